@@ -12,7 +12,7 @@ from collections.abc import Callable
 import tyro
 
 from cadalign.errors import CadalignError
-from cadalign.evaluation.paper.reproduction import PaperPlan, reproduce_paper
+from cadalign.evaluation.experiments.paper import PaperPlan, reproduce_paper
 from cadalign.evaluation.runs.run import Progress
 
 

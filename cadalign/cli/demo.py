@@ -9,7 +9,7 @@ from typing import Any
 from cadalign.cli.evaluate import RunCommand, command_of
 from cadalign.cli.options import new_console
 from cadalign.cli.runs import NOTHING_WORKED, SUCCESS, conclude
-from cadalign.evaluation.demo.options import DemoOptions
+from cadalign.evaluation.experiments.demo import DemoOptions
 
 
 @dataclass(frozen=True, kw_only=True)

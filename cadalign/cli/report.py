@@ -13,7 +13,7 @@ from cadalign.cli.evaluate import command_of
 from cadalign.cli.options import new_console
 from cadalign.cli.runs import conclude
 from cadalign.errors import InputError
-from cadalign.evaluation.estimates.options import EstimatesOptions
+from cadalign.evaluation.experiments.estimates import EstimatesOptions
 from cadalign.io.files import write_text
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from cadalign.cli.evaluate import MethodsCommand, command_of, one_of
-from cadalign.evaluation.simulation.options import SweepOptions
+from cadalign.evaluation.experiments.simulation import SweepOptions
 
 _ABOUT = {
     "noise": "Errors against the keypoints' noise, at 1,024 points.",

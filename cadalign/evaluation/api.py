@@ -50,7 +50,7 @@ def evaluate(
     **options
         Options of the experiment, the same as on the command line: ``noise_px=2.0`` is
         ``--noise-px 2``. Those of ``keypointnet`` are the fields of
-        `cadalign.evaluation.keypointnet.options.KeypointNetOptions`: ``categories``, ``split``,
+        `cadalign.evaluation.experiments.keypointnet.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
         ``shape``, ``visibility``, ``render``, ``metrics``, ``seed``. Among ``methods`` and
         ``metrics`` may be functions of one's own, and names that they were registered by; see
@@ -97,7 +97,7 @@ def simulate(sweep: str, **options: Any) -> pd.DataFrame:
         The quantity that is varied.
     **options
         ``methods``, ``values``, ``runs``, ``points``, ``noise_px`` in place of the sweep's own (see
-        `cadalign.evaluation.simulation.options.SWEEPS`), ``seed``; and ``workers``, ``dask``,
+        `cadalign.evaluation.experiments.simulation.SWEEPS`), ``seed``; and ``workers``, ``dask``,
         ``out`` as for `evaluate`.
 
     Returns

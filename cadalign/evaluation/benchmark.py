@@ -1,31 +1,51 @@
 """Benchmarks: instances x methods x metrics, the one walk of all experiments.
 
-A `Setting` makes the instances of tasks, says what general methods are given of them, and measures
-estimates; `Benchmark` runs methods on them. An instance or an estimate that fails is a row with a
-reason, and never stops a run.
+A `Setting` makes the instances of tasks, gives them to methods, and measures estimates; `Benchmark`
+runs methods on them. An instance or an estimate that fails is a row with a reason, and never stops
+a run.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from cadalign.errors import InputError
-from cadalign.evaluation.methods.fitted import LIMIT
+from cadalign.errors import DataError, InputError
 from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.methods.registry import fingerprints
-from cadalign.evaluation.metrics.registry import Compared, RegisteredMetric, metrics_config
+from cadalign.evaluation.methods.registry import choose_methods, fingerprints
+from cadalign.evaluation.metrics.registry import (
+    Compared,
+    RegisteredMetric,
+    choose_metrics,
+    metrics_config,
+)
+from cadalign.evaluation.options import LIMIT, ExperimentOptions
 from cadalign.evaluation.outcome import FAILED, Outcome, reason_of, status_of
-from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import AbortError, Rows
+from cadalign.evaluation.runs.work import AbortError, Plan, Rows
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.runs.tables import Columns, Row
 
 R = TypeVar("R")
+T = TypeVar("T")
 Pair = tuple[Any, Any]
 """An instance, and an estimate of it."""
 VIEW_NAMES: Columns = (("category", str), ("model_id", str), ("view", int), ("method", str))
 """The columns that name a row of a method on a view of a model."""
+
+
+class Tasks(Sequence[T]):
+    """Tasks of a run that are made when they are asked for; a subclass has ``__len__``."""
+
+    def task(self, index: int) -> T:
+        """The task of a number from 0."""
+        raise NotImplementedError
+
+    def __getitem__(self, index: Any) -> Any:
+        places = range(len(self))[index]
+        return list(map(self.task, places)) if isinstance(places, range) else self.task(places)
 
 
 @dataclass(frozen=True)
@@ -58,10 +78,10 @@ class Case:
     seconds: float | None = None
 
 
-class Setting(Protocol):
+class Setting:
     """Instances and metrics of a benchmark; picklable.
 
-    Methods with a body are defaults.
+    A setting has ``names``, ``columns``, ``case`` or ``cases``, and ``row`` or ``measure``.
     """
 
     record_columns: ClassVar[Columns | None] = None
@@ -70,30 +90,50 @@ class Setting(Protocol):
     @property
     def names(self) -> Columns:
         """The columns that name a row, the method's last."""
+        raise NotImplementedError
 
     @property
     def columns(self) -> Columns:
         """All columns of the result table."""
+        raise NotImplementedError
 
     def warm_up(self) -> Sequence[Any]:
         """Compile what all workers need; returns tasks whose evaluation compiles the rest."""
+        return ()
+
+    def case(self, task: Any) -> Case:
+        """The instance of a task; one that cannot be made raises."""
+        raise NotImplementedError
 
     def cases(self, tasks: Sequence[Any]) -> list[Case]:
         """The instances of tasks, in their order."""
+        return [case for task in tasks for case in self._cases(task)]
+
+    def _cases(self, task: Any) -> list[Case]:
+        found = attempt(self.case, task)
+        if isinstance(found, Exception):
+            return [replace(case, error=found) for case in self.failed(task)]
+        return [found]
 
     def failed(self, task: Any) -> list[Case]:
         """The cases, without instances, of a task that could not be evaluated."""
+        return [Case(task.names)]
 
     def given(self, instance: Any) -> MethodInput:
         """The instance as general methods are given it; an error of settings without them."""
         raise InputError("there are no general methods", where="methods")
 
     def answered(self, method: Method, instance: Any, answer: Any) -> Any:
-        """The estimate that `measure` takes, of a general method's alignment or result."""
+        """The estimate that is measured, of a general method's alignment or result."""
         return answer
+
+    def row(self, method: Method, instance: Any, estimate: Any) -> Row:
+        """Cells of the result table for an estimate; one that cannot be measured raises."""
+        raise NotImplementedError
 
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
         """Cells of the result table for each estimate, or why there are none."""
+        return [attempt(self.row, method, *pair) for pair in pairs]
 
     def compared(self, instance: Any, estimate: Any) -> Compared:
         """The estimated and the true alignment, for registered metrics."""
@@ -128,15 +168,24 @@ class Benchmark:
     repeats: int = 1
     metrics: tuple[RegisteredMetric, ...] = ()
 
+    @classmethod
+    def chosen(
+        cls,
+        setting: Setting,
+        methods: Iterable[str],
+        own: Mapping[str, Method] | None = None,
+        *,
+        metrics: Iterable[str] = (),
+        **how: Any,
+    ) -> Benchmark:
+        """The benchmark of methods and registered metrics by their names; see `choose_methods`."""
+        further = choose_metrics(metrics, setting.columns)
+        return cls(setting, choose_methods(methods, own), metrics=further, **how)
+
     @property
     def columns(self) -> Columns:
         """The columns of the result table."""
         return (*self.setting.columns, *((each.metric.key, float) for each in self.metrics))
-
-    @property
-    def config(self) -> dict[str, Any]:
-        """Users' functions in a run's configuration; empty without any."""
-        return fingerprints(self.methods) | metrics_config(self.metrics)
 
     @property
     def timing_columns(self) -> Columns:
@@ -147,6 +196,17 @@ class Benchmark:
     def record_columns(self) -> Columns | None:
         """The columns of the table of instance records."""
         return self.setting.record_columns
+
+    def plan(
+        self, options: ExperimentOptions, tasks: Sequence[T], *, chunk: int, **more: Any
+    ) -> Plan[T]:
+        """The plan of a run, with more of its configuration than the options and the functions."""
+        return Plan(self, tasks, options.as_config() | more | self.functions, chunk)
+
+    @property
+    def functions(self) -> dict[str, Any]:
+        """Users' functions in a run's configuration; empty without any."""
+        return fingerprints(self.methods) | metrics_config(self.metrics)
 
     def warm_up(self) -> None:
         """Compile solvers and metrics; functions that users registered are not called."""
@@ -245,16 +305,13 @@ class Benchmark:
         if method.name not in self.batched or method.solve_many is None:
             return [self._timed(method, instance) for instance in instances]
         start = time.perf_counter()
-        if not method.is_general:
-            found = method.solve_many(instances)
-        else:
-            answers = method.solve_many([self.setting.given(each) for each in instances])
-            found = [
-                answer
-                if isinstance(answer, Exception)
-                else self.setting.answered(method, instance, answer)
-                for instance, answer in zip(instances, answers, strict=True)
-            ]
+        answers = method.solve_many([self.setting.given(each) for each in instances])
+        found = [
+            answer
+            if isinstance(answer, Exception)
+            else self.setting.answered(method, instance, answer)
+            for instance, answer in zip(instances, answers, strict=True)
+        ]
         share = (time.perf_counter() - start) / max(len(instances), 1)
         return [(estimate, share) for estimate in found]
 
@@ -284,3 +341,14 @@ def attempt(function: Callable[..., R], *arguments: Any) -> R | Exception:
         raise
     except Exception as error:
         return error
+
+
+def write_picture(write: Callable[..., object], *arguments: Any) -> None:
+    """Write an instance's pictures; where there is no room for them, the run is stopped."""
+    try:
+        write(*arguments)
+    except (OSError, DataError) as error:
+        raise AbortError(
+            f"a picture cannot be written: {error}",
+            fix="free some space, and start the same command again: the run goes on",
+        ) from None

@@ -1,18 +1,25 @@
 """Options that experiments share: each is at once API, command line and run configuration.
 
-Experiments add their own in ``<experiment>/options.py``. The command line takes a field's help from
-the text below it. These modules load quickly: `cadalign --help` imports them.
+An experiment adds its own in its module. The command line takes a field's help from the text below
+it. These modules load quickly: `cadalign evaluate --help` imports them.
 """
 
 from __future__ import annotations
 
 import math
 from copy import copy
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self
+
+import tyro
 
 from cadalign.errors import InputError
+
+LIMIT = "limit"
+"""The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.cramer_rao`."""
+SHAPE = "shape"
+"""The alignment of a category's learned shape, in runs that have one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +27,7 @@ class ExperimentOptions:
     """Options of every experiment."""
 
     experiment: ClassVar[str]
-    """Name of the experiment, as the run's configuration has it."""
+    """Name of the experiment, as in the run's configuration."""
     command: ClassVar[str] = "evaluate"
     """Command that runs it."""
 
@@ -46,8 +53,9 @@ class ExperimentOptions:
         return 1
 
     def as_config(self) -> dict[str, Any]:
-        """The options in a run's configuration."""
-        return asdict(self)
+        """The options and the experiment's name in a run's configuration, paths made absolute."""
+        config = {name: _absolute(value) for name, value in asdict(self).items()}
+        return {**config, "experiment": self.experiment}
 
     def with_methods(self, names: tuple[str, ...]) -> Self:
         """The options with further methods, for experiments that run functions."""
@@ -68,6 +76,17 @@ class ExperimentOptions:
                 raise InputError(
                     f"unknown value {value!r}", where=name, fix=f"known are {', '.join(known)}"
                 )
+
+    def replace_values(self, **values: Any) -> None:
+        """Set options of a new instance to their checked values."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+
+def _absolute(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value.absolute())
+    return [_absolute(each) for each in value] if isinstance(value, tuple) else value
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,14 +115,23 @@ class FunctionOptions(ExperimentOptions):
             fix = "give --methods, too: the functions, and methods to compare them with"
             raise InputError("the other methods are not given", where="plugin", fix=fix)
         found = copy(self)
-        object.__setattr__(found, "methods", tuple(dict.fromkeys((*methods, *names))))
+        found.replace_values(methods=tuple(dict.fromkeys((*methods, *names))))
         return found
 
+    def check_methods(self, own: tuple[str, ...] | None = None) -> None:
+        """Check the names of methods, each once; ``own`` are the experiment's, if it has any."""
+        from cadalign.evaluation.methods.registry import checked_names
 
-@dataclass(frozen=True, kw_only=True)
+        self.replace_values(methods=checked_names(getattr(self, "methods", ()), own))
+
+
+@dataclass(frozen=True)
 class ModelOptions(ExperimentOptions):
     """Choice of the models of a dataset."""
 
+    root: Annotated[Path, tyro.conf.Positional]
+    """Folder in KeypointNet's layout."""
+    _: KW_ONLY
     categories: tuple[str, ...] | None = None
     """Categories to take; all by default."""
     max_models: int | None = None
@@ -118,8 +146,9 @@ class ModelOptions(ExperimentOptions):
     def as_config(self) -> dict[str, Any]:
         """The options in a run's configuration: ``shapenet`` only where it is given."""
         config = super().as_config()
-        shapenet = config.pop("shapenet")
-        return config if shapenet is None else {**config, "shapenet": str(shapenet.absolute())}
+        if config["shapenet"] is None:
+            del config["shapenet"]
+        return config
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,6 +162,11 @@ class NoiseOption(ExperimentOptions):
         super().__post_init__()
         if not 0 <= self.noise_px < math.inf:
             raise InputError(f"{self.noise_px} is not a noise level", where="noise_px")
+
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of the keypoints that methods are told [px]."""
+        return self.noise_px or 1.0
 
 
 @dataclass(frozen=True, kw_only=True)

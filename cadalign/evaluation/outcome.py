@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import CadalignError, TooFewVisibleError
-from cadalign.evaluation.runs.tables import Row
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.runs.tables import Row
 
 OK = "ok"
 FAILED = "failed"
 LEFT_OUT = "left out"
-"""Of an instance, or a method on it, that lacks what is asked for: no failure, and no result."""
+"""Status of an instance, or a method on it, that lacks what is asked for: neither failed nor ok."""
 SKIPPED = "skipped"
-"""Of an instance that no view shows enough keypoints of: no method was run, and none failed."""
+"""Status of an instance that no view shows enough keypoints of: no method was run."""
 
 
 class LeftOutError(CadalignError):
@@ -63,5 +65,5 @@ def status_of(error: Exception) -> str:
 
 
 def reason_of(error: Exception) -> str:
-    """An error in one line; ours speak for themselves, others are named."""
+    """An error in one line; errors of other packages with their type's name."""
     return str(error) if isinstance(error, CadalignError) else f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Registry of experiments: those of this package, by their folders, and those that are registered.
+"""Registry of experiments: the modules of `cadalign.evaluation.experiments`, and those of users.
 
 An experiment of your own needs a single file, anywhere: options (`cadalign.evaluation.options`),
 tasks and an experiment (`cadalign.evaluation.runs.work`), a specification, and ::
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.opened import Run
     from cadalign.evaluation.spec import Spec
 
-# The folders of experiments in this package, in the order in which they are named to users.
-_FOLDERS = (
+# In the order in which they are named to users.
+_MODULES = (
     "keypointnet",
     "demo",
     "simulation",
@@ -43,24 +43,29 @@ def register(spec: Spec) -> Spec:
     return spec
 
 
+def known_specs() -> Iterator[Spec]:
+    """The specifications of all experiments."""
+    for name in _MODULES:
+        spec: Spec = import_module(f"cadalign.evaluation.experiments.{name}").SPEC
+        yield spec
+    yield from _REGISTERED.values()
+
+
 def known_options() -> Iterator[type[ExperimentOptions]]:
     """The options of all experiments."""
-    for folder in _FOLDERS:
-        found: type[ExperimentOptions] = import_module(f"{__package__}.{folder}.options").OPTIONS
-        yield found
-    yield from (spec.options for spec in _REGISTERED.values())
+    return (spec.options for spec in known_specs())
 
 
 def spec_named(name: str) -> Spec:
     """The specification of an experiment."""
     if name in _REGISTERED:
         return _REGISTERED[name]
-    for folder in _FOLDERS:
-        if import_module(f"{__package__}.{folder}.options").OPTIONS.experiment == name:
-            spec: Spec = import_module(f"{__package__}.{folder}.spec").SPEC
+    known = []
+    for spec in known_specs():
+        if spec.name == name:
             return spec
-    names = [options.experiment for options in known_options()]
-    what, fix = f"unknown experiment {quote(name)}", f"known are {', '.join(names)}"
+        known.append(spec.name)
+    what, fix = f"unknown experiment {quote(name)}", f"known are {', '.join(known)}"
     raise InputError(what, where="experiment", fix=fix)
 
 

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
-from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.plots import Plot, draw_plots
-from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import COLUMNS, Run
-from cadalign.evaluation.runs.tables import Columns
-from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
 
-Summaries = Sequence[Summary]
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from cadalign.evaluation.options import ExperimentOptions
+    from cadalign.evaluation.runs.folder import RunFolder
+    from cadalign.evaluation.runs.opened import Run
+    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.work import Plan
+
+    Summaries = Sequence[Summary]
+
+RESULT_COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
+"""Columns of the result table of every experiment."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,7 @@ class Spec:
     columns : tuple of Metric
         Columns of the headline table; those are left out that no line has a value of.
     summarize : callable
-        Makes summaries of a run, finished or not; see `cadalign.evaluation.summary.medians`.
+        Makes summaries of a run, finished or not; see `cadalign.evaluation.summary`.
     results : Columns
         Columns that the result table of a run must have to be summarized.
     lines : callable
@@ -72,6 +78,8 @@ class Spec:
         Runs of one kind, whose name this gives, can be compared.
     title : callable
         Names runs of one kind in a few words.
+    topic : str
+        What is evaluated, in place of a title: ``topic on dataset``.
     describe : callable
         Says what the methods were run on.
     about : str
@@ -86,7 +94,7 @@ class Spec:
     plan: Callable[[Any, RunFolder], Plan[Any]]
     columns: tuple[Metric, ...]
     summarize: Callable[[Run], Summaries]
-    results: Columns = COLUMNS
+    results: Columns = RESULT_COLUMNS
     lines: Callable[[Summaries], Summaries] = list
     table: Callable[[Run, Summaries], ConsoleTable] | None = None
     group: Callable[[Run], Metric] = lambda run: CATEGORY
@@ -95,7 +103,8 @@ class Spec:
     conclude: Callable[[Run, Summaries], Conclusion] = _count_failures
     metrics: tuple[Metric, ...] = ()
     kind: Callable[[Run], str] = lambda run: run.experiment
-    title: Callable[[Sequence[Run]], str] = lambda runs: on_datasets(runs[0].experiment, runs)
+    title: Callable[[Sequence[Run]], str] | None = None
+    topic: str = ""
     describe: Callable[[Run], str] = lambda run: f"on {run.total:,} tasks of {run.experiment}"
     about: str = ""
     note: str = ""
@@ -108,7 +117,16 @@ class Spec:
 
     def open(self, path: Path, name: str | None = None) -> Run:
         """Read a run of the experiment, ``name`` being its name beside others."""
+        from cadalign.evaluation.runs.opened import Run
+
         return Run.open(path, name, columns=self.results)
+
+    def title_of(self, runs: Sequence[Run]) -> str:
+        """A few words that name runs of one kind, such as ``alignment on keypointnet``."""
+        if self.title is not None:
+            return self.title(runs)
+        datasets = dict.fromkeys(run.dataset for run in runs)
+        return f"{self.topic or runs[0].experiment} on {', '.join(datasets)}"
 
     def console_table(self, run: Run, summaries: Summaries) -> ConsoleTable:
         """The table for the console."""
@@ -116,16 +134,8 @@ class Spec:
             return self.table(run, summaries)
         lines = self.lines(summaries)
         columns = self.shown_columns(lines, [run])
-        return ConsoleTable(
-            title="Medians per group and method",
-            labels=(self.group(run).heading, "method"),
-            heads=tuple(column.symbol for column in columns),
-            rows=[
-                (line.group, line.method, *(c.text(line.number(c.key)) for c in columns))
-                for line in lines
-            ],
-            note="",
-        )
+        labels = (self.group(run).heading, "method")
+        return ConsoleTable.of("Medians per group and method", lines, columns, labels=labels)
 
     def shown_columns(self, lines: Summaries, runs: Sequence[Run]) -> list[Metric]:
         """The columns that some line has a value of, those of registered metrics last."""
@@ -136,16 +146,10 @@ class Spec:
     def write(self, run: Run) -> Summaries:
         """Write ``summary.csv`` and ``figures`` of a finished run."""
         summaries = self.summarize(run)
-        write_text(
-            run.folder.summary, summary_csv(summaries, rename={"value": self.group(run).key})
-        )
+        names = {"value": self.group(run).key}
+        write_text(run.folder.summary, summary_csv(summaries, rename=names))
         plots = self.plots([run])
         if plots:
             draw_plots(run.folder.made_figures(), plots)
         self.write_more(run, summaries)
         return summaries
-
-
-def on_datasets(topic: str, runs: Sequence[Run]) -> str:
-    """A title such as ``alignment on keypointnet``."""
-    return f"{topic} on {', '.join(dict.fromkeys(run.dataset for run in runs))}"

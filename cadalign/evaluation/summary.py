@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +14,12 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
 from cadalign.evaluation.outcome import OK, SKIPPED
-from cadalign.evaluation.runs.opened import Cells, Run
-from cadalign.evaluation.runs.tables import Row
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.runs.opened import Cells, Run
+    from cadalign.evaluation.runs.tables import Row
+
+    Statistics = Mapping[str, Callable[[Cells], float]]
 
 ALL = "all"
 """Name of the summary over all categories."""
@@ -88,6 +92,25 @@ class ConsoleTable:
     grouped: bool = True
     wraps: bool = False
 
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        summaries: Sequence[Summary],
+        shown: Sequence[Metric],
+        *,
+        labels: tuple[str, str] = ("category", "method"),
+        note: str = "",
+        **look: bool,
+    ) -> ConsoleTable:
+        """The table of the shown cells of summaries, each with its group and method."""
+        heads = tuple(column.symbol for column in shown)
+        rows = [
+            (s.group, s.method, *(column.text(s.number(column.key)) for column in shown))
+            for s in summaries
+        ]
+        return cls(title, labels, heads, rows, note, **look)
+
 
 @dataclass(frozen=True)
 class Conclusion:
@@ -156,28 +179,62 @@ def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) ->
 
     Of the columns those are taken that the run's results have.
     """
-    cells = run.cells
-    metrics = [metric.key for metric in columns if metric.key in cells]
+    statistics = {metric.key: median(metric.key) for metric in columns if metric.key in run.cells}
     summaries = []
-    for value in sorted(set(cells[group.key].tolist())):
+    for value in sorted(set(run.cells[group.key].tolist())):
+        cells = where(run.cells, run.cells[group.key] == value)
         for method in run.methods:
-            chosen = (cells[group.key] == value) & (cells["method"] == method)
-            solved = chosen & (cells["status"] == OK)
-            counts = {"instances": int(chosen.sum()), "failed": int((chosen & ~solved).sum())}
-            values = {name: median_of(cells[name][solved]) for name in metrics}
             names = {group.key: value, "method": method}
-            summaries.append(Summary(group_name(group, value), names, {**counts, **values}))
+            values = _values(cells, method, statistics)
+            summaries.append(Summary(group_name(group, value), names, values))
     return summaries
 
 
 def by_category_and_method(
-    run: Run, summarize: Callable[[str, str, Cells], Summary]
+    run: Run, statistics: Statistics, *, count_skipped: bool = False
 ) -> list[Summary]:
     """A summary of each category's cells for every method, and of all where there are several.
 
-    Medians of registered metrics are added.
+    Statistics are of the rows that are ok. Medians of registered metrics are added.
     """
+
+    def summarize(category: str, method: str, cells: Cells) -> Summary:
+        values = _values(cells, method, statistics)
+        if count_skipped:
+            values["skipped"] = counted(cells, method)[1]
+        return Summary(category, {"category": category, "method": method}, values)
+
     return summaries_of(run.cells, run.methods, summarize, further=run.metrics)
+
+
+def _values(cells: Cells, method: str, statistics: Statistics) -> Row:
+    counts, _, solved = counted(cells, method)
+    return {**counts, **{name: made(solved) for name, made in statistics.items()}}
+
+
+def median(key: str) -> Callable[[Cells], float]:
+    """The median of a column."""
+    return lambda cells: median_of(cells[key])
+
+
+def mean(key: str) -> Callable[[Cells], float]:
+    """The mean of a column."""
+    return lambda cells: mean_of(cells[key])
+
+
+def percentile(key: str, percent: float) -> Callable[[Cells], float]:
+    """A percentile of a column, NaN where all cells are missing."""
+
+    def made(cells: Cells) -> float:
+        values = known(cells[key])
+        return float(np.percentile(values, percent)) if len(values) else np.nan
+
+    return made
+
+
+def milliseconds(cells: Cells) -> float:
+    """The median time."""
+    return median_of(1e3 * cells["seconds"].astype(float))
 
 
 def summaries_of(
@@ -187,7 +244,7 @@ def summaries_of(
     *,
     further: Sequence[Metric] = (),
 ) -> list[Summary]:
-    """Summaries of cells for some methods; see `by_category_and_method`."""
+    """Summaries of cells by category for some methods; see `by_category_and_method`."""
     categories = sorted(set(cells["category"].tolist()))
     parts = [(name, where(cells, cells["category"] == name)) for name in categories]
     if len(parts) > 1:
@@ -208,20 +265,13 @@ def with_medians(summary: Summary, cells: Cells, metrics: Sequence[Metric]) -> S
     return replace(summary, values={**summary.values, **medians})
 
 
-def counted(cells: Cells, method: str) -> tuple[dict[str, int], int, Cells]:
+def counted(cells: Cells, method: str) -> tuple[Row, int, Cells]:
     """Numbers of instances and of failures of a method, of skipped ones, and the rows without."""
     chosen = cells["method"] == method
     solved = where(cells, chosen & (cells["status"] == OK))
     skipped = int((chosen & (cells["status"] == SKIPPED)).sum())
     count = int(chosen.sum()) - skipped
     return {"instances": count, "failed": count - len(solved["method"])}, skipped, solved
-
-
-def text_rows(summaries: Sequence[Summary], shown: Sequence[Metric]) -> list[tuple[str, ...]]:
-    """Rows of a table for the console: group, method, and the shown cells as text."""
-    return [
-        (s.group, s.method, *(column.text(s[column.key]) for column in shown)) for s in summaries
-    ]
 
 
 def group_name(group: Metric, value: Any) -> str:

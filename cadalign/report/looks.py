@@ -5,8 +5,8 @@ from __future__ import annotations
 import colorsys
 from typing import Any
 
-from cadalign.evaluation.accuracy.style import look_of
-from cadalign.evaluation.methods.fitted import LIMIT
+from cadalign.evaluation.options import LIMIT
+from cadalign.evaluation.plots import look_of
 
 _INK, _INK_ON_DARK = "#1b1d21", "#e8e9ec"
 _LEAST_LIGHTNESS_ON_DARK = 0.62

@@ -37,7 +37,7 @@ headline and the values of ``plots`` are as shown. What is unknown or not finite
 ``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is an instance record
 (`cadalign.evaluation.instances.record`) with the keys of its ``picture``, which has no boxes drawn
 in as thumbs have, and of its ``mesh``, both null where there is none. A mesh is a preview
-(`cadalign.evaluation.instances.preview`) of the dataset's model: that, times the exhibit's
+(`cadalign.evaluation.instances.pictures`) of the dataset's model: that, times the exhibit's
 ``stretch``, is the model that methods were given.
 
 Where pictures are in a folder beside the page, instead of ``exhibits`` and ``meshes`` there are

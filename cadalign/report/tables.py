@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cadalign.errors import InputError
-from cadalign.evaluation.accuracy.style import look_of
 from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.summary import csv_text
 from cadalign.report.headline import Headline, HeadlineRow, headline_of
 from cadalign.report.runs import read_runs

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any
 
-from cadalign.evaluation.methods.fitted import LIMIT
+from cadalign.evaluation.options import LIMIT
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
 
@@ -32,7 +32,7 @@ _UNITS = {
 
 def title_of(runs: Sequence[Run]) -> str:
     """A report's title."""
-    title = spec_of(runs[0]).title(runs)
+    title = spec_of(runs[0]).title_of(runs)
     if len(runs) > 1:
         return f"{len(runs)} runs compared: {title}"
     return title[0].upper() + title[1:]

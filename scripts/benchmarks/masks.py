@@ -16,7 +16,7 @@ from cadalign import Camera, Model, View, align
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.contours.bound import contour_bound
-from cadalign.evaluation.accuracy.masks import DAMAGES, damaged_mask
+from cadalign.evaluation.instances.scene import DAMAGES, damaged_mask
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, rotation_error

@@ -23,10 +23,10 @@ from benchmarks.section import (
 from cadalign import Box, Library, ShapeModel
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError, DegenerateError
+from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.retrieval.tasks import RetrievalQuery, RetrievalTask, observe_model
-from cadalign.evaluation.unseen.options import UnseenOptions
-from cadalign.evaluation.unseen.tasks import UnseenSighting, UnseenTasks, observe_object
+from cadalign.evaluation.instances.queries import RetrievalQuery, RetrievalTask, observe_model
+from cadalign.evaluation.instances.unseen import UnseenSighting, UnseenTasks, observe_object
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel, Match
 from cadalign.retrieval.models import ModelKey

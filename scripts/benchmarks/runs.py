@@ -28,9 +28,8 @@ from benchmarks.section import (
 )
 from cadalign import Alignment, Camera, RansacOptions, metrics
 from cadalign.datasets import Bundler, Colmap, Correspondences, KeypointNet, write_sample_dataset
-from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
-from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.tasks import KeypointTasks
+from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
+from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
 
 _CHUNK = 100
 _SEARCH = {"max_reproj_error": 4.0, "success_prob": 0.9999}

@@ -14,7 +14,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from cadalign.errors import CadalignError
-from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, sample_limit
+from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.simulation.problems import Problem
 
 LIMIT_DRAWS = 20

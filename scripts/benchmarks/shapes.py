@@ -21,10 +21,10 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.estimation.uncertainty.misfit import projection_jacobian
+from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.unseen.options import UnseenOptions
-from cadalign.evaluation.unseen.tasks import UnseenTasks, observe_object
+from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
 from cadalign.geometry.metrics import box_iou, rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.render import look_at

@@ -17,11 +17,10 @@ import pytest
 from cadalign.cli import main
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.api import run, simulate
+from cadalign.evaluation.experiments.simulation import SweepOptions, sweep_benchmark
 from cadalign.evaluation.runs.cluster import DaskWorkers
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
-from cadalign.evaluation.simulation.experiment import sweep_benchmark
-from cadalign.evaluation.simulation.options import SweepOptions
 
 distributed = pytest.importorskip(
     "distributed", reason="Dask is not installed: pip install 'cadalign[dask]'"

@@ -8,8 +8,7 @@ import pytest
 from cadalign import metrics
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance
-from cadalign.evaluation.instances.symmetry import InstanceSymmetry
+from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance, InstanceSymmetry
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

@@ -23,15 +23,14 @@ from cadalign.estimation.result_parts import ViewResult
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.correspondences.experiment import (
+from cadalign.evaluation.experiments.correspondences import SPEC, CorrespondenceOptions, summarize
+from cadalign.evaluation.instances.correspondences import (
     CorrespondenceTask,
     CorrespondenceTasks,
     correspondence_benchmark,
     errors_of,
     spoil,
 )
-from cadalign.evaluation.correspondences.options import CorrespondenceOptions
-from cadalign.evaluation.correspondences.spec import SPEC, summarize
 from cadalign.evaluation.methods.fitted import fit_methods, fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run

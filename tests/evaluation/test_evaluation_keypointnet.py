@@ -14,13 +14,16 @@ import cadalign
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.instances.drawing import draw_instance
+from cadalign.evaluation.experiments.keypointnet import (
+    SPEC,
+    KeypointNetOptions,
+    summarize_cells,
+    texts,
+)
 from cadalign.evaluation.instances.instance import load_scene, make_instance
+from cadalign.evaluation.instances.pictures import draw_instance
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.keypointnet.experiment import COLUMNS, keypointnet_benchmark
-from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.spec import SPEC, summarize_cells, texts
-from cadalign.evaluation.keypointnet.tasks import KeypointTasks
+from cadalign.evaluation.instances.views import COLUMNS, KeypointTasks, keypointnet_benchmark
 from cadalign.evaluation.outcome import FAILED, OK, SKIPPED
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.summary import Summary, summary_csv

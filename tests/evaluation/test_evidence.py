@@ -12,17 +12,17 @@ from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.estimation.align import align
 from cadalign.evaluation.api import evaluate
-from cadalign.evaluation.evidence.experiment import BOUNDS, evidence_benchmark
-from cadalign.evaluation.evidence.options import METHODS, EvidenceRunOptions
-from cadalign.evaluation.evidence.scene import (
+from cadalign.evaluation.experiments.evidence import METHODS, EvidenceRunOptions, summarize
+from cadalign.evaluation.instances.evidence import (
+    BOUNDS,
     EvidenceInstance,
     ObjectScene,
     bound_of,
+    evidence_benchmark,
     evidence_for,
     make_scene,
     truth_in,
 )
-from cadalign.evaluation.evidence.spec import summarize
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.runs.opened import Run
 
@@ -133,7 +133,7 @@ def test_model_that_fails_gives_failed_rows(root: Path) -> None:
     options = EvidenceRunOptions(root, methods=("keypoints", "depth"))
     experiment = evidence_benchmark(options)
     (model,) = KeypointNet(root).subset(categories=["car"])
-    from cadalign.evaluation.keypointnet.tasks import KeypointTask
+    from cadalign.evaluation.instances.views import KeypointTask
 
     task = KeypointTask.of_model(
         KeypointNet(root), model.category, model.model_id, visibility="rays"

@@ -19,13 +19,13 @@ import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.correspondences.options import CorrespondenceOptions
-from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.retrieval.options import RetrievalRunOptions
+from cadalign.evaluation.experiments.correspondences import CorrespondenceOptions
+from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
+from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
+from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.evaluation.simulation.options import SweepOptions
 
 SWEEP = SweepOptions("points", values=(8, 10), runs=40, methods=("aepnp",))
 Change = Callable[[Path], None]

@@ -8,17 +8,18 @@ import pytest
 from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError, TooFewVisibleError
-from cadalign.evaluation.accuracy.cramer_rao import cramer_rao_bound, limit_estimate
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view, sample_hull_views
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     Instance,
+    InstanceSymmetry,
     make_hull_instances,
 )
-from cadalign.evaluation.instances.symmetry import InstanceSymmetry
-from cadalign.evaluation.keypointnet.tasks import KeypointTask
-from cadalign.evaluation.methods.fitted import LIMIT, fit_methods, fit_options
+from cadalign.evaluation.instances.views import KeypointTask
+from cadalign.evaluation.methods.fitted import fit_methods, fit_options
 from cadalign.evaluation.methods.registry import checked_names
+from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate
+from cadalign.evaluation.options import LIMIT
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

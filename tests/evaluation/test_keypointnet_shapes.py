@@ -18,8 +18,8 @@ from support.refusals import refusal_line, refusal_text
 from cadalign import Alignment, Box, ShapeModel, evaluate
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.evaluation.instances.aligned import box_alignment
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.shapes.examples import Example
 

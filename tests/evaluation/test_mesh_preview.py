@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cadalign import Mesh
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError
-from cadalign.evaluation.instances.preview import MeshPreview, preview_of, write_preview
+from cadalign.evaluation.instances.pictures import MeshPreview, preview_of, write_preview
 
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
 QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))

@@ -20,12 +20,12 @@ from cadalign import Alignment, Camera, Model, Result, View
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation import register_method
-from cadalign.evaluation.accuracy.style import look_of
+from cadalign.evaluation.experiments.photos import PhotosOptions
 from cadalign.evaluation.methods import registry
 from cadalign.evaluation.methods.method import MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, registered_method
-from cadalign.evaluation.photos.experiment import photos_benchmark
-from cadalign.evaluation.photos.options import PhotosOptions
+from cadalign.evaluation.photos.objects import photos_benchmark
+from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.simulation.problems import simulate_problem
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from cadalign.evaluation.paper.reproduction import PaperPlan, reproduce_paper
-from cadalign.evaluation.paper.table import PAPER_TABLE
-from cadalign.evaluation.simulation.options import SWEEPS, SweepKind
+from cadalign.evaluation.experiments.keypointnet import PAPER_TABLE
+from cadalign.evaluation.experiments.paper import PaperPlan, reproduce_paper
+from cadalign.evaluation.experiments.simulation import SWEEPS, SweepKind
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "reproduce_paper.py"
 

@@ -18,11 +18,15 @@ from cadalign.cli import main
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
+from cadalign.evaluation.experiments.retrieval import SPEC, RetrievalRunOptions, summarize
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.retrieval.experiment import retrieval_benchmark, same_shapes
-from cadalign.evaluation.retrieval.options import RetrievalRunOptions
-from cadalign.evaluation.retrieval.spec import SPEC, summarize
-from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model, retrieval_tasks
+from cadalign.evaluation.instances.queries import (
+    RetrievalTask,
+    observe_model,
+    retrieval_benchmark,
+    retrieval_tasks,
+    same_shapes,
+)
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table

@@ -13,13 +13,14 @@ import pytest
 import cadalign
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.simulation.experiment import (
+from cadalign.evaluation.experiments.simulation import (
+    SWEEPS,
+    SweepOptions,
     SweepProblems,
     SweepTask,
     sweep_benchmark,
     sweep_tasks,
 )
-from cadalign.evaluation.simulation.options import SWEEPS, SweepOptions
 from cadalign.evaluation.simulation.problems import simulate_problem
 
 

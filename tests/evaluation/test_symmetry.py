@@ -11,7 +11,7 @@ from cadalign import Alignment
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
-from cadalign.evaluation.instances.symmetry import InstanceSymmetry, symmetry_group
+from cadalign.evaluation.instances.instance import InstanceSymmetry, symmetry_group
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.metrics import rotation_error, translation_error
 from cadalign.geometry.rotations import rotation_from_vector

@@ -18,16 +18,19 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
+from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.unseen import (
+    UnseenTask,
+    UnseenTasks,
+    keep_preview,
+    observe_object,
+    probability_level,
+)
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.evaluation.unseen.experiment import probability_level
-from cadalign.evaluation.unseen.options import METHODS, UnseenOptions
-from cadalign.evaluation.unseen.records import keep_preview
-from cadalign.evaluation.unseen.spec import SPEC
-from cadalign.evaluation.unseen.tasks import UnseenTask, UnseenTasks, observe_object
 from cadalign.geometry.metrics import box_iou
 from cadalign.report import headline_text, write_report
 

@@ -13,7 +13,7 @@ from support.pages import Opened, scroll_through
 from support.reports import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
 
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.keypointnet.options import KeypointNetOptions
+from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.report import write_report
 from cadalign.web import asset

@@ -21,17 +21,16 @@ from cadalign import Alignment, Box, Camera, Library, fit
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.api import run as do_run
-from cadalign.evaluation.correspondences.options import CorrespondenceOptions
+from cadalign.evaluation.experiments.correspondences import CorrespondenceOptions
+from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
+from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
+from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.instances.record import record_stem
-from cadalign.evaluation.keypointnet.experiment import keypointnet_benchmark
-from cadalign.evaluation.keypointnet.options import KeypointNetOptions
-from cadalign.evaluation.keypointnet.tasks import KeypointTasks
+from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
 from cadalign.evaluation.methods.fitted import fit_options
-from cadalign.evaluation.retrieval.options import RetrievalRunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
-from cadalign.evaluation.simulation.options import SweepOptions
 from cadalign.geometry.metrics import alignment_box_iou, rotation_error
 from cadalign.report import media, write_report
 from cadalign.report.instances import compact

@@ -13,9 +13,9 @@ import pytest
 from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.evaluation.api import run as do_run
+from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.simulation.options import SweepOptions
 from cadalign.report import FORMATS, headline_text
 from cadalign.report.headline import Headline, HeadlineRow
 from cadalign.report.tables import table_text

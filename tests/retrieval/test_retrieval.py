@@ -18,7 +18,7 @@ from cadalign.datasets import KeypointNet, Symmetries
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.retrieval.tasks import RetrievalTask, observe_model
+from cadalign.evaluation.instances.queries import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.bounds import error_bound

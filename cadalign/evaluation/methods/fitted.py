@@ -11,15 +11,11 @@ from typing import TYPE_CHECKING, Any
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import METHODS, RansacOptions
 from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.options import LIMIT
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
-
-LIMIT = "limit"
-"""The pseudo-method of the Cramer-Rao bound; see `cramer_rao.limit_estimate`."""
-SHAPE = "shape"
-"""The alignment of a category's learned shape, in runs that are given one."""
 
 # Names for a method together with options of `cadalign.fit`.
 _VARIANTS: dict[str, dict[str, Any]] = {
@@ -103,7 +99,7 @@ class FitCall:
 
 def bound_estimate(given: MethodInput) -> Alignment:
     """The estimate of an ideal estimator that knows the outliers."""
-    from cadalign.evaluation.accuracy.cramer_rao import limit_estimate
+    from cadalign.evaluation.metrics.cramer_rao import limit_estimate
 
     if given.gt is None:
         raise InputError("the Cramer-Rao bound needs the true alignment", where="methods")

@@ -7,7 +7,7 @@ definitions of bop_toolkit's ``pose_error.py`` with the visibility of BOP 2019 a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,14 +18,15 @@ from cadalign.errors import InputError
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.photos.target import PhotoTarget
-from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.render.raycast.renderer import cast_geometry
-from cadalign.render.scene import Scene
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.runs.tables import Row
+    from cadalign.render.scene import Scene
 
 MAX_STEP = 0.01
 """Of a diameter: how far rotations about an axis of symmetry move the model's points at most."""
@@ -139,6 +140,8 @@ def vsd(
     taus : sequence of float
         Misalignment tolerances, as fractions of the diameter.
     """
+    from cadalign.render.raycast.renderer import cast_geometry
+
     drawn = [cast_geometry(scene, camera, pose).depth for pose in (est, gt)]
     return vsd_of_depths(
         est=drawn[0], gt=drawn[1], test=depth, camera=camera, diameter=diameter, delta=delta,

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.evaluation.instances.instance import Instance
-from cadalign.evaluation.instances.symmetry import InstanceSymmetry
-from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import (
@@ -32,6 +30,10 @@ from cadalign.geometry.pose_errors import (
     translation_errors_up_to_scale,
 )
 from cadalign.geometry.projection import perspective
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.instances.instance import Instance, InstanceSymmetry
+    from cadalign.evaluation.runs.tables import Row
 
 
 def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
@@ -59,10 +61,6 @@ def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
         return box_iou_up_to_scale(est=est, gt=gt)
     except InputError:
         return None
-
-
-POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
-"""Errors that the symmetries of a model bear on."""
 
 
 @np.errstate(all="ignore")

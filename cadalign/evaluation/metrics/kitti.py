@@ -6,17 +6,20 @@ Geiger et al., "Are we ready for Autonomous Driving?", CVPR 2012, and the benchm
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
 from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
-from cadalign.evaluation.photos.target import PhotoTarget
-from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import box_iou
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.runs.tables import Row
 
 
 @dataclass(frozen=True)

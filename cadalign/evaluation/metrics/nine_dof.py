@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +18,15 @@ from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.errors import overlap_up_to_scale
 from cadalign.evaluation.metrics.sets import MetricSet, Rate, numbers
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.photos.target import PhotoTarget
-from cadalign.evaluation.runs.opened import Cells
-from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import box_iou
 from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.runs.opened import Cells
+    from cadalign.evaluation.runs.tables import Row
 
 IOU_THRESHOLDS = (0.25, 0.5, 0.75)
 DEGREE_CM = ((5.0, 2.0), (5.0, 5.0), (10.0, 2.0), (10.0, 5.0), (10.0, 10.0))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,12 +16,14 @@ from cadalign.arrays import as_floats
 from cadalign.errors import InputError
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.sets import MetricSet, Rate, numbers
-from cadalign.evaluation.photos.target import PhotoTarget
-from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.symmetry import symmetric_rotation_error
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.runs.tables import Row
 
 ACCURACY_DEG = 30.0
 """pi/6 [degrees]."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,12 +17,14 @@ from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.photos.target import PhotoTarget
-from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import scale_error
 from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.runs.tables import Row
 
 MAX_TRANSLATION = 0.2
 """[m]"""

@@ -8,19 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import FAILED
-from cadalign.evaluation.photos.target import PhotoTarget
-from cadalign.evaluation.runs.opened import Cells
-from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.summary import known, median_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.runs.opened import Cells
+    from cadalign.evaluation.runs.tables import Columns, Row
 
 PERCENTILE = 90
 

@@ -1,19 +1,37 @@
-"""Errors of poses that somebody else estimated, on a data set of photos."""
+"""Poses that somebody else estimated, on the objects of photos: methods that read a file.
+
+Rows have the columns of `cadalign.evaluation.photos.objects`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.errors import CadalignError, InputError, quote
+from cadalign.datasets.photos.photo import NamedPoints
+from cadalign.datasets.photos.poses import PoseEstimate, PoseFile
+from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting, write_picture
+from cadalign.evaluation.experiments.estimates import EstimatesOptions
+from cadalign.evaluation.experiments.photos import COLUMNS, summarize_cells
+from cadalign.evaluation.instances.record import RECORD_COLUMNS
+from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.metrics.bop import mssd
 from cadalign.evaluation.metrics.sets import score_alignment
-from cadalign.evaluation.outcome import LEFT_OUT, Outcome, reason_of
-from cadalign.evaluation.photos.experiment import COLUMNS
+from cadalign.evaluation.outcome import LeftOutError, Outcome
+from cadalign.evaluation.photos.methods import PhotoEstimate
+from cadalign.evaluation.photos.objects import draw_sighting, sighting_record, targets_of
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
-from cadalign.evaluation.photos.spec import summarize_cells
-from cadalign.evaluation.photos.target import PhotoTarget
+from cadalign.evaluation.photos.sighting import Sighting
+from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened
+from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.summary import Summary
 from cadalign.geometry.alignment import Alignment
@@ -21,6 +39,109 @@ from cadalign.geometry.box import Box
 
 Poses = Mapping[tuple[str, str], Alignment]
 """Alignments by the photo's name and the object's id."""
+_FACTS = {"source": "", "keypoints": 0}
+_STEP = 0.1  # of rotations about an axis of symmetry, coarse: it only decides which object is meant
+
+
+@dataclass(frozen=True, eq=False)
+class GivenPoses:
+    """An object of a photo, and each method's pose of it, or why it has none."""
+
+    target: PhotoTarget
+    protocol: Protocol
+    poses: tuple[PoseEstimate | CadalignError | None, ...]
+    is_shown: bool = False
+
+
+@dataclass(frozen=True)
+class PosesOfObjects(Setting):
+    """Objects of photos with given poses; they are tasks and instances at once."""
+
+    names = VIEW_NAMES
+    columns = COLUMNS
+
+    def case(self, task: GivenPoses) -> Case:
+        """An object with its poses."""
+        return Case(task.target.names, _FACTS, task)
+
+    def row(self, method: Method, instance: GivenPoses, estimate: PhotoEstimate) -> Row:
+        """Errors by the metrics of the data set."""
+        sets = instance.protocol.metrics
+        return score_alignment(instance.target, sets, estimate.alignment, estimate.box)
+
+
+@dataclass(frozen=True)
+class PosesOfFiles(PosesOfObjects):
+    """Poses of files on the objects of photos: the setting of the experiment.
+
+    Parameters
+    ----------
+    options : EstimatesOptions
+    drawn_in : RunFolder
+        The folder that pictures go to.
+    """
+
+    record_columns = RECORD_COLUMNS
+
+    options: EstimatesOptions
+    drawn_in: RunFolder = field(repr=False)
+
+    def failed(self, task: PhotoTask) -> list[Case]:
+        """The case of a photo that cannot be scored."""
+        return [Case(task.names, _FACTS)]
+
+    def _cases(self, task: PhotoTask) -> list[Case]:
+        """The objects of a photo, with their poses."""
+        found = targets_of(task, self.options.root)
+        targets = [each for each in found if isinstance(each, PhotoTarget)]
+        files = [self._poses(path, targets) for path in self.options.estimates if targets]
+        cases = []
+        for each in found:
+            if isinstance(each, Case):
+                cases.append(replace(each, facts=_FACTS))
+                continue
+            poses = tuple(
+                some if isinstance(some, CadalignError) else some.get(each.found.object_id)
+                for some in files
+            )
+            protocol = protocol_of(opened(self.options.root).kind)
+            shown = task.index < self.options.pictures
+            cases.append(self.case(GivenPoses(each, protocol, poses, shown)))
+        return cases
+
+    def _poses(
+        self, path: Path, targets: Sequence[PhotoTarget]
+    ) -> dict[str, PoseEstimate] | CadalignError:
+        """Poses of a file by the objects' ids, or why it has none of the photo."""
+        try:
+            file = opened_estimates(path, opened(self.options.root))
+            return match_estimates(targets, file.poses_in(targets[0].photo))
+        except CadalignError as error:
+            return error
+
+    def finish(
+        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
+    ) -> tuple[list[Outcome], Row | None]:
+        """The outcomes with their files' times, the record and the pictures of an object."""
+        instance: GivenPoses = case.instance
+        outcomes = [
+            replace(outcome, seconds=pose.seconds if isinstance(pose, PoseEstimate) else None)
+            for outcome, pose in zip(outcomes, instance.poses, strict=True)
+        ]
+        sighting = _sighting(instance.target)
+        if sighting is None or not any(outcome.is_ok for outcome in outcomes):
+            return outcomes, None
+        if instance.is_shown:
+            best = next(each for each in estimates if isinstance(each, PhotoEstimate))
+            write_picture(draw_sighting, self.drawn_in, sighting, best)
+        return outcomes, sighting_record(sighting, outcomes, estimates)
+
+
+def estimates_benchmark(
+    options: EstimatesOptions, names: Sequence[str], drawn_in: RunFolder
+) -> Benchmark:
+    """Files of estimates, by these names, on the objects of photos."""
+    return Benchmark(PosesOfFiles(options, drawn_in), _methods(names))
 
 
 def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -> list[Row]:
@@ -40,7 +161,7 @@ def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -
     -------
     list of dict
         A row for each object with a true pose, with the columns of
-        `cadalign.evaluation.photos.experiment`.
+        `cadalign.evaluation.photos.objects`.
 
     Raises
     ------
@@ -56,45 +177,102 @@ def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -
     >>> score_poses(dataset, truth)[0]["mssd"]  # doctest: +SKIP
     0.0
     """
-    protocol, root = protocol_of(dataset.kind), str(dataset.root)
-    left = set(poses)
-    rows = []
-    for target in _targets(dataset, root):
-        key = target.photo.name, target.found.object_id
-        left.discard(key)
-        rows.append(_outcome(target, protocol, poses.get(key), method).row())
+    protocol = protocol_of(dataset.kind)
+    tasks, left = [], set(poses)
+    for target in _targets(dataset):
+        photo, object_id = target.photo.name, target.found.object_id
+        est, model = poses.get((photo, object_id)), target.found.model
+        model_id = "" if model is None else model.model_id
+        pose = None if est is None else PoseEstimate("", photo, model_id, est, 1.0)
+        tasks.append(GivenPoses(target, protocol, (pose,)))
+        left.discard((photo, object_id))
     if left:
-        photo, found = sorted(left)[0]
-        what = f"the data set has no object {quote(found)} with a pose in the photo {quote(photo)}"
-        raise InputError(what, where="poses")
-    return rows
+        photo, object_id = sorted(left)[0]
+        what = f"the data set has no object {quote(object_id)} with a pose in the photo "
+        raise InputError(f"{what}{quote(photo)}", where="poses")
+    return Benchmark(PosesOfObjects(), _methods([method])).evaluate(tasks).rows
 
 
 def summarize_rows(rows: list[Row]) -> list[Summary]:
-    """Summaries of rows by category and method; see `cadalign.evaluation.photos.spec`."""
+    """Summaries of rows by category and method; see `cadalign.evaluation.experiments.photos`."""
     names = (*(name for name, _ in COLUMNS), "seconds")
     cells = {name: np.array([row.get(name) for row in rows], dtype=object) for name in names}
     return summarize_cells(cells, list(dict.fromkeys(row["method"] for row in rows)))
 
 
-def _targets(dataset: PhotoDataset, root: str) -> Iterator[PhotoTarget]:
+def _targets(dataset: PhotoDataset) -> Iterator[PhotoTarget]:
     for photo in dataset:
         for found in photo.objects:
             if found.truth.cam_from_model is not None or found.truth.box is not None:
-                yield PhotoTarget(photo, found, root)
+                yield PhotoTarget(photo, found, str(dataset.root))
 
 
-def _outcome(
-    target: PhotoTarget, protocol: Protocol, est: Alignment | None, method: str
-) -> Outcome:
-    names, facts = {**target.names, "method": method}, {"source": ""}
-    if est is None:
-        return Outcome.failure("there is no estimate", names, **facts)
+def _methods(names: Sequence[str]) -> tuple[Method, ...]:
+    return tuple(Method(name, partial(_pose, index=k)) for k, name in enumerate(names))
+
+
+def _pose(instance: GivenPoses, *, index: int) -> PhotoEstimate:
+    """The pose that a method has of an object."""
+    target, pose = instance.target, instance.poses[index]
+    bounds = target.bounds
+    if target.gt is None or bounds is None:
+        raise LeftOutError("the true pose or the size of the model is not known")
+    if not isinstance(pose, PoseEstimate):
+        raise DegenerateError("there is no estimate") if pose is None else pose
+    return PhotoEstimate(pose.cam_from_model, Box.from_model(bounds, pose.cam_from_model))
+
+
+def _sighting(target: PhotoTarget) -> Sighting | None:
+    """The object without keypoints, for its picture and its record; None without a camera."""
+    camera, bounds = target.camera, target.bounds
+    if camera is None or bounds is None or not camera.focal_known:
+        return None
+    nothing = NamedPoints((), np.empty((0, 3)))
+    no_pixels = np.empty((0, 2))
+    return Sighting(target, camera, "", (), no_pixels, 1.0, nothing, bounds, 1.0, "y")
+
+
+# Files --------------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=8)
+def opened_estimates(path: Path, dataset: PhotoDataset) -> PoseFile:
+    """Open a file of estimates on a data set, once in every process."""
+    return dataset.open_poses(path)
+
+
+def match_estimates(
+    targets: Sequence[PhotoTarget], poses: Sequence[PoseEstimate]
+) -> dict[str, PoseEstimate]:
+    """The estimate of each object, by the object's id.
+
+    As in BOP's localisation task, a photo's n objects of one model are matched with the n estimates
+    of the highest scores; the others are not counted. The best estimate takes the object that it is
+    nearest to, by the symmetry-aware distance of surfaces, and so on.
+    """
+    of_model: dict[str, list[PhotoTarget]] = defaultdict(list)
+    for target in targets:
+        if target.found.model is not None:
+            of_model[target.found.model.model_id].append(target)
+    found: dict[str, PoseEstimate] = {}
+    for model_id, left in of_model.items():
+        own = [each for each in poses if each.model_id == model_id]
+        for pose in sorted(own, key=lambda each: -each.score)[: len(left)]:
+            nearest = min(left, key=lambda target: _distance(target, pose.cam_from_model))
+            left.remove(nearest)
+            found[nearest.found.object_id] = pose
+    return found
+
+
+def _distance(target: PhotoTarget, est: Alignment) -> float:
+    gt, cad = target.gt, target.cad
+    if gt is None:
+        return float("inf")
     try:
-        bounds = target.bounds
-        if bounds is None:
-            return Outcome(names, facts, LEFT_OUT, "the size of the model is not known")
-        scores = score_alignment(target, protocol.metrics, est, Box.from_model(bounds, est))
-    except CadalignError as error:
-        return Outcome.failure(reason_of(error), names, **facts)
-    return Outcome(names, facts | scores)
+        if cad is not None and cad.has_mesh:
+            symmetry = target.found.symmetry
+            vertices = cad.hull_vertices
+            return mssd(est=est, gt=gt, vertices=vertices, symmetry=symmetry, max_step=_STEP)
+    except CadalignError:
+        pass
+    return float(np.linalg.norm(est.translation - gt.translation))

@@ -16,23 +16,23 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.instances.aligned import box_alignment
+from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.options import SHAPE
 from cadalign.evaluation.outcome import LeftOutError
-from cadalign.evaluation.photos.options import (
+from cadalign.evaluation.photos.protocols import (
     DEPTH,
     EPNP,
     GRAVITY,
     MASK,
     PRIOR,
     RIGID,
-    SHAPE,
     SIMILAR,
     STRETCHED,
     TRUTH,
+    Protocol,
     parts_of,
 )
-from cadalign.evaluation.photos.protocols import Protocol
 from cadalign.evaluation.photos.sighting import Sighting
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -74,7 +74,7 @@ class PhotoInstance:
     shapes : tuple of ShapeModel
         Each for the category that it names.
     similar_sigma : float
-        Deviation of the object's keypoints from the model's [diagonals of the model].
+        Standard deviation of the object's keypoints from the model's [diagonals of the model].
     is_shown : bool
         Its pictures are drawn.
     """
@@ -87,7 +87,7 @@ class PhotoInstance:
 
 
 def photo_method(name: str) -> Method:
-    """The method of a name; see `cadalign.evaluation.photos.options`."""
+    """The method of a name; see `cadalign.evaluation.photos.protocols`."""
     return Method(name, partial(estimate_object, name))
 
 
@@ -186,7 +186,7 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
 def _mesh(sighting: Sighting) -> Mesh:
     cad = sighting.target.cad
     if cad is None or not cad.has_mesh:
-        raise LeftOutError("the model has no mesh, which a mask needs")
+        raise LeftOutError("the model has no mesh for the mask")
     mesh = cad.scene.mesh
     return Mesh(mesh.vertices * sighting.width, mesh.faces)
 
@@ -233,7 +233,7 @@ def _of_shape(
     if shape is None:
         raise LeftOutError(f"there is no shape model of {category}")
     if MASK in evidence:
-        raise LeftOutError("a shape model has no mesh, which a mask needs")
+        raise LeftOutError("a shape model has no mesh for the mask")
     known = np.isin(sighting.names, [str(name) for name in shape.ids])
     if not known.any():
         raise LeftOutError("the shape model has none of the keypoints")

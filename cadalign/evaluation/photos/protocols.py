@@ -1,7 +1,11 @@
-"""Data sets' habits: which metrics they are evaluated by, and how accurate their keypoints are."""
+"""Protocols of data sets of photos: their metrics and keypoints, and the names of methods.
+
+A method's name is a base, and the evidence beside the keypoints, as in ``rigid+mask``.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from cadalign.datasets.photos.bop import Bop
@@ -11,13 +15,83 @@ from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.posed_photos import PosedPhotos
 from cadalign.datasets.photos.scan2cad import Scan2CAD
+from cadalign.errors import InputError, quote
 from cadalign.evaluation.metrics.bop import BOP
 from cadalign.evaluation.metrics.kitti import KITTI
 from cadalign.evaluation.metrics.nine_dof import NINE_DOF
 from cadalign.evaluation.metrics.pascal3d import VIEWPOINT
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import MetricSet
-from cadalign.evaluation.photos.options import PRIOR, RIGID, SHAPE, SIMILAR, STRETCHED
+from cadalign.evaluation.options import SHAPE
+
+EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
+TRUTH = "truth"
+BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
+MASK, DEPTH, GRAVITY = "mask", "depth", "gravity"
+EVIDENCE = (MASK, DEPTH, GRAVITY)
+
+
+def parts_of(method: str) -> tuple[str, frozenset[str]]:
+    """The base of a method, and its evidence.
+
+    Examples
+    --------
+    >>> base, evidence = parts_of("rigid+mask+depth")
+    >>> base, sorted(evidence)
+    ('rigid', ['depth', 'mask'])
+    """
+    base, *evidence = method.split("+")
+    return base, frozenset(evidence)
+
+
+def is_own(method: str) -> bool:
+    """True for a name whose base is one of the experiment's."""
+    return parts_of(method)[0] in (*BASES, TRUTH)
+
+
+def check_method(method: str) -> None:
+    """Check the name of a method.
+
+    Raises
+    ------
+    InputError
+        If there is none of this name, or EPnP or the truth is given evidence.
+    """
+    base, evidence = parts_of(method)
+    is_known = base in (*BASES, TRUTH) and evidence <= set(EVIDENCE)
+    if not is_known or method.count("+") != len(evidence):
+        fix = f"known are {', '.join((*BASES, TRUTH))}, with {', '.join(f'+{e}' for e in EVIDENCE)}"
+        raise InputError(f"unknown method {quote(method)}", where="methods", fix=fix)
+    if evidence and base in (EPNP, TRUTH):
+        fix = "give rigid, stretched, prior, similar or shape the evidence"
+        raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
+
+
+def default_methods(
+    *,
+    with_evidence: Collection[str],
+    evidence: Collection[str],
+    has_shape: bool,
+    up_axis: str = "y",
+) -> tuple[str, ...]:
+    """The methods for data that have some evidence, which the given bases get, where they can.
+
+    A shape model has no mesh for a mask; other models must be upright along y for gravity.
+
+    Examples
+    --------
+    >>> default_methods(with_evidence=("rigid",), evidence={"mask", "depth"}, has_shape=False)[5:]
+    ('rigid+mask', 'rigid+depth', 'rigid+mask+depth')
+    """
+    bases = [base for base in BASES if has_shape or base != SHAPE]
+    more = []
+    for base in (each for each in with_evidence if each in bases):
+        useless = {MASK} if base == SHAPE else {GRAVITY} if up_axis != "y" else set()
+        kinds = [kind for kind in EVIDENCE if kind in evidence and kind not in useless]
+        sets = [[kind] for kind in kinds] + ([kinds] if len(kinds) > 1 else [])
+        more += ["+".join((base, *each)) for each in sets]
+    return (*bases, *more)
+
 
 SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI, BOP)
 """All sets of metrics, in the order of the result table's columns."""

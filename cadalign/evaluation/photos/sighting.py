@@ -10,15 +10,15 @@ from scipy import ndimage
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.photos.photo import NamedPoints, PhotoObject
 from cadalign.estimation.fit import fit
+from cadalign.evaluation.experiments.photos import SIMULATED, PhotosOptions
 from cadalign.evaluation.outcome import LeftOutError
-from cadalign.evaluation.photos.options import PhotosOptions
 from cadalign.evaluation.photos.protocols import Protocol
 from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
 from cadalign.geometry.camera import Camera
 from cadalign.render.views.visibility import visible_keypoints
 from cadalign.seeding import instance_rng
 
-ANNOTATED, DETECTED, SIMULATED = "annotated", "detected", "simulated"
+ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _RIM = 2  # width of a mask's rim [px]
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated

@@ -1,7 +1,8 @@
-"""Objects of photos with their truth and CAD models, each of which is read once for many photos."""
+"""Photos as tasks, and their objects with truth and CAD models, which are read once for many."""
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -10,9 +11,13 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets.photos.dataset import PhotoDataset
+from cadalign.datasets.photos.formats import open_photos
 from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError
-from cadalign.evaluation.instances.aligned import box_alignment
+from cadalign.evaluation.benchmark import Tasks
+from cadalign.evaluation.experiments.photos import UNREADABLE
+from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.outcome import LeftOutError
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
@@ -24,6 +29,59 @@ from cadalign.render.scene import Scene
 _KEPT = 16
 _ON_SURFACE = 2000  # points among which farthest ones are sought, beside the vertices
 _MOST_OF_HULL = 1000  # points whose distances are compared
+
+
+@dataclass(frozen=True)
+class PhotoTask:
+    """One photo of a data set, by its number.
+
+    Parameters
+    ----------
+    index : int
+        Its number in the data set; -1 of a record that is no photo.
+    name : str
+    problem : str
+        Reason why the record cannot be read at all; empty otherwise.
+    """
+
+    index: int
+    name: str
+    problem: str = ""
+
+    @property
+    def names(self) -> Row:
+        """The cells that name the rows of the whole record, but for the method."""
+        return {"category": UNREADABLE, "model_id": self.name, "view": 0}
+
+
+class PhotoTasks(Tasks[PhotoTask]):
+    """The photos of a data set, then the records that its listing could not read."""
+
+    def __init__(self, dataset: PhotoDataset, max_photos: int | None) -> None:
+        self._names = dataset.names[:max_photos]
+        bad = dataset.problems.items() if max_photos is None else ()
+        self._bad = tuple((name, str(error)) for name, error in bad)
+        if not len(self):
+            raise DataError("there are no photos", where=str(dataset.root))
+
+    def __len__(self) -> int:
+        return len(self._names) + len(self._bad)
+
+    def task(self, index: int) -> PhotoTask:
+        """A photo, or a record that could not be read."""
+        if index < len(self._names):
+            return PhotoTask(index, self._names[index])
+        return PhotoTask(-1, *self._bad[index - len(self._names)])
+
+    def fingerprint(self) -> str:
+        """Hash of the photos' names: a run must not go on with others."""
+        digest = hashlib.sha256("\0".join(self._names).encode("utf-8", "replace"))
+        digest.update(repr(self._bad).encode("utf-8", "replace"))
+        return digest.hexdigest()[:16]
+
+
+opened = lru_cache(maxsize=1)(open_photos)
+"""The data set of a folder, listed once in every process."""
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from cadalign.errors import DataError
 from cadalign.evaluation.outcome import Outcome
-from cadalign.evaluation.runs.tables import Columns, Row
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.runs.tables import Columns, Row
 
 T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)

@@ -28,11 +28,9 @@ from cadalign import Alignment
 from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.evaluation.api import evaluate, run
+from cadalign.evaluation.experiments.photos import SPEC, PhotosOptions
 from cadalign.evaluation.photos.given import score_poses, summarize_rows
-from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.spec import SPEC
-from cadalign.evaluation.photos.target import farthest_points
-from cadalign.evaluation.photos.tasks import opened
+from cadalign.evaluation.photos.target import farthest_points, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress

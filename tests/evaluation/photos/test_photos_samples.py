@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from cadalign.evaluation.api import run
-from cadalign.evaluation.photos.options import PhotosOptions
-from cadalign.evaluation.photos.spec import SPEC
+from cadalign.evaluation.experiments.photos import SPEC, PhotosOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 

@@ -1,1 +1,0 @@
-"""Errors of methods on instances, their summaries, and the Cramer-Rao bound."""

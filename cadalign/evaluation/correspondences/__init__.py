@@ -1,1 +1,0 @@
-"""The experiment on real images with wrong correspondences."""

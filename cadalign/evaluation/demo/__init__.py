@@ -1,1 +1,0 @@
-"""The demonstration on the sample dataset."""

@@ -1,1 +1,0 @@
-"""The experiment on estimates of other programs, read from their files."""

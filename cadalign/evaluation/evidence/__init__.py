@@ -1,1 +1,0 @@
-"""The experiment on evidence beyond keypoints."""

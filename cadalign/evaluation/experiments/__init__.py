@@ -1,0 +1,1 @@
+"""Experiments: options, plan, summary and page text of each."""

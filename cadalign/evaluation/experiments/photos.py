@@ -1,0 +1,360 @@
+"""The experiment on data sets of photos.
+
+Cells of a summary: ``instances``, those with rows that are not left out, ``failed`` and
+``left_out``; ``keypoints``, the mean number of those that did not fail; over these the medians of
+the result table's errors, ``yaw_error_deg_90``, the 90th percentile, and ``milliseconds``, the
+median time of an estimate. Shares of all instances, failures included: ``accuracy_pi_6``, rotation
+errors below 30 degrees; ``iou_25``, ``iou_50``, ``iou_75``, boxes with a larger IoU;
+``deg_5_cm_5`` and the like; ``scan2cad_aligned``; ``mssd_recall``, ``mspd_recall`` and
+``vsd_recall``, and their mean ``average_recall``. NaN where there is none, as for objects whose
+truth is not known.
+
+The categories of objects with simulated keypoints are marked so. Behind all categories comes
+``mean of categories``, as Scan2CAD and PASCAL3D+ report.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import tyro
+
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.benchmark import VIEW_NAMES
+from cadalign.evaluation.methods.registry import is_registered
+from cadalign.evaluation.metrics import kitti
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.bop import BOP
+from cadalign.evaluation.metrics.kitti import KITTI
+from cadalign.evaluation.metrics.nine_dof import NINE_DOF
+from cadalign.evaluation.metrics.pascal3d import ROTATION, VIEWPOINT
+from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
+from cadalign.evaluation.metrics.sets import medians_of, score_columns, shares_of
+from cadalign.evaluation.metrics.table import BOX_IOU, Metric
+from cadalign.evaluation.options import FunctionOptions
+from cadalign.evaluation.outcome import FAILED, LEFT_OUT, OK
+from cadalign.evaluation.photos.protocols import (
+    DEPTH,
+    GRAVITY,
+    MASK,
+    RIGID,
+    SETS,
+    check_method,
+    default_methods,
+    is_own,
+    protocol_of,
+)
+from cadalign.evaluation.plots import Plot, cumulative
+from cadalign.evaluation.spec import Spec
+from cadalign.evaluation.summary import (
+    ALL,
+    Conclusion,
+    ConsoleTable,
+    Summary,
+    known,
+    mean_of,
+    milliseconds,
+    summaries_of,
+    where,
+)
+
+if TYPE_CHECKING:
+    from cadalign.datasets.photos.dataset import PhotoDataset
+    from cadalign.evaluation.photos.target import PhotoTask
+    from cadalign.evaluation.runs.folder import RunFolder
+    from cadalign.evaluation.runs.opened import Cells, Run
+    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.work import Plan
+
+SIMULATED = "simulated"
+"""Source of keypoints that are projected with the true pose."""
+UNREADABLE = "unreadable"
+"""The category of records that cannot be read."""
+COLUMNS: Columns = (
+    *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
+    *(("rms_px", float), *score_columns(SETS)),
+)
+"""Columns of the result table; see `cadalign.evaluation.photos.objects`."""
+
+
+@dataclass(frozen=True)
+class PhotosOptions(FunctionOptions):
+    """Evaluate methods on photos of real objects, by the metrics of their data set.
+
+    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
+    are the annotated or detected ones; where there are none, visible points of the model's mesh are
+    projected with the true pose, with noise, and called simulated. The model's width (x) is given,
+    as one image does not tell size; with depth, or a shape model in metres, it is estimated. The
+    run's folder gets results.parquet with a row per object and method, summary.csv, figures and
+    report.html. Killed, it goes on where it was when the same command is started again.
+    """
+
+    experiment = "photos"
+
+    root: Annotated[Path, tyro.conf.Positional]
+    """Folder of the data set, in any of the known formats."""
+    _: KW_ONLY
+    categories: tuple[str, ...] | None = None
+    """Categories to take; all by default."""
+    max_photos: int | None = None
+    """Number of photos to take, the first ones; all by default."""
+    methods: tuple[str, ...] = ()
+    """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
+    keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
+    rigid+mask or similar+depth+gravity; and truth. By default the first five, shape where there is
+    one, and the evidence that the data have."""
+    shape: tuple[Path, ...] = ()
+    """Files of `cadalign shape learn`, each for its category."""
+    simulated_noise_px: float = 1.0
+    """Standard deviation of simulated keypoints, in pixels."""
+    simulated_points: int = 24
+    """Number of points on a model of which the visible ones are simulated keypoints."""
+    sigma: float | None = None
+    """Standard deviation of annotated or detected keypoints that methods are told, in pixels; by
+    default that of the data set."""
+    similar_sigma: float = 0.04
+    """Standard deviation of the object's keypoints from the model's, for the method similar, in
+    diagonals of the model."""
+    min_keypoints: int = 6
+    """Objects with fewer keypoints are left out."""
+    min_score: float = 0.4
+    """Detected keypoints with lower scores are not used."""
+    pictures: int = 100
+    """Number of photos whose pictures the report shows, the first ones."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(max_photos=1, simulated_points=4, min_keypoints=1, pictures=0)
+        for name in ("sigma", "similar_sigma"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"{value} is not positive", where=name)
+        if not 0 <= self.simulated_noise_px < math.inf:
+            what = f"{self.simulated_noise_px} is not a noise level"
+            raise InputError(what, where="simulated_noise_px")
+        if not math.isfinite(self.min_score):
+            raise InputError(f"{self.min_score} is not a score", where="min_score")
+        self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
+        for name in self.methods:
+            if is_own(name) or not is_registered(name):
+                check_method(name)
+
+
+MEAN = "mean of categories"
+GALLERY = (
+    *(metric for each in SETS for metric in each.medians),
+    metrics.RMS,
+    *BOP.shares,
+)
+"""Errors of single objects."""
+# The data sets' own first.
+_OWN_FIRST = (SCAN2CAD, KITTI, BOP, VIEWPOINT, NINE_DOF)
+HEADLINE = (
+    *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT, metrics.KEYPOINTS),
+    *(metric for each in _OWN_FIRST for metric in each.headline),
+    *(metric for each in _OWN_FIRST for metric in each.details),
+    *(metrics.RMS, metrics.QUERY_MILLISECONDS),
+)
+
+
+def summarize(run: Run) -> list[Summary]:
+    """A summary for every category and method, for all together, and the mean of categories."""
+    return summarize_cells(run.cells, run.methods, further=run.metrics)
+
+
+def summarize_cells(
+    cells: Cells, methods: Sequence[str], *, further: Sequence[Metric] = ()
+) -> list[Summary]:
+    """Summaries of the columns of a result table; see `summarize`."""
+    marked = {**cells, "category": _categories(cells)}
+    found = summaries_of(marked, methods, _summarize, further=further)
+    names = dict.fromkeys(each.group for each in found if each.group not in (ALL, UNREADABLE))
+    if len(names) < 2:
+        return found
+    return [*found, *(_mean([s for s in found if s.method == name]) for name in methods)]
+
+
+def _categories(cells: Cells) -> npt.NDArray[np.object_]:
+    """The rows' categories, those of objects with simulated keypoints marked."""
+    categories, is_simulated = cells["category"], cells["source"] == SIMULATED
+    known_otherwise = set(categories[(cells["status"] != LEFT_OUT) & ~is_simulated].tolist())
+    only = set(categories[is_simulated].tolist()) - known_otherwise
+    marked = is_simulated | np.isin(categories.astype(str), sorted(only))
+    names = [
+        f"{name}, {SIMULATED}" if mark else name
+        for name, mark in zip(categories.tolist(), marked.tolist(), strict=True)
+    ]
+    return np.array(names, dtype=object)
+
+
+def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
+    """The summaries for the console: the columns that the data set has."""
+    sets = protocol_of(str(run.config.get("kind"))).metrics
+    columns = (
+        *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT),
+        *(column for each in sets for column in each.console),
+        *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
+        *run.metrics,
+    )
+    shown = [c for c in columns if not all(np.isnan(each[c.key]) for each in summaries)]
+    has_simulated = any(SIMULATED in each.group for each in summaries)
+    more = f"; {SIMULATED}: keypoints projected with the true pose, with noise"
+    return ConsoleTable.of(
+        "Medians and shares per category and method",
+        summaries,
+        shown,
+        note=f"shares count failures{more if has_simulated else ''}",
+        narrow=True,
+        wraps=True,
+    )
+
+
+def _summarize(category: str, method: str, cells: Cells) -> Summary:
+    chosen = where(cells, cells["method"] == method)
+    left_out = chosen["status"] == LEFT_OUT
+    rated = where(chosen, ~left_out)
+    solved = where(rated, rated["status"] == OK)
+    values = {
+        "instances": len(rated["method"]),
+        "failed": int((rated["status"] == FAILED).sum()),
+        metrics.LEFT_OUT.key: int(left_out.sum()),
+        "keypoints": mean_of(solved["keypoints"]),
+        **medians_of(SETS, solved, metrics.RMS),
+        **shares_of(SETS, rated, solved),
+        "milliseconds": milliseconds(solved),
+    }
+    return Summary(category, {"category": category, "method": method}, values)
+
+
+def _mean(found: Sequence[Summary]) -> Summary:
+    """The mean of a method's values over categories; its counts are those of all."""
+    (every,) = (each for each in found if each.group == ALL)
+    single = [each for each in found if each.group not in (ALL, UNREADABLE)]
+    counts = ("instances", "failed", metrics.LEFT_OUT.key)
+    values = {
+        key: value if key in counts else mean_of(np.array([each.values[key] for each in single]))
+        for key, value in every.values.items()
+    }
+    return Summary(MEAN, {"category": MEAN, "method": every.method}, values)
+
+
+_CURVES = (
+    (ROTATION, np.array([0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 45, 90])),
+    (replace(kitti.DEPTH, log=False), np.array([1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
+    (replace(BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
+    (replace(kitti.IOU_3D, log=False), np.arange(0, 1.01, 0.05)),
+)
+
+
+def plots(runs: Sequence[Run]) -> list[Plot]:
+    """Shares of objects within an error, for the errors that the data sets have."""
+    return [
+        cumulative(runs, metric, places, title=f"{metric.label} on photos")
+        for metric, places in _CURVES
+        if any(len(known(run.cells[metric.key])) for run in runs)
+    ]
+
+
+_CHUNK, _LARGE_CHUNK = 4, 32
+_LARGE = 500  # photos
+_LOOKED_AT = 20  # photos that say which evidence the data set has
+
+
+def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
+    """Plan a run over the photos of a data set."""
+    from cadalign.evaluation.photos.objects import photos_benchmark
+    from cadalign.evaluation.photos.target import PhotoTasks, opened
+    from cadalign.evaluation.shape_files import shapes_fingerprint, shapes_of
+
+    dataset = opened(options.root)
+    protocol = protocol_of(dataset.kind)
+    shapes = shapes_of(options.shape, dataset.root)
+    if not options.methods:
+        methods = default_methods(
+            with_evidence=tuple(dict.fromkeys((RIGID, protocol.best))),
+            evidence=_evidence(dataset),
+            has_shape=bool(shapes),
+            up_axis=protocol.up_axis,
+        )
+        options = replace(options, methods=methods)
+    tasks = PhotoTasks(dataset, options.max_photos)
+    pictures = folder.made_for_pictures()
+    chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK
+    return photos_benchmark(options, shapes, pictures).plan(
+        options,
+        tasks,
+        chunk=chunk,
+        kind=dataset.kind,
+        shapes=shapes_fingerprint(shapes),
+        annotations=tasks.fingerprint(),
+    )
+
+
+def _evidence(dataset: PhotoDataset) -> set[str]:
+    """The evidence that the first photos have."""
+    found: set[str] = set()
+    for index in range(min(_LOOKED_AT, len(dataset))):
+        try:
+            photo = dataset[index]
+        except DataError:
+            continue
+        has = {
+            MASK: any(each.mask_path is not None for each in photo.objects),
+            DEPTH: photo.depth is not None,
+            GRAVITY: photo.up is not None,
+        }
+        found |= {name for name, is_there in has.items() if is_there}
+    return found
+
+
+def _describe(run: Run) -> str:
+    status, source = run.cells["status"], run.cells["source"]
+    objects = len({*run.cells["model_id"][status != LEFT_OUT].tolist()})
+    simulated = len({*run.cells["model_id"][source == SIMULATED].tolist()})
+    text = f"on {objects:,} objects in photos of {run.dataset} ({run.config.get('kind')})"
+    if not simulated:
+        return text
+    whose = "whose" if simulated == objects else f"the keypoints of {simulated:,} of which"
+    keypoints = "keypoints " if simulated == objects else ""
+    noise = run.config.get("simulated_noise_px") or 0
+    return f"{text}, {whose} {keypoints}are simulated: projected with the true pose, {noise:g} px"
+
+
+def _conclude(run: Run, summaries: Sequence[Summary]) -> Conclusion:
+    status: Any = run.cells["status"]
+    left_out = int(np.sum(status == LEFT_OUT))
+    note = f"{left_out} more were left out" if left_out else ""
+    rows, failed = len(status) - left_out, int(np.sum(status == FAILED))
+    return Conclusion(rows, failed, {"left_out": left_out}, note)
+
+
+SPEC = Spec(
+    options=PhotosOptions,
+    plan=plan,
+    results=COLUMNS,
+    columns=HEADLINE,
+    summarize=summarize,
+    table=console_table,
+    plots=plots,
+    conclude=_conclude,
+    topic="alignment to photos",
+    describe=_describe,
+    metrics=GALLERY,
+    about=(
+        "Green is the truth, red what a method found: its box, and the model warped to the "
+        "estimated shape."
+    ),
+    note=(
+        "Medians over the objects that did not fail, and shares of all, of which failures count as "
+        "misses; objects without camera, model or enough keypoints are left out. The model's width "
+        "is the object's, as one image does not tell size, where neither depth nor a shape model "
+        "in metres does. Simulated: the data set has no keypoints, so that visible points of the "
+        "model were projected with the true pose, with noise; all methods get the same."
+    ),
+)

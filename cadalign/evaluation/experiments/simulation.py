@@ -1,0 +1,436 @@
+"""The AEPnP paper's simulation: errors of methods while one quantity is varied.
+
+640 x 480 px, f = 150 px, points in [-1, 1)^3, true scales in [0.5, 2]; see
+`cadalign.evaluation.simulation.problems.simulate_problem`.
+
+A summary is of one metric, over the problems that a method solved at one value. Its cells: ``runs``
+and ``failed``, the number of problems and of those that the method did not solve, and
+``lower_quartile``, ``median`` and ``upper_quartile``, NaN where it solved none.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+import tyro
+
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.benchmark import Benchmark, Case, Setting
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.registry import Compared
+from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.options import FunctionOptions
+from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.spec import Spec
+from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
+from cadalign.geometry.alignment import Alignment
+from cadalign.io.documents import convert, in_file
+from cadalign.seeding import instance_rng
+
+if TYPE_CHECKING:
+    from cadalign.estimation.result import Result
+    from cadalign.evaluation.runs.folder import RunFolder
+    from cadalign.evaluation.runs.opened import Run
+    from cadalign.evaluation.runs.tables import Columns, Row
+    from cadalign.evaluation.runs.work import Plan
+
+
+@dataclass(frozen=True)
+class SweepKind:
+    """The quantity that is varied, a column of the result table, and those that are held."""
+
+    name: str
+    column: Literal["noise_px", "points", "outlier_share"]
+    values: tuple[int | float, ...]
+    points: int
+    noise_px: float
+    outlier_share: float
+    methods: tuple[str, ...]
+    runs: int
+
+    @property
+    def is_timed(self) -> bool:
+        """True where the running time is measured."""
+        return self.name == "runtime"
+
+
+_NOISE = SweepKind(
+    name="noise",
+    column="noise_px",
+    values=(0.5, *(float(noise) for noise in range(1, 11))),
+    points=1024,
+    noise_px=2.0,
+    outlier_share=0.0,
+    methods=("optimal", "aepnp", "aepnp-paper", "epnp", "limit"),
+    runs=2000,
+)
+_POINTS = replace(
+    _NOISE,
+    name="points",
+    column="points",
+    values=(6, 7, 8, 10, 15, 20, 50, 100, 200, 500, 1024),
+)
+_OUTLIERS = replace(
+    _NOISE,
+    name="outliers",
+    column="outlier_share",
+    values=tuple(round(0.1 * tenth, 1) for tenth in range(8)),
+    points=100,
+    methods=("ransac-optimal", "ransac-aepnp", "optimal-cauchy", "optimal", "limit"),
+    runs=500,
+)
+_RUNTIME = replace(
+    _POINTS,
+    name="runtime",
+    values=(6, 10, 20, 50, 100, 200, 500, 1024, 2048),
+    methods=("optimal", "aepnp", "aepnp-paper", "epnp"),
+    runs=100,
+)
+SWEEPS = {kind.name: kind for kind in (_NOISE, _POINTS, _OUTLIERS, _RUNTIME)}
+
+
+@dataclass(frozen=True)
+class SweepOptions(FunctionOptions):
+    """Repeat the AEPnP paper's simulation: a table, a page, and figures as PNG and PDF."""
+
+    experiment = "simulate"
+    command = "simulate"
+
+    sweep: Annotated[str, tyro.conf.Suppress]
+    """The quantity that is varied: noise, points, outliers or runtime."""
+    _: KW_ONLY
+    methods: tuple[str, ...] | None = None
+    """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
+    ransac-aepnp, and limit: the Cramer-Rao bound. The sweep's own by default."""
+    values: tuple[float, ...] | None = None
+    """Values of the quantity that is varied, instead of the sweep's own."""
+    runs: int | None = None
+    """Problems for each value."""
+    points: int | None = None
+    """Number of points, where it is held."""
+    noise_px: float | None = None
+    """Standard deviation of the noise in pixels, where it is held."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sweep not in SWEEPS:
+            fix = f"known are {', '.join(SWEEPS)}"
+            raise InputError(f"unknown sweep {self.sweep!r}", where="sweep", fix=fix)
+        if self.methods is not None:
+            self.check_methods()
+        if self.values is not None:
+            self.replace_values(values=tuple(float(value) for value in self.values))
+        _check_values(self.kind)
+
+    def with_methods(self, names: tuple[str, ...]) -> Self:
+        """The options with further methods beside the sweep's own."""
+        return replace(self, methods=(*self.kind.methods, *names))
+
+    @property
+    def kind(self) -> SweepKind:
+        """The sweep, with what is given in place of its own settings."""
+        names = {field.name for field in fields(SweepKind)}
+        given = {
+            name: value for name, value in vars(self).items() if name in names and value is not None
+        }
+        return replace(SWEEPS[self.sweep], **given)
+
+    @property
+    def run_name(self) -> str:
+        """Name of the run's folder, unless another is given."""
+        return f"simulate_{self.sweep}"
+
+    @property
+    def default_workers(self) -> int:
+        """Processes side by side would slow one another down where times are measured."""
+        return 1 if self.kind.is_timed else -1
+
+
+# Quantities that may be varied: a check, a name, and values to give.
+_CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
+    "points": (
+        lambda value: value >= 4 and value == int(value),
+        "a number of points",
+        "give 4 or more",
+    ),
+    "noise_px": (lambda value: 0 <= value < math.inf, "a noise level", "give pixels, 0 or more"),
+    "outlier_share": (lambda value: 0 <= value < 1, "a share", "give 0 to 0.95"),
+}
+
+
+def _check_values(kind: SweepKind) -> None:
+    """Check the values of a sweep."""
+    if not kind.values:
+        raise InputError("none is given", where="values")
+    settings = {column: (getattr(kind, column),) for column in _CHECKS}
+    for column, values in {**settings, kind.column: kind.values}.items():
+        valid, what, fix = _CHECKS[column]
+        for value in values:
+            if not valid(value):
+                where = "values" if column == kind.column else column
+                raise InputError(f"{value:g} is not {what}", where=where, fix=fix)
+    if kind.runs < 1:
+        raise InputError(f"{kind.runs} is not positive", where="runs")
+
+
+_REPEATS = 5
+ERRORS = (metrics.ROTATION, metrics.TRANSLATION_IN_UNITS, metrics.SCALE_Y, metrics.SCALE_Z)
+COLUMNS: Columns = (
+    *(("points", int), ("noise_px", float), ("outlier_share", float), ("run", int)),
+    *(("method", str), ("status", str), ("reason", str)),
+    *((metric.key, float) for metric in ERRORS),
+)
+
+
+@dataclass(frozen=True)
+class SweepTask:
+    """One random problem; ``value`` is that of the quantity that is varied."""
+
+    value: float
+    run: int
+
+
+def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
+    """All problems of a sweep, value by value."""
+    return [SweepTask(value, run) for value in kind.values for run in range(kind.runs)]
+
+
+@dataclass(frozen=True)
+class SweepProblems(Setting):
+    """Random problems: the setting of the simulation."""
+
+    columns = COLUMNS
+    # Seconds of one call where time is what is measured, a share of the batch's elsewhere.
+    names = (("points", int), ("run", int), ("method", str))
+
+    kind: SweepKind
+    seed: int
+
+    def warm_up(self) -> Sequence[SweepTask]:
+        """A task whose evaluation compiles the solvers."""
+        return [SweepTask(self.kind.values[0], 0)]
+
+    def case(self, task: SweepTask) -> Case:
+        """The problem of a task, and the standard deviation of its noise."""
+        instance = self.problem(task), self._setting(task)["noise_px"] or 1.0
+        return Case(self._names(task), instance=instance)
+
+    def failed(self, task: SweepTask) -> list[Case]:
+        """The case of a task without a problem."""
+        return [Case(self._names(task))]
+
+    def given(self, instance: tuple[Problem, float]) -> MethodInput:
+        """The points of the problem: methods are told the standard deviation of the noise."""
+        problem, sigma = instance
+        inliers = None if problem.outliers is None else ~problem.outliers
+        return MethodInput(
+            problem.points_3d,
+            problem.points_2d,
+            problem.camera,
+            sigma,
+            gt=problem.alignment,
+            inliers=inliers,
+        )
+
+    def answered(
+        self, method: Method, instance: tuple[Problem, float], answer: Alignment | Result
+    ) -> Alignment:
+        """The alignment."""
+        return answer if isinstance(answer, Alignment) else answer.alignment
+
+    def compared(self, instance: tuple[Problem, float], estimate: Alignment) -> Compared:
+        """The estimated and the true alignment."""
+        return Compared(estimate, instance[0].alignment)
+
+    def row(self, method: Method, instance: tuple[Problem, float], estimate: Alignment) -> Row:
+        """Errors of pose and stretch."""
+        return {**alignment_errors(est=estimate, gt=instance[0].alignment)}
+
+    def problem(self, task: SweepTask) -> Problem:
+        """The problem of a task."""
+        rng = instance_rng(self.seed, self.kind.name, repr(float(task.value)), str(task.run))
+        return simulate_problem(rng, **self._setting(task))
+
+    def _setting(self, task: SweepTask) -> Row:
+        """Points, noise and outliers of a task."""
+        held = {name: getattr(self.kind, name) for name in ("points", "noise_px", "outlier_share")}
+        setting = {**held, self.kind.column: task.value}
+        return {**setting, "points": int(setting["points"])}
+
+    def _names(self, task: SweepTask) -> Row:
+        return {**self._setting(task), "run": task.run}
+
+
+def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:
+    """The methods of a sweep on its problems: in batches, or timed alone and several times."""
+    batched = frozenset[str]() if kind.is_timed else frozenset(kind.methods)
+    repeats = _REPEATS if kind.is_timed else 1
+    setting = SweepProblems(kind, seed)
+    return Benchmark.chosen(
+        setting, kind.methods, metrics=metrics, batched=batched, repeats=repeats
+    )
+
+
+VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metrics.OUTLIER_SHARE)}
+"""Quantities that a sweep may vary."""
+
+
+def kind_of(run: Run) -> SweepKind:
+    """The sweep that a run makes."""
+    given = run.config.get("sweep")
+    # What an older run does not say is as in this sweep.
+    stated = {**asdict(SWEEPS["noise"]), **given} if isinstance(given, dict) else given
+    with in_file(run.folder.config_file):
+        found: SweepKind = convert(stated, SweepKind, "sweep")
+        if any(abs(value) > sys.float_info.max for value in found.values):
+            raise DataError("a value is beyond all numbers", where="sweep.values")
+    return found
+
+
+def varied(run: Run) -> Metric:
+    """The quantity that a run varies."""
+    return VARIED[kind_of(run).column]
+
+
+def summarize(run: Run) -> list[Summary]:
+    """Quartiles for every metric, method and value, as far as the run is."""
+    kind, cells = kind_of(run), run.cells
+    if kind.is_timed:
+        cells = {**cells, metrics.MICROSECONDS.key: 1e6 * cells["seconds"]}
+    summaries = []
+    for metric in _metrics(kind, run):
+        for method in kind.methods:
+            for value in kind.values:
+                chosen = (cells["method"] == method) & (cells[kind.column] == value)
+                solved = chosen & (cells["status"] == OK)
+                found = Quartiles.of_solved(cells[metric.key][solved].astype(float))
+                count, failed = int(chosen.sum()), int((chosen & ~solved).sum())
+                if not count:
+                    continue
+                names = {"value": value, "method": method, "metric": metric.key}
+                values = {
+                    "runs": count,
+                    "failed": failed,
+                    "lower_quartile": found.lower,
+                    "median": found.median,
+                    "upper_quartile": found.upper,
+                }
+                group = group_name(VARIED[kind.column], value)
+                summaries.append(Summary(group, names, values, tasks=count))
+    return summaries
+
+
+def lines(summaries: Sequence[Summary]) -> list[Summary]:
+    """Lines of the headline table, value by value, with the medians of all metrics."""
+    found: dict[tuple[float, str], Summary] = {}
+    for s in sorted(summaries, key=lambda s: float(s["value"])):
+        place = s["value"], s.method
+        values = found[place].values if place in found else {"failed": s["failed"]}
+        names = {"value": s["value"], "method": s.method}
+        found[place] = Summary(s.group, names, {**values, s["metric"]: s["median"]}, s.tasks)
+    return list(found.values())
+
+
+def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
+    """Medians of the first metric, a row for each value."""
+    metric = summaries[0]["metric"]
+    shown = [summary for summary in summaries if summary["metric"] == metric]
+    methods = list(dict.fromkeys(summary.method for summary in shown))
+    rows = []
+    for value in dict.fromkeys(summary["value"] for summary in shown):
+        row = {s.method: s for s in shown if s["value"] == value}
+        texts = [
+            "-" if s is None or s["failed"] == s["runs"] else f"{s['median']:.4g}"
+            for s in map(row.get, methods)
+        ]
+        rows.append((f"{value:g}", *texts))
+    heads = (kind_of(run).column, *methods)
+    return ConsoleTable(f"Median {metric}", (), heads, rows, "", grouped=False)
+
+
+def plots(runs: Sequence[Run]) -> list[Plot]:
+    """Errors, and times where they are measured, against the quantity that is varied."""
+    kind, x = kind_of(runs[0]), varied(runs[0])
+    found = [summarize(run) for run in runs]
+    count = max((summary["runs"] for summary in found[0]), default=0)
+    return [
+        Plot(
+            id=metric.key,
+            x=x,
+            y=metric,
+            traces=[
+                _trace(index, method, metric, x, summaries)
+                for index, summaries in enumerate(found)
+                for method in kind_of(runs[index]).methods
+            ],
+            note=QUARTILES_NOTE,
+            caption=f"{_held(kind)}{count} problems each; {QUARTILES_NOTE}",
+            figure=f"{kind.name}_{metric.key}",
+        )
+        for metric in _metrics(kind, runs[0])
+    ]
+
+
+def _trace(run: int, method: str, metric: Metric, x: Metric, summaries: Sequence[Summary]) -> Trace:
+    rows = [s for s in summaries if s["metric"] == metric.key and s.method == method]
+    places = [x.factor * row["value"] for row in rows]
+    ends = ("lower_quartile", "median", "upper_quartile")
+    return Trace.of(
+        run, method, places, [Quartiles(*map(row.__getitem__, ends)) for row in rows], metric
+    )
+
+
+def _metrics(kind: SweepKind, run: Run) -> tuple[Metric, ...]:
+    times = (metrics.MICROSECONDS,) if kind.is_timed else ()
+    return (*times, *ERRORS, *run.metrics)
+
+
+def _held(kind: SweepKind) -> str:
+    """The quantities that are held."""
+    noise = "" if kind.column == "noise_px" else f"noise {kind.noise_px:g} px, "
+    return noise if kind.column == "points" else f"{noise}{kind.points} points, "
+
+
+_CHUNK, _CHUNK_TIMED = 64, 20
+
+
+def plan(options: SweepOptions, folder: RunFolder) -> Plan[SweepTask]:
+    """Plan a sweep."""
+    from cadalign.evaluation.runs.work import Plan
+
+    kind = options.kind
+    benchmark = sweep_benchmark(kind, options.seed, options.metrics)
+    config = {"experiment": options.experiment, "seed": options.seed, "sweep": asdict(kind)}
+    chunk = _CHUNK_TIMED if kind.is_timed else _CHUNK
+    return Plan(benchmark, sweep_tasks(kind), config | benchmark.functions, chunk)
+
+
+def _describe(run: Run) -> str:
+    kind = kind_of(run)
+    problems = f"{kind.runs:,} problems for each value"
+    return f"on the AEPnP paper's simulation, {kind.name} varied, {problems}"
+
+
+SPEC = Spec(
+    options=SweepOptions,
+    plan=plan,
+    columns=(metrics.INSTANCES, metrics.FAILED, *ERRORS, metrics.MICROSECONDS),
+    results=COLUMNS,
+    summarize=summarize,
+    lines=lines,
+    table=console_table,
+    group=varied,
+    plots=plots,
+    kind=lambda run: f"cadalign simulate {kind_of(run).name}",
+    title=lambda runs: f"simulation: {kind_of(runs[0]).name}",
+    describe=_describe,
+    note="Medians over the problems that did not fail.",
+)

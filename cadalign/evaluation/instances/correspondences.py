@@ -1,0 +1,256 @@
+"""Errors of methods on real images with known poses, stretched scenes and outliers.
+
+As in the AEPnP paper, the scene is stretched by scales that are drawn anew for every draw, and a
+share of the image points is moved to anywhere in the image. All methods get the same input.
+
+Columns of the result table, one row per input and method: what names the row (``image``, ``draw``,
+``outliers``, the share of the image points that were moved, and ``method``), ``status`` and
+``reason``, and then
+
+points
+    Number of points that the method was given; empty where the image could not be read.
+inliers
+    Number of points that it kept; empty for methods that do not search for inliers.
+rotation_error_deg
+    [degrees]
+translation_error
+    Relative to the distance from the camera to the mean of the image's points, a fraction.
+scale_y_error, scale_z_error
+    Relative errors, fractions.
+success
+    True if the rotation error is less than 0.5 degrees and neither scale is off by more than 1 %.
+inlier_precision
+    Share of the points that it kept that were not moved.
+inlier_recall
+    Share of the points that were not moved that it kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.datasets import Correspondences, CorrespondenceSet
+from cadalign.errors import DataError
+from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.result import Result
+from cadalign.evaluation.benchmark import Benchmark, Case, Setting, Tasks
+from cadalign.evaluation.experiments.correspondences import (
+    COLUMNS,
+    NAMES,
+    CorrespondenceOptions,
+)
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.registry import Compared
+from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.seeding import instance_rng
+
+
+@dataclass(frozen=True, eq=False)
+class CorrespondenceTask:
+    """One draw of scales for one image, with a share of its points to be moved.
+
+    ``seen`` is None where the image cannot be read, for the reason ``problem``.
+    """
+
+    image: str
+    outliers: float
+    draw: int
+    seen: Correspondences | None
+    problem: str = ""
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"image": self.image, "draw": self.draw, "outliers": self.outliers}
+
+
+class CorrespondenceTasks(Tasks[CorrespondenceTask]):
+    """All draws, image by image and share by share."""
+
+    def __init__(self, images: CorrespondenceSet, options: CorrespondenceOptions) -> None:
+        self._outliers = options.outliers
+        self._draws = options.draws
+        self._ids = images.ids[: options.max_images]
+        if not self._ids:
+            raise DataError("there are no images", where=str(images.source))
+        problems = images.problems
+        self._problems = {name: problems[name] for name in self._ids if name in problems}
+        if len(self._problems) == len(self._ids):
+            first = self._problems[self._ids[0]]
+            raise DataError(
+                f"none of {len(self._ids)} images can be read; the first: {first}",
+                where=str(images.source),
+            )
+        self._read = lru_cache(maxsize=2)(images.__getitem__)
+
+    def __len__(self) -> int:
+        return len(self._ids) * len(self._outliers) * self._draws
+
+    def task(self, index: int) -> CorrespondenceTask:
+        """A draw for an image and a share."""
+        rest, draw = divmod(index, self._draws)
+        place, share = divmod(rest, len(self._outliers))
+        name = self._ids[place]
+        problem = self._problems.get(name)
+        return CorrespondenceTask(
+            image=name,
+            outliers=self._outliers[share],
+            draw=draw,
+            seen=self._read(name) if problem is None else None,
+            problem="" if problem is None else str(problem),
+        )
+
+    def fingerprint(self) -> str:
+        """Hash of all that is read: a run must not go on with other data."""
+        digest = hashlib.sha256()
+        for name in self._ids:
+            digest.update(f"{name}\0".encode())
+            if name in self._problems:
+                digest.update(str(self._problems[name]).encode())
+                continue
+            seen = self._read(name)
+            pose = seen.cam_from_world
+            for values in (seen.points_3d, seen.points_2d, pose.rotation, pose.translation):
+                digest.update(np.ascontiguousarray(values).tobytes())
+            digest.update(repr(seen.camera).encode())
+        return digest.hexdigest()[:16]
+
+
+SUCCESS_DEG = 0.5
+"""A success has less than this rotation error [degrees] ..."""
+SUCCESS_SCALE = 0.01
+"""... and at most this relative error of either scale."""
+_STRETCH = (0.5, 2.0)
+_REDRAWS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class SpoiledImage:
+    """An image with a stretched scene and moved points, and the options of searches for inliers."""
+
+    truth: Problem
+    ransac: RansacOptions
+
+
+@dataclass(frozen=True)
+class SpoiledImages(Setting):
+    """Stretched scenes with outliers: the setting of the experiment on real correspondences."""
+
+    names = NAMES
+    columns = COLUMNS
+
+    options: CorrespondenceOptions
+
+    def warm_up(self) -> Sequence[CorrespondenceTask]:
+        """A task whose evaluation compiles the solvers."""
+        problem = simulate_problem(
+            np.random.default_rng(0), points=40, noise_px=0.5, stretch=(1.0, 1.0)
+        )
+        seen = Correspondences(
+            "", problem.points_3d, problem.points_2d, problem.camera, problem.alignment
+        )
+        return [CorrespondenceTask("warm-up", 0.2, 0, seen)]
+
+    def failed(self, task: CorrespondenceTask) -> list[Case]:
+        """The case of a task without an instance."""
+        points = None if task.seen is None else len(task.seen)
+        return [Case(task.names, {"points": points, "success": False})]
+
+    def case(self, task: CorrespondenceTask) -> Case:
+        """The spoiled image of a task."""
+        if task.seen is None:
+            raise DataError(task.problem)
+        (case,) = self.failed(task)
+        names = (task.image, str(task.draw), repr(task.outliers))
+        rng = instance_rng(self.options.seed, *names)
+        truth = spoil(task.seen, task.outliers, rng=rng)
+        ransac = self.options.ransac(int(rng.integers(2**31)))
+        return replace(case, instance=SpoiledImage(truth, ransac))
+
+    def given(self, image: SpoiledImage) -> MethodInput:
+        """All points of the image."""
+        truth = image.truth
+        return MethodInput(truth.points_3d, truth.points_2d, truth.camera, 1.0, ransac=image.ransac)
+
+    def compared(self, image: SpoiledImage, estimate: Alignment | Result) -> Compared:
+        """The estimated and the true alignment."""
+        if isinstance(estimate, Alignment):
+            return Compared(estimate, image.truth.alignment)
+        return Compared(estimate.alignment, image.truth.alignment, estimate)
+
+    def row(self, method: Method, image: SpoiledImage, estimate: Alignment | Result) -> Row:
+        """Errors by column."""
+        return errors_of(estimate, image.truth, method=method)
+
+
+def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:
+    """The methods of the options on spoiled images."""
+    return Benchmark.chosen(SpoiledImages(options), options.methods, metrics=options.metrics)
+
+
+def errors_of(found: Alignment | Result, truth: Problem, *, method: Method) -> Row:
+    """Errors of an estimate by column."""
+    est = found if isinstance(found, Alignment) else found.alignment
+    distance = np.linalg.norm(truth.alignment.apply(truth.points_3d).mean(axis=0))
+    errors = alignment_errors(est=est, gt=truth.alignment, length=float(distance))
+    scales = max(errors["scale_y_error"], errors["scale_z_error"])
+    row: Row = {
+        "points": len(truth.points_3d),
+        **errors,
+        "success": errors["rotation_error_deg"] < SUCCESS_DEG and scales <= SUCCESS_SCALE,
+    }
+    if not method.is_robust or isinstance(found, Alignment):
+        return row
+    inliers = np.ones(len(truth.points_3d), bool) if truth.outliers is None else ~truth.outliers
+    kept, kept_inliers = int(found.inliers.sum()), int((found.inliers & inliers).sum())
+    return {
+        **row,
+        "inliers": kept,
+        "inlier_precision": kept_inliers / max(kept, 1),
+        "inlier_recall": kept_inliers / max(int(inliers.sum()), 1),
+    }
+
+
+def spoil(seen: Correspondences, outliers: float, *, rng: np.random.Generator) -> Problem:
+    """Stretch what an image shows, and move a share of its points to anywhere in the image.
+
+    The model is the scene with y and z divided by scales between 0.5 and 2, so that the true
+    alignment has the scene's true pose and the scale (1, s_y, s_z). Raises DataError if the lens
+    model is not valid in nearly the whole image.
+    """
+    scale = np.array([1.0, *rng.uniform(*_STRETCH, 2)])
+    pose = seen.cam_from_world
+    count = round(outliers * len(seen))
+    moved = np.zeros(len(seen), dtype=bool)
+    moved[rng.choice(len(seen), size=count, replace=False)] = True
+    points_2d = seen.points_2d.copy()
+    points_2d[moved] = _pixels_anywhere(seen.camera, count, rng)
+    return Problem(
+        points_3d=seen.points_3d / scale,
+        points_2d=points_2d,
+        camera=seen.camera,
+        alignment=Alignment(pose.rotation, pose.translation, scale),
+        outliers=moved,
+    )
+
+
+def _pixels_anywhere(camera: Camera, count: int, rng: np.random.Generator) -> FloatArray:
+    """Uniform over that part of the image which the lens model can be inverted in, (count, 2)."""
+    size = np.array([camera.width, camera.height])
+    pixels = rng.uniform(-0.5, size - 0.5, (count, 2))
+    for _ in range(_REDRAWS):
+        _, valid = camera.normalize_where_valid(pixels)
+        if valid.all():
+            return pixels
+        pixels[~valid] = rng.uniform(-0.5, size - 0.5, (int((~valid).sum()), 2))
+    raise DataError("the lens model is valid in a small part of the image only", where="camera")

@@ -1,0 +1,163 @@
+"""Pictures of instances, with true and predicted boxes, and previews of their models' meshes."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import RenderError
+from cadalign.evaluation.instances.instance import Instance
+from cadalign.evaluation.instances.record import record_stem
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import resized_camera
+from cadalign.geometry.edges import mesh_edges
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import cluster, simplify
+from cadalign.io.files import dense_json, write_text, write_whole
+from cadalign.io.images import write_image
+from cadalign.render import RaycastRenderer, draw_overlay
+from cadalign.render.drawing.color import ByteImage
+
+_THUMB_WIDTH = 320
+_QUALITY, _THUMB_QUALITY = 85, 75
+_EFFORT = 2  # of WebP's 6: half the time of 4, files 3 % larger
+
+
+def draw_instance(
+    folder: RunFolder,
+    instance: Instance,
+    estimate: Alignment,
+    category: str,
+    model_id: str,
+    view: int = 0,
+) -> None:
+    """Render an instance; write its pictures and its mesh preview to a run's folder.
+
+    ``overlays`` gets it with the boxes of truth and estimate and its keypoints, ``thumbs`` a small
+    one with the boxes, ``pictures`` it as it is, ``sketches`` the preview of its model's mesh. Each
+    file appears whole or not at all.
+    """
+    stem = record_stem(category, model_id, view)
+    if instance.scene is None:
+        raise RenderError("there is no mesh to draw", where=stem)
+    frame = _renderer().render(instance.scene, instance.camera, instance.cam_from_model)
+    plain = frame.composite()
+    est_box = Box.from_model(instance.bounds, estimate)
+    image = draw_overlay(
+        plain,
+        instance.camera,
+        gt_box=instance.gt_box,
+        est_box=est_box,
+        observed=instance.points_2d,
+        reprojected=instance.camera.project_where_ahead(estimate.apply(instance.points_3d)),
+    )
+    small, camera = _scaled(plain, instance.camera, width=_THUMB_WIDTH)
+    thumb = draw_overlay(
+        small, camera, gt_box=instance.gt_box, est_box=est_box, axes=False, legend=False
+    )
+    write_webp(folder.pictures / f"{stem}.webp", plain)
+    write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
+    preview = folder.previews / f"{record_stem(category, model_id)}.json"
+    if view == 0 or not preview.exists():
+        write_preview(preview, instance.scene.mesh)
+    write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, image))
+
+
+def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage, Camera]:
+    """A picture of that width, and its camera."""
+    height = round(camera.height * width / camera.width)
+    small = np.asarray(
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+    )
+    return small, resized_camera(camera, width, height)
+
+
+def write_webp(path: Path, image: ByteImage, *, quality: int = _QUALITY) -> None:
+    """Write a picture for a page, whole or not at all."""
+    from PIL import Image
+
+    picture = Image.fromarray(image)
+    write_whole(path, lambda unfinished: picture.save(unfinished, quality=quality, method=_EFFORT))
+
+
+@cache
+def _renderer() -> RaycastRenderer:
+    return RaycastRenderer()
+
+
+MAX_FACES = 1500
+MAX_EDGES = 1500
+_FINEST = 1 << 15  # cells along the longest side: the steps of 16-bit coordinates
+_CREASE_DEG = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPreview:
+    """A simplified model [model units].
+
+    ``edges`` are pairs of vertices for a wireframe: parts too thin for triangles, creases and
+    borders.
+    """
+
+    vertices: FloatArray
+    faces: IntArray
+    edges: IntArray
+
+    def to_dict(self) -> dict[str, Any]:
+        """The preview for JSON: arrays as base64, little-endian; vertex = lo + step * uint16."""
+        placed = self.vertices if len(self.vertices) else np.zeros((1, 3))
+        low = placed.min(axis=0)
+        step = np.maximum(np.ptp(placed, axis=0), 1e-12) / (2 * _FINEST - 1)
+        wide = len(self.vertices) > 2 * _FINEST
+        index = "<u4" if wide else "<u2"
+        return {
+            "lo": low.tolist(),
+            "step": step.tolist(),
+            "vertices": _base64(np.round((self.vertices - low) / step), "<u2"),
+            "faces": _base64(self.faces, index),
+            "edges": _base64(self.edges, index),
+            "wide": wide,
+        }
+
+
+def preview_of(
+    mesh: Mesh, *, max_faces: int = MAX_FACES, max_edges: int = MAX_EDGES
+) -> MeshPreview:
+    """Simplify a mesh to at most so many triangles and lines, by merging vertices on a grid.
+
+    Examples
+    --------
+    >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+    >>> preview = preview_of(square)
+    >>> len(preview.faces), len(preview.edges)  # the diagonal is no crease
+    (2, 4)
+    """
+    small = cluster(mesh, cells=_FINEST)
+    if len(small.faces) > max_faces:
+        small = simplify(mesh, max_faces=max_faces)
+    edges = mesh_edges(small.vertices, small.faces, crease_angle=_CREASE_DEG)
+    creases = edges.ends[edges.creased]
+    length = np.linalg.norm(small.vertices[creases[:, 0]] - small.vertices[creases[:, 1]], axis=1)
+    longest = creases[np.argsort(-length, kind="stable")]
+    lines = np.concatenate([small.wires, longest])[:max_edges]
+    return MeshPreview(small.vertices, small.faces, lines)
+
+
+def write_preview(path: Path, mesh: Mesh) -> None:
+    """Write a preview of a mesh as JSON."""
+    write_text(path, dense_json(preview_of(mesh).to_dict()))
+
+
+def _base64(values: npt.NDArray[Any], kind: str) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype=kind).tobytes()).decode("ascii")

@@ -1,0 +1,301 @@
+"""Queries of the retrieval experiment: views of a library's models, to be found again in it.
+
+Every model of the library is stretched by factors from 0.5 to 2 along y and z, seen from a random
+view, and some of its visible keypoints are handed over with noise. Models whose keypoints are the
+same after stretch, to within 1 % of their extent and with the same set of keypoints, count as the
+true model. Two protocols: ``leave-in``, where the library holds the model, and ``leave-out``, where
+it and all that count as it are taken out. All methods get the same keypoints.
+
+Columns of the result table, one row per query, protocol and method: what names the row
+(``category``, ``model_id``, ``noise_px``, ``keypoints``, ``protocol``, ``method``), ``status``,
+which is ``no view`` where there was nothing to ask, ``reason``, and then
+
+alike
+    Number of models that count as the true one, itself included.
+rank
+    Place of the first of these, 1 for the best; empty beyond 50, and in the leave-out protocol.
+matched_category, matched_id, score
+    The best match and its probability.
+none_probability
+    Probability that the object is none of the library's models.
+shared, rms_px
+    Keypoints that it shares with the image, and their residuals [px].
+shape_distance
+    Distance of its keypoints from the true model's after stretch, as a share of their extent; empty
+    for another category.
+box_iou
+    Overlap of its box with the true model's, both posed and stretched; empty for a model without
+    volume.
+box_iou_up_to_scale
+    The same after its box was scaled about the camera centre: one image does not tell the size of
+    an object that is not in the library.
+rotation_error_deg
+    [degrees]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.datasets.models.categories import require_category
+from cadalign.errors import DegenerateError, InputError
+from cadalign.evaluation.benchmark import Benchmark, Case, Setting
+from cadalign.evaluation.experiments.retrieval import (
+    COLUMNS,
+    LEAVE_IN,
+    LEAVE_OUT,
+    NAMES,
+    NO_VIEW,
+    RetrievalRunOptions,
+)
+from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.methods.registry import choose_methods
+from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
+from cadalign.evaluation.runs.tables import Row
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import rotation_error
+from cadalign.retrieval.library import Library
+from cadalign.retrieval.match import Match
+from cadalign.retrieval.models import LibraryModel, ModelKey
+from cadalign.retrieval.shape import SAME_SHAPE, distances, shape_distance
+from cadalign.seeding import instance_rng
+
+TOP = 50
+"""Ranks beyond this are not told apart."""
+_LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
+_UNIT_BOUNDS = np.array([[-0.3] * 3, [0.3] * 3])
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "optimal": {},
+    "optimal-unstretched": {"stretch": "none"},
+    "epnp": {"method": "epnp"},
+}
+"""Options of `cadalign.Library.retrieve` by method."""
+_NO_MATCH: Row = {"matched_category": "", "matched_id": ""}
+
+
+@dataclass(frozen=True)
+class RetrievalTask:
+    """One view of one model, with a level of noise and a number of keypoints."""
+
+    category: str
+    model_id: str
+    noise_px: float
+    keypoints: int
+
+    def names(self, protocol: str) -> Row:
+        """The cells that name the rows of a protocol, but for the method."""
+        return {**asdict(self), "protocol": protocol}
+
+
+def retrieval_tasks(library: Library, options: RetrievalRunOptions) -> list[RetrievalTask]:
+    """Every model with every noise and number of keypoints that it has, model by model."""
+    names = library.categories
+    if options.categories is not None:
+        chosen = {require_category(name, names, where="categories") for name in options.categories}
+        names = tuple(sorted(chosen))
+    tasks = []
+    for name in names:
+        own = [key for key in library.keys if key[0] == name]
+        count = min(len(own), options.max_models or len(own))
+        for key in (own[i * len(own) // count] for i in range(count)):
+            most = len(library[key].xyz)
+            tasks += [
+                RetrievalTask(*key, noise, keypoints)
+                for noise in options.noises_px
+                for keypoints in options.keypoints
+                if keypoints <= most
+            ]
+    if not tasks:
+        raise InputError(f"no model has {options.keypoints[0]} keypoints", where="keypoints")
+    return tasks
+
+
+@dataclass(frozen=True, eq=False)
+class RetrievalQuery:
+    """View of a stretched model: noisy keypoints [px], and its true pose and stretch."""
+
+    points_2d: FloatArray
+    semantic_ids: IntArray
+    gt: Alignment
+
+
+def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> RetrievalQuery:
+    """Stretch a model, draw a view of it, and hand over some of its visible keypoints.
+
+    Everything random follows from the seed and the task. Visibility follows from the
+    keypoints alone; see `cadalign.evaluation.instances.hull`.
+    """
+    rng = instance_rng(seed, task.category, task.model_id, repr(task.noise_px), str(task.keypoints))
+    stretch = np.array([1.0, *rng.uniform(*STRETCH_RANGE, 2)])
+    hull = KeypointHull(model.xyz * stretch)
+    pose, visible = sample_hull_view(hull, KEYPOINT_CAMERA, rng=rng, min_visible=task.keypoints)
+    chosen = np.sort(rng.choice(np.flatnonzero(visible), task.keypoints, replace=False))
+    pixels = KEYPOINT_CAMERA.project(pose.apply(hull.xyz[chosen]))
+    return RetrievalQuery(
+        points_2d=pixels + task.noise_px * rng.standard_normal(pixels.shape),
+        semantic_ids=model.semantic_ids[chosen],
+        gt=Alignment(pose.rotation, pose.translation, stretch),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class RetrievalInstance:
+    """A query of a library's file, with the models that count as the true one."""
+
+    library: str
+    task: RetrievalTask
+    query: RetrievalQuery
+    gt: LibraryModel
+    alike: frozenset[ModelKey]
+    protocol: str
+    options: RetrievalRunOptions
+
+
+@dataclass(frozen=True)
+class RetrievalQueries(Setting):
+    """Queries of a library's file, which all workers map into memory: the experiment's setting."""
+
+    names = NAMES
+    columns = COLUMNS
+
+    library: str
+    options: RetrievalRunOptions
+
+    def warm_up(self) -> Sequence[RetrievalTask]:
+        """Compile the kernels."""
+        rng = np.random.default_rng(0)
+        models = [
+            LibraryModel("box", str(k), rng.uniform(-0.3, 0.3, (9, 3)), np.arange(9), _UNIT_BOUNDS)
+            for k in range(3)
+        ]
+        pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
+        pixels = KEYPOINT_CAMERA.project(pose.apply(models[0].xyz))
+        Library.from_models(models).retrieve(pixels, np.arange(9), KEYPOINT_CAMERA)
+        return ()
+
+    def failed(self, task: RetrievalTask) -> list[Case]:
+        """The cases of a task without a query."""
+        return [Case(task.names(protocol), _NO_MATCH) for protocol in self.options.protocols]
+
+    def _cases(self, task: RetrievalTask) -> list[Case]:
+        gt = _opened(self.library)[task.category, task.model_id]
+        try:
+            query = observe_model(gt, task, seed=self.options.seed)
+        except DegenerateError as error:
+            return [replace(case, error=error, status=NO_VIEW) for case in self.failed(task)]
+        alike = same_shapes(self.library, gt.key)
+        return [
+            replace(
+                case,
+                instance=RetrievalInstance(
+                    self.library, task, query, gt, alike, protocol, self.options
+                ),
+            )
+            for case, protocol in zip(self.failed(task), self.options.protocols, strict=True)
+        ]
+
+    def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
+        """Compare matches with the truth; see `match_values`."""
+        best = _opened(instance.library)[matches[0].category, matches[0].model_id]
+        placed = instance.query.gt
+        return match_values(matches, best=best, gt=instance.gt, placed=placed, alike=instance.alike)
+
+
+def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:
+    """The methods of the options on queries of a library's file."""
+    methods = choose_methods(options.methods, _OWN_METHODS, general=False)
+    return Benchmark(RetrievalQueries(library, options), methods)
+
+
+def _retrieve(instance: RetrievalInstance, *, method: str) -> list[Match]:
+    options, task = instance.options, instance.task
+    is_exact = instance.protocol == LEAVE_IN and method == "optimal"
+    return _opened(instance.library).retrieve(
+        instance.query.points_2d,
+        instance.query.semantic_ids,
+        KEYPOINT_CAMERA,
+        top=TOP,
+        category=None if options.whole_library else task.category,
+        sigma=max(task.noise_px, _LEAST_SIGMA),
+        shape_sigma=0.0 if is_exact else options.shape_sigma,
+        exclude=instance.alike if instance.protocol == LEAVE_OUT else (),
+        workers=1,
+        **_OPTIONS[method],
+    )
+
+
+_OWN_METHODS = {name: Method(name, partial(_retrieve, method=name)) for name in _OPTIONS}
+
+
+def match_values(
+    matches: Sequence[Match],
+    *,
+    best: LibraryModel,
+    gt: LibraryModel,
+    placed: Alignment,
+    alike: Collection[ModelKey],
+) -> Row:
+    """Compare matches with the truth; metrics by column.
+
+    ``best`` is the model of the first match, ``gt`` the true model, ``placed`` its pose and
+    stretch; ``alike`` are the models that count as the true one.
+    """
+    first = matches[0]
+    boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, placed)}
+    ranks = [
+        place
+        for place, match in enumerate(matches, start=1)
+        if (match.category, match.model_id) in alike
+    ]
+    return {
+        "alike": len(alike),
+        "rank": ranks[0] if ranks else None,
+        "matched_category": first.category,
+        "matched_id": first.model_id,
+        "score": first.score,
+        "none_probability": first.none_probability,
+        "shared": first.shared,
+        "rms_px": first.rms,
+        "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
+        "box_iou": overlap(**boxes),
+        "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
+        "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
+    }
+
+
+@lru_cache(maxsize=64)
+def same_shapes(library: str, key: ModelKey) -> frozenset[ModelKey]:
+    """The models of a library's file that count as the given one, itself among them."""
+    groups = _by_keypoints(library)
+    gt = _opened(library)[key]
+    keys, xyz = groups[gt.category, tuple(gt.semantic_ids.tolist())]
+    near = distances(xyz, gt.xyz) <= SAME_SHAPE
+    return frozenset([key, *(keys[k] for k in np.flatnonzero(near).tolist())])
+
+
+@lru_cache(maxsize=2)
+def _opened(library: str) -> Library:
+    return Library.open(library)
+
+
+@lru_cache(maxsize=2)
+def _by_keypoints(
+    library: str,
+) -> dict[tuple[str, tuple[int, ...]], tuple[list[ModelKey], FloatArray]]:
+    """Names and keypoints of the models with the same set of keypoints."""
+    groups: dict[tuple[str, tuple[int, ...]], list[LibraryModel]] = {}
+    for model in _opened(library):
+        groups.setdefault((model.category, tuple(model.semantic_ids.tolist())), []).append(model)
+    return {
+        ids: ([model.key for model in models], np.array([model.xyz for model in models]))
+        for ids, models in groups.items()
+    }

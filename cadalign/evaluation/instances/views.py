@@ -1,0 +1,396 @@
+"""Views of annotated models: tasks, instances, errors and pictures of the KeypointNet experiment.
+
+Columns of the result table, one row per view and method: what names the row (``category``,
+``model_id``, ``view``, ``method``), ``status`` and ``reason``, and then
+
+visibility
+    Rule by which keypoints count as seen, ``rays`` or ``hull``; empty if it failed before.
+keypoints
+    Number of keypoints that the method was given.
+stretch_y, stretch_z
+    Factors that the model was stretched by; the true scales are one over these.
+rotation_error_deg
+    [degrees]
+translation_error
+    [diagonals of the model's bounding box]
+translation_error_up_to_scale
+    The same after the estimate was scaled about the camera centre, since one image does not tell
+    the size of an object; empty in earlier runs.
+scale_y_error, scale_z_error
+    Relative errors, fractions.
+box_iou
+    Overlap of the stretched model's true and predicted box; empty for a model without volume.
+rms_px
+    Root mean square of the residuals [px].
+symmetry
+    The model's: ``none``, ``circle``, or the number of rotations that map it onto itself.
+sym_rotation_error_deg, sym_translation_error, sym_box_iou
+    The same errors from the nearest truth that looks the same; see
+    `cadalign.evaluation.instances.instance`. Errors of the scale do not depend on it.
+box_iou_up_to_scale
+    The overlap after the estimate was scaled about the camera centre; in runs with learned shapes.
+
+The metrics of failed rows are empty. Rows of instances that no view shows enough keypoints of have
+the status ``skipped``; they count in no share and no median.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from typing import Any, Protocol
+
+import numpy as np
+
+from cadalign.arrays import IntArray
+from cadalign.datasets import AnnotatedModel, KeypointNet
+from cadalign.errors import CadalignError, DataError
+from cadalign.estimation.result import Result
+from cadalign.evaluation.benchmark import (
+    VIEW_NAMES,
+    Benchmark,
+    Case,
+    Pair,
+    Setting,
+    Tasks,
+    attempt,
+    write_picture,
+)
+from cadalign.evaluation.experiments.keypointnet import COLUMNS, KeypointNetOptions
+from cadalign.evaluation.instances.hull import KeypointHull
+from cadalign.evaluation.instances.instance import (
+    RAYS,
+    Instance,
+    InstanceSymmetry,
+    load_scene,
+    make_hull_instances,
+    make_instance,
+    symmetry_group,
+)
+from cadalign.evaluation.instances.record import (
+    RECORD_COLUMNS,
+    AlignedShape,
+    align_instance,
+    pose_of,
+    record_row,
+)
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.metrics.errors import estimate_errors, overlap_up_to_scale
+from cadalign.evaluation.metrics.registry import Compared
+from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
+from cadalign.evaluation.options import SHAPE
+from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+
+AUTO = "auto"
+"""Rays where there is a mesh, the hull's rule elsewhere."""
+_NO_SYMMETRY = InstanceSymmetry(np.zeros(3), np.eye(3)[None])
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointTask:
+    """One view of one model.
+
+    Parameters
+    ----------
+    hull : KeypointHull
+        Keypoints (k, 3), and what views without a mesh need to know of them.
+    model : AnnotatedModel, optional
+        The model with its mesh; None where it is evaluated on its keypoints alone.
+    problem : str
+        Reason why the model cannot be evaluated; empty otherwise.
+    """
+
+    category: str
+    model_id: str
+    view: int
+    hull: KeypointHull
+    semantic_ids: IntArray
+    symmetry: InstanceSymmetry
+    model: AnnotatedModel | None
+    problem: str = ""
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"category": self.category, "model_id": self.model_id, "view": self.view}
+
+    @classmethod
+    def of_model(
+        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str
+    ) -> KeypointTask:
+        """The first view of a dataset's model; a malformed one gives a task with a problem."""
+        try:
+            model = dataset[category, model_id]
+        except CadalignError as error:
+            return cls(
+                category=category,
+                model_id=model_id,
+                view=0,
+                hull=KeypointHull(np.empty((0, 3))),
+                semantic_ids=np.empty(0, dtype=np.int64),
+                symmetry=_NO_SYMMETRY,
+                model=None,
+                problem=str(error),
+            )
+        return cls(
+            category=category,
+            model_id=model_id,
+            view=0,
+            hull=KeypointHull(model.keypoints.xyz),
+            semantic_ids=model.keypoints.semantic_ids,
+            symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
+            model=_mesh_of(model, visibility),
+        )
+
+
+class TaskOptions(Protocol):
+    """Options that say which tasks there are."""
+
+    @property
+    def visibility(self) -> str: ...
+
+    @property
+    def views_per_model(self) -> int: ...
+
+    @property
+    def max_models(self) -> int | None: ...
+
+
+class KeypointTasks(Tasks[KeypointTask]):
+    """All views of all models of a dataset in the order of their names."""
+
+    def __init__(self, dataset: KeypointNet, options: TaskOptions) -> None:
+        self.dataset, self._visibility = dataset, options.visibility
+        self._views = options.views_per_model
+        self.keys = [
+            key
+            for category in dataset.categories
+            for key in sorted(dataset.ids(category))[: options.max_models]
+        ]
+        if not self.keys:
+            raise DataError("there are no models to evaluate", where=str(dataset.root))
+        self._first = lru_cache(maxsize=4)(self._first_view)
+
+    def __len__(self) -> int:
+        return len(self.keys) * self._views
+
+    def task(self, index: int) -> KeypointTask:
+        """A view of a model."""
+        place, view = divmod(index, self._views)
+        first = self._first(place)
+        return first if view == 0 else replace(first, view=view)
+
+    def _first_view(self, place: int) -> KeypointTask:
+        return KeypointTask.of_model(self.dataset, *self.keys[place], visibility=self._visibility)
+
+    def fingerprint(self) -> str:
+        """Hash of the annotations: a run must not go on with others."""
+        digest = hashlib.sha256()
+        for category, model_id in self.keys:
+            digest.update(f"{category}\0{model_id}\0".encode())
+            try:
+                model = self.dataset[category, model_id]
+            except CadalignError as error:
+                digest.update(str(error).encode())
+                continue
+            digest.update(model.keypoints.xyz.tobytes())
+            rotations = [rotation.keypoints for rotation in model.symmetries.rotations]
+            digest.update(repr((model.symmetries.reflections, rotations)).encode())
+            digest.update(b"mesh" if _mesh_of(model, self._visibility) else b"")
+        return digest.hexdigest()[:16]
+
+
+def _mesh_of(model: AnnotatedModel, visibility: str) -> AnnotatedModel | None:
+    """The model if its mesh is to be used, which `load_scene` looks for."""
+    use_mesh = visibility == RAYS or (visibility == AUTO and model.mesh_path is not None)
+    return model if use_mesh else None
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointView:
+    """A view of a model as an instance: its task, what it shows, and the shapes that are known."""
+
+    task: KeypointTask
+    instance: Instance
+    sigma: float
+    shapes: ShapeFiles
+
+
+@dataclass(frozen=True)
+class KeypointViews(Setting):
+    """Views of annotated models: the setting of the KeypointNet experiment.
+
+    The first method's alignment of every instance with a mesh is drawn in the folder ``drawn_in``,
+    if one is given; its folders for pictures must exist.
+    """
+
+    names = VIEW_NAMES
+    record_columns = RECORD_COLUMNS
+
+    options: KeypointNetOptions
+    drawn_in: RunFolder | None
+    shapes: ShapeFiles = NO_SHAPES
+
+    @property
+    def columns(self) -> Columns:
+        """The columns of the result table."""
+        return (*COLUMNS, (BOX_IOU_UP_TO_SCALE.key, float)) if self.shapes.paths else COLUMNS
+
+    def warm_up(self) -> Sequence[KeypointTask]:
+        """A task whose evaluation compiles solvers and metrics."""
+        rng = np.random.default_rng(0)
+        return [
+            KeypointTask(
+                category="warm-up",
+                model_id="",
+                view=0,
+                hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
+                semantic_ids=np.arange(12),
+                symmetry=_NO_SYMMETRY,
+                model=None,
+            )
+        ]
+
+    def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
+        """The instance of every task, or why there is none."""
+        start, found = time.perf_counter(), []
+        instances = self._instances(tasks)
+        share = (time.perf_counter() - start) / max(len(tasks), 1)
+        for task, instance in zip(tasks, instances, strict=True):
+            (case,) = self.failed(task)
+            if isinstance(instance, Exception):
+                found.append(replace(case, error=instance, seconds=share))
+            else:
+                view = KeypointView(task, instance, self.options.sigma, self.shapes)
+                found.append(Case(case.names, _facts(task, instance), view, without=case.without))
+        return found
+
+    def failed(self, task: KeypointTask) -> list[Case]:
+        """The case of a task without an instance."""
+        facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
+        has_shape = task.category in dict(self.shapes.paths)
+        return [Case(task.names, facts, without=() if has_shape else (SHAPE,))]
+
+    def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
+        names = ("noise_px", "min_visible", "seed")
+        how = {name: getattr(self.options, name) for name in names}
+        plain = [task for task in tasks if not task.problem and task.model is None]
+        of_hulls = iter(make_hull_instances(plain, **how))
+        instances: list[Instance | Exception] = []
+        for task in tasks:
+            if task.problem:
+                instances.append(DataError(task.problem))
+            elif task.model is None:
+                instances.append(next(of_hulls))
+            else:
+                instances.append(attempt(partial(_with_mesh, task, **how)))
+        return instances
+
+    def given(self, view: KeypointView) -> MethodInput:
+        """The visible keypoints of the stretched model."""
+        found = view.instance
+        return MethodInput(
+            found.points_3d,
+            found.points_2d,
+            found.camera,
+            view.sigma,
+            bounds=found.bounds,
+            gt=found.gt,
+        )
+
+    def compared(self, view: KeypointView, estimate: Alignment | Result | AlignedShape) -> Compared:
+        """The estimated and the true alignment."""
+        result = estimate if isinstance(estimate, Result) else None
+        return Compared(pose_of(estimate), view.instance.gt, result)
+
+    def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
+        """Metrics by column of each estimate."""
+        rows: list[Row | Exception] = [
+            *estimate_errors(
+                [pose_of(estimate) for _, estimate in pairs],
+                [view.instance for view, _ in pairs],
+                [view.task.symmetry for view, _ in pairs],
+            )
+        ]
+        for (view, estimate), row in zip(pairs, rows, strict=True):
+            if isinstance(row, Exception):
+                continue
+            if isinstance(estimate, AlignedShape):
+                row["rms_px"] = estimate.rms
+            if self.shapes.paths:  # it takes longer than most methods
+                box = Box.from_model(view.instance.bounds, pose_of(estimate))
+                overlap = overlap_up_to_scale(est=box, gt=view.instance.gt_box)
+                row[BOX_IOU_UP_TO_SCALE.key] = overlap
+        return rows
+
+    def finish(
+        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
+    ) -> tuple[list[Outcome], Row | None]:
+        """Draw the first method's estimate, whose row fails where that is impossible."""
+        view: KeypointView = case.instance
+        first = outcomes[0]
+        if self.drawn_in is not None and first.is_ok:
+            problem = attempt(_draw, self.drawn_in, view, pose_of(estimates[0]))
+            if problem is not None:
+                failed = replace(first, status=FAILED, reason=reason_of(problem), values=case.facts)
+                outcomes = [failed, *outcomes[1:]]
+        return outcomes, record_row(view.instance, outcomes, estimates)
+
+
+def keypointnet_benchmark(
+    options: KeypointNetOptions, drawn_in: RunFolder | None = None, shapes: ShapeFiles = NO_SHAPES
+) -> Benchmark:
+    """The methods of the options on views of models, and that of learned shapes where there are."""
+    setting = KeypointViews(options, drawn_in, shapes)
+    found = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
+    batched = frozenset(each.name for each in found.methods if not each.has_statistics)
+    of_shapes = (Method(SHAPE, _aligned),) if shapes.paths else ()
+    return replace(found, batched=batched, methods=(*found.methods, *of_shapes))
+
+
+def _aligned(view: KeypointView) -> AlignedShape:
+    """The estimate from the learned shape of the model's category."""
+    task = view.task
+    shape = view.shapes.shape(task.category)
+    assert shape is not None
+    own = task.semantic_ids, task.hull.xyz
+    return align_instance(shape, view.instance, *own, sigma=view.sigma)
+
+
+def _draw(folder: RunFolder, view: KeypointView, estimate: Alignment) -> None:
+    # Only here: runs on annotations alone are not to load the renderer.
+    from cadalign.evaluation.instances.pictures import draw_instance
+
+    if view.instance.scene is not None:
+        names = (view.task.category, view.task.model_id, view.task.view)
+        write_picture(draw_instance, folder, view.instance, estimate, *names)
+
+
+# Views of one model come one after another.
+_scene_of = lru_cache(maxsize=1)(load_scene)
+
+
+def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
+    """The instance of a model with a mesh."""
+    assert task.model is not None
+    return make_instance(task.model, scene=_scene_of(task.model), view_index=task.view, **how)
+
+
+def _facts(task: KeypointTask, instance: Instance) -> Row:
+    """Columns that do not depend on the estimate."""
+    _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
+    return {
+        "visibility": instance.visibility,
+        "keypoints": len(instance.points_3d),
+        "stretch_y": stretch_y,
+        "stretch_z": stretch_z,
+        "symmetry": str(task.symmetry),
+    }

@@ -1,1 +1,0 @@
-"""The sparse-keypoint experiment on KeypointNet."""

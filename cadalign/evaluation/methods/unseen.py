@@ -1,0 +1,216 @@
+"""Methods on unseen objects: other models, the mean shape, the shape model, the object's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.errors import DegenerateError
+from cadalign.estimation.align import align
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.result import Result
+from cadalign.estimation.view import View
+from cadalign.evaluation.experiments.unseen import (
+    EXACT,
+    MEAN_RIGID,
+    MEAN_STRETCHED,
+    NEAREST,
+    RANDOM_RIGID,
+    RANDOM_STRETCHED,
+    UnseenOptions,
+)
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.views import KeypointTask
+from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.metrics.cramer_rao import limit_estimate
+from cadalign.evaluation.options import LIMIT, SHAPE
+from cadalign.evaluation.shape_files import LearnedFiles
+from cadalign.geometry.alignment import Alignment
+from cadalign.retrieval.models import LibraryModel
+from cadalign.seeding import instance_rng
+from cadalign.shapes.model import ShapeModel
+
+_LEAST_SIGMA = 0.5  # of retrieval [px]: keypoints without noise would leave no model any chance
+_SIMILAR = 0.02  # of retrieval: misfit of the best model, as a share of its extent
+_INLIER_BOUND = 3.5  # standard deviations
+_MISFIT_PX = 30.0  # a residual that another model of the category leaves
+_LEAST_SHARED = 6
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenSighting:
+    """Content of a view of an object, and the truth.
+
+    Parameters
+    ----------
+    points_2d : (n, 2) float
+        The given keypoints [px], with noise and outliers.
+    semantic_ids : (n,) int
+    rows : (n,) int
+        Their rows among all keypoints of the object.
+    is_outlier : (n,) bool
+    gt : Alignment
+        The object's pose; its scale is 1.
+    xyz, all_ids
+        All keypoints of the object.
+    """
+
+    points_2d: FloatArray
+    semantic_ids: IntArray
+    rows: IntArray
+    is_outlier: BoolArray
+    gt: Alignment
+    xyz: FloatArray
+    all_ids: IntArray
+
+    @property
+    def bounds(self) -> FloatArray:
+        """The least and greatest coordinates of the object's keypoints, (2, 3) float."""
+        return np.array([self.xyz.min(axis=0), self.xyz.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeEstimate:
+    """Pose and shape of an object as a method found them.
+
+    Parameters
+    ----------
+    alignment : Alignment
+    bounds : (2, 3) float
+        Least and greatest coordinates before the stretch.
+    ids : (m,) int
+    points_3d : (m, 3) float
+        Keypoints before the stretch.
+    result : Result, optional
+        With the covariances; None for methods that have none.
+    """
+
+    alignment: Alignment
+    bounds: FloatArray
+    ids: IntArray
+    points_3d: FloatArray
+    result: Result | None = None
+
+    @property
+    def poses(self) -> tuple[Alignment, ...]:
+        """The alignment, and the alternatives to it."""
+        others = () if self.result is None else self.result.alternatives
+        return (self.alignment, *(other.alignment for other in others))
+
+
+@dataclass(frozen=True, eq=False)
+class UnseenInstance:
+    """A view of an object, and what was learned of its category from others."""
+
+    task: KeypointTask
+    sighting: UnseenSighting
+    learned: LearnedFiles
+    options: UnseenOptions
+
+    @property
+    def shape(self) -> ShapeModel:
+        """The shape model of the category."""
+        return self.learned.shape(self.task.category)
+
+    def view_of(self, model: Model | ShapeModel) -> View:
+        """Those given keypoints that a model has."""
+        seen = self.sighting
+        shared = np.isin(seen.semantic_ids, np.array(model.ids, dtype=np.int64))
+        ids = seen.semantic_ids[shared].tolist()
+        return View(KEYPOINT_CAMERA, seen.points_2d[shared], ids=ids, sigma=self.options.sigma)
+
+
+def _of_shape(instance: UnseenInstance) -> ShapeEstimate:
+    return _aligned(instance.shape, instance)
+
+
+def _of_own_model(instance: UnseenInstance) -> ShapeEstimate:
+    seen = instance.sighting
+    return _aligned(Model(points_3d=seen.xyz, ids=seen.all_ids.tolist()), instance)
+
+
+def _of_mean(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
+    shape = instance.shape
+    rows = shape.mean
+    model = Model(points_3d=rows[:-2], ids=shape.ids, bounds=rows[-2:], stretch=stretch)
+    return _aligned(model, instance, misfit_px=_MISFIT_PX)
+
+
+def _of_random_model(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
+    other = _random_model(instance)
+    ids = other.semantic_ids.tolist()
+    model = Model(points_3d=other.xyz, ids=ids, bounds=other.bounds, stretch=stretch)
+    return _aligned(model, instance, misfit_px=_MISFIT_PX)
+
+
+def _aligned(
+    model: Model | ShapeModel, instance: UnseenInstance, *, misfit_px: float = 0.0
+) -> ShapeEstimate:
+    """Align a model with those given keypoints that it has."""
+    bound = max(_INLIER_BOUND * instance.options.sigma, misfit_px)
+    ransac = RansacOptions(max_reproj_error=bound) if instance.options.outliers else None
+    result = align(model, instance.view_of(model), ransac=ransac)
+    ids = np.array(model.ids, dtype=np.int64)
+    return ShapeEstimate(result.alignment, result.bounds, ids, result.points_3d, result)
+
+
+def _nearest(instance: UnseenInstance) -> ShapeEstimate:
+    """The best match of the library."""
+    library, options = instance.learned.opened_library(), instance.options
+    first = library.retrieve(
+        instance.sighting.points_2d,
+        instance.sighting.semantic_ids,
+        KEYPOINT_CAMERA,
+        top=1,
+        category=instance.task.category,
+        sigma=max(options.noise_px, _LEAST_SIGMA),
+        shape_sigma=_SIMILAR,
+        loss="cauchy" if options.outliers else "linear",
+        workers=1,
+    )[0]
+    model = library[first.category, first.model_id]
+    return ShapeEstimate(first.alignment, first.bounds, model.semantic_ids, model.xyz)
+
+
+def _random_model(instance: UnseenInstance) -> LibraryModel:
+    """A random model of the category, among those that share enough keypoints with the image."""
+    library, task = instance.learned.opened_library(), instance.task
+    given = instance.sighting.semantic_ids
+    keys = [key for key in library.keys if key[0] == task.category]
+    names = (task.category, task.model_id, str(task.view))
+    rng = instance_rng(instance.options.seed, *names, "another model")
+    least = min(_LEAST_SHARED, len(given))
+    for place in rng.permutation(len(keys)).tolist():
+        model = library[keys[place]]
+        if np.isin(given, model.semantic_ids).sum() >= least:
+            return model
+    raise DegenerateError(f"no other model has {least} of the keypoints", where="keypoints")
+
+
+def _bound(instance: UnseenInstance) -> ShapeEstimate:
+    """The ideal estimate with the object's own model from the keypoints that are no outliers."""
+    seen = instance.sighting
+    kept = ~seen.is_outlier
+    alignment = limit_estimate(
+        seen.xyz[seen.rows[kept]], seen.points_2d[kept], KEYPOINT_CAMERA, seen.gt
+    )
+    return ShapeEstimate(alignment, seen.bounds, seen.all_ids, seen.xyz)
+
+
+_SOLVERS: dict[str, Callable[[UnseenInstance], ShapeEstimate]] = {
+    RANDOM_RIGID: partial(_of_random_model, stretch="none"),
+    RANDOM_STRETCHED: partial(_of_random_model, stretch=None),
+    NEAREST: _nearest,
+    MEAN_RIGID: partial(_of_mean, stretch="none"),
+    MEAN_STRETCHED: partial(_of_mean, stretch=None),
+    SHAPE: _of_shape,
+    EXACT: _of_own_model,
+    LIMIT: _bound,
+}
+OWN_METHODS = {name: Method(name, solve) for name, solve in _SOLVERS.items()}
+"""The experiment's methods by name."""

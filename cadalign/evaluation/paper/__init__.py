@@ -1,1 +1,0 @@
-"""The AEPnP paper's tables and figures."""

@@ -1,0 +1,342 @@
+"""Objects in photos: errors of methods, records and pictures.
+
+Columns of the result table, one row per object and method: what names the row (``category``,
+``model_id``, the photo's name and the object's, ``view``, ``method``), ``status`` (``left out``
+where the object, or the method on it, lacks what is asked for) and ``reason``, and then
+
+keypoints, source
+    Number of the given keypoints, and where they come from: annotated, detected or simulated.
+rms_px
+    Root mean square residual of the given keypoints [px].
+rotation_error_deg, translation_cm
+    Symmetry-aware, and of the model's origin.
+box_iou, box_iou_up_to_scale
+    Overlap of the boxes, the first symmetry-aware, the second after the estimate was scaled about
+    the camera centre.
+scan2cad_translation_m, scan2cad_scale, scan2cad_aligned, scan2cad_aligned_axes
+    Scan2CAD's errors, 1 where all are within their thresholds, and 1 where the scale of each axis
+    is too; see `cadalign.evaluation.metrics.scan2cad`.
+yaw_error_deg, depth_error, depth_error_relative, iou_3d, iou_bev
+    KITTI's; see `cadalign.evaluation.metrics.kitti`.
+mssd, mspd_px, mssd_recall, mspd_recall, vsd_recall
+    BOP's: the first in diameters, the last three averaged over the thresholds; see
+    `cadalign.evaluation.metrics.bop`.
+
+Metrics of other data sets are empty, as are those of rows that are not ok, and of objects whose
+truth is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError, DataError
+from cadalign.estimation.align import align
+from cadalign.estimation.model import Model
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Alternative
+from cadalign.estimation.view import View
+from cadalign.evaluation.benchmark import (
+    VIEW_NAMES,
+    Benchmark,
+    Case,
+    Setting,
+    attempt,
+    write_picture,
+)
+from cadalign.evaluation.experiments.photos import COLUMNS, PhotosOptions
+from cadalign.evaluation.instances.pictures import write_preview, write_webp
+from cadalign.evaluation.instances.record import (
+    RECORD_COLUMNS,
+    Estimate,
+    Warp,
+    box_alignment,
+    record_of,
+    record_stem,
+    shape_of_result,
+)
+from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.metrics.registry import Compared
+from cadalign.evaluation.metrics.sets import score_alignment
+from cadalign.evaluation.outcome import Outcome
+from cadalign.evaluation.photos.methods import (
+    PhotoEstimate,
+    PhotoInstance,
+    estimate_of_answer,
+    given_of,
+    photo_method,
+)
+from cadalign.evaluation.photos.protocols import TRUTH, is_own, protocol_of
+from cadalign.evaluation.photos.sighting import Sighting, sight
+from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import Row
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import resized_camera
+from cadalign.io.files import write_whole
+from cadalign.io.images import ByteImage, write_image
+from cadalign.render.drawing.overlay import draw_overlay
+from cadalign.render.raycast.renderer import cast_geometry
+from cadalign.shapes.model import ShapeModel
+
+
+@dataclass(frozen=True)
+class PhotoObjects(Setting):
+    """Objects in photos: the setting of the experiment.
+
+    Parameters
+    ----------
+    options : PhotosOptions
+    shapes : tuple of ShapeModel
+    drawn_in : RunFolder
+        The folder that pictures go to.
+    """
+
+    names = VIEW_NAMES
+    columns = COLUMNS
+    record_columns = RECORD_COLUMNS
+
+    options: PhotosOptions
+    shapes: tuple[ShapeModel, ...]
+    drawn_in: RunFolder
+
+    def warm_up(self) -> Sequence[PhotoTask]:
+        """Compile the kernels."""
+        points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
+        pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
+        camera = Camera(640, 480, 500, 500, 319.5, 239.5)
+        pixels = camera.project(pose.apply(points))
+        for model in (Model(points_3d=points), Model(points_3d=points, shape_sigma=0.01)):
+            align(model, View(camera, pixels))
+        return ()
+
+    def failed(self, task: PhotoTask) -> list[Case]:
+        """The case of a photo that could not be evaluated."""
+        return [Case(task.names, {"source": ""})]
+
+    def _cases(self, task: PhotoTask) -> list[Case]:
+        """The objects of a photo."""
+        wanted = self.options.categories
+        found = []
+        for each in targets_of(task, self.options.root):
+            if isinstance(each, Case):
+                found.append(replace(each, facts={"source": ""}))
+            elif wanted is None or each.found.category in wanted:
+                found.append(self._case(each, shown=task.index < self.options.pictures))
+        return found
+
+    def _case(self, target: PhotoTarget, *, shown: bool) -> Case:
+        protocol = protocol_of(opened(self.options.root).kind)
+        sighting = attempt(sight, target, protocol, self.options)
+        if isinstance(sighting, Exception):
+            return Case(target.names, {"source": ""}, error=sighting)
+        facts = {"keypoints": len(sighting.names), "source": sighting.source}
+        similar_sigma = self.options.similar_sigma
+        instance = PhotoInstance(sighting, protocol, self.shapes, similar_sigma, shown)
+        return Case(target.names, facts, instance)
+
+    def given(self, instance: PhotoInstance) -> MethodInput:
+        """The keypoints; for functions of views, the model to be stretched and all evidence."""
+        return given_of(instance)
+
+    def answered(
+        self, method: Method, instance: PhotoInstance, answer: Alignment | Result
+    ) -> PhotoEstimate:
+        """The estimate of the data set's model."""
+        return estimate_of_answer(answer, instance.sighting)
+
+    def compared(self, instance: PhotoInstance, estimate: PhotoEstimate) -> Compared:
+        """The estimated and the true alignment of the data set's model."""
+        return Compared(estimate.alignment, instance.sighting.target.gt, estimate.result)
+
+    def row(self, method: Method, instance: PhotoInstance, estimate: PhotoEstimate) -> Row:
+        """Errors by the metrics of the data set."""
+        sighting, sets = instance.sighting, instance.protocol.metrics
+        scores = score_alignment(sighting.target, sets, estimate.alignment, estimate.box)
+        return {"rms_px": _rms(estimate, sighting)} | scores
+
+    def finish(
+        self, case: Case, outcomes: list[Outcome], estimates: list[Any]
+    ) -> tuple[list[Outcome], Row | None]:
+        """The record and the pictures of an object, where a method has an estimate of it."""
+        if not any(outcome.is_ok for outcome in outcomes):
+            return outcomes, None
+        instance: PhotoInstance = case.instance
+        if instance.is_shown:
+            methods = [outcome.names["method"] for outcome in outcomes]
+            pairs = dict(zip(methods, estimates, strict=True))
+            found = (pairs.get(name) for name in (instance.protocol.best, *methods, TRUTH))
+            best = next((each for each in found if isinstance(each, PhotoEstimate)), None)
+            write_picture(draw_sighting, self.drawn_in, instance.sighting, best)
+        return outcomes, sighting_record(instance.sighting, outcomes, estimates)
+
+
+def photos_benchmark(
+    options: PhotosOptions, shapes: tuple[ShapeModel, ...], drawn_in: RunFolder
+) -> Benchmark:
+    """The methods of the options on objects in photos."""
+    own = {name: photo_method(name) for name in options.methods if is_own(name)}
+    setting = PhotoObjects(options, shapes, drawn_in)
+    return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
+
+
+def targets_of(task: PhotoTask, root: Path) -> list[PhotoTarget | Case]:
+    """The objects of a photo; cases without an instance for what cannot be read."""
+    if task.problem:
+        return [Case(task.names, error=DataError(task.problem))]
+    dataset = opened(root)
+    try:
+        photo = dataset[task.index]
+    except DataError as error:
+        return [Case(task.names, error=error)]
+    bad = [
+        Case(PhotoTask(-1, f"{photo.name}, problem {number + 1}").names, error=problem)
+        for number, problem in enumerate(photo.problems)
+    ]
+    return [*bad, *(PhotoTarget(photo, found, str(dataset.root)) for found in photo.objects)]
+
+
+def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
+    """Root mean square residual of the given keypoints [px]; None behind the camera."""
+    if found.result is not None:
+        residuals = found.result.residuals
+    else:
+        points = found.alignment.apply(sighting.points_3d)
+        residuals = sighting.camera.project_where_ahead(points) - sighting.points_2d
+    rms = float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else np.nan
+    return rms if np.isfinite(rms) else None
+
+
+def sighting_record(
+    sighting: Sighting,
+    outcomes: Sequence[Outcome],
+    estimates: Sequence[PhotoEstimate | CadalignError],
+) -> Row:
+    """The record of an object, in terms of the data set's model."""
+    return record_of(
+        camera=sighting.camera,
+        gt=sighting.target.gt,
+        stretch=np.ones(3),
+        bounds=sighting.bounds,
+        points_3d=sighting.points_3d,
+        points_2d=sighting.points_2d,
+        semantic_ids=np.arange(len(sighting.names)),
+        outcomes=outcomes,
+        estimates=[_described(each, sighting) for each in estimates],
+    )
+
+
+def _described(estimate: PhotoEstimate | CadalignError, sighting: Sighting) -> Estimate:
+    if isinstance(estimate, CadalignError):
+        return estimate
+    result = estimate.result
+    if result is None:
+        return estimate.alignment
+    return shape_of_result(
+        result,
+        lambda each: (_of_box(each, sighting), _warp(result, each, sighting)),
+        rms=result.rms,
+        sigma=sighting.sigma,
+    )
+
+
+def _of_box(found: Result | Alternative, sighting: Sighting) -> Alignment:
+    """The alignment of the model's box with an estimated one."""
+    return box_alignment(found.alignment, found.bounds, model_bounds=sighting.bounds)
+
+
+def _warp(result: Result, found: Result | Alternative, sighting: Sighting) -> Warp:
+    """The places of the model's keypoints on the estimated object, in the model's coordinates."""
+    row_of = {str(name): row for row, name in enumerate(result.ids)}
+    known = [row for row, name in enumerate(sighting.model.names) if name in row_of]
+    rows = [row_of[sighting.model.names[row]] for row in known]
+    places = _of_box(found, sighting).inverse(found.alignment.apply(found.points_3d[rows]))
+    return Warp(sighting.model.xyz[known], places)
+
+
+_MOST = 1024  # pixels of a picture's longer side
+_THUMB = (320, 240)
+_MARGIN = 0.2  # of a thumb, around the object
+_GREY = 225  # of a photo that is not there
+
+
+def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate | None) -> None:
+    """Write the pictures of an object in a photo, and the preview of its model, to a run's folder.
+
+    ``overlays`` gets the photo with the boxes of truth and estimate, the estimated model and the
+    keypoints, ``thumbs`` the part around the object with the boxes, ``pictures`` the photo alone,
+    the folder of previews that of its model. Files appear whole or not at all.
+    """
+    names = sighting.target.names
+    stem = record_stem(names["category"], names["model_id"])
+    photo, camera = _photo(sighting)
+    scale = camera.width / sighting.camera.width
+    est_box = None if estimate is None else estimate.box
+    boxes: dict[str, Any] = {"gt_box": sighting.target.gt_box, "est_box": est_box}
+    cad = sighting.target.cad
+    frame = predicted = None
+    if estimate is not None:
+        predicted = camera.project_where_ahead(estimate.alignment.apply(sighting.points_3d))
+        if cad is not None and cad.has_mesh:
+            frame = cast_geometry(cad.scene, camera, estimate.alignment)
+    observed = (sighting.points_2d + 0.5) * scale - 0.5
+    marks: dict[str, Any] = {"observed": observed, "reprojected": predicted}
+    image = draw_overlay(photo, camera, est_frame=frame, **boxes, **marks)
+    crop, near = _around(photo, camera, sighting, observed)
+    thumb = draw_overlay(crop, near, axes=False, legend=False, **boxes)
+    write_webp(folder.pictures / f"{stem}.webp", photo)
+    write_webp(folder.thumbs / f"{stem}.webp", thumb)
+    if cad is not None and cad.has_mesh:
+        write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)
+    write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, image))
+
+
+def _photo(sighting: Sighting) -> tuple[ByteImage, Camera]:
+    """The photo in a size for a page, and its camera; a grey one where there is none."""
+    camera = sighting.camera
+    try:
+        image = sighting.target.photo.read_image()
+    except DataError:
+        image = np.full((camera.height, camera.width, 3), _GREY, dtype=np.uint8)
+    factor = min(1.0, _MOST / max(camera.width, camera.height))
+    size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
+    if image.shape[1::-1] != size:
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return image, resized_camera(camera, *size)
+
+
+def _around(
+    photo: ByteImage, camera: Camera, sighting: Sighting, points: FloatArray
+) -> tuple[ByteImage, Camera]:
+    """The part of a photo around the object, and its camera."""
+    box = sighting.target.gt_box
+    if box is not None and (box.corners[:, 2] > 0).all():
+        points = np.concatenate([points, camera.project(box.corners)])
+    limit = np.array([camera.width, camera.height], dtype=float)
+    low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
+    middle = (low + high) / 2
+    across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel
+    across = min(max(across, 0.1), float((limit / _THUMB).max()))
+    corner = middle - across * np.array(_THUMB) / 2
+    # A pixel's borders, not its centre, stay in place.
+    warp = np.array([[across, 0, corner[0]], [0, across, corner[1]]])
+    how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
+    crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderValue=(_GREY,) * 3)
+    near = replace(
+        camera,
+        width=_THUMB[0],
+        height=_THUMB[1],
+        fx=camera.fx / across,
+        fy=camera.fy / across,
+        cx=(camera.cx - corner[0]) / across,
+        cy=(camera.cy - corner[1]) / across,
+    )
+    return np.asarray(crop, dtype=np.uint8), near

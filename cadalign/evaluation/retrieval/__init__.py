@@ -1,1 +1,0 @@
-"""The retrieval experiment."""

@@ -1,1 +1,0 @@
-"""The experiment on objects that are no stretched copy of any model."""

@@ -135,10 +135,6 @@ class Setting:
         """Cells of the result table for each estimate, or why there are none."""
         return [attempt(self.row, method, *pair) for pair in pairs]
 
-    def compared(self, instance: Any, estimate: Any) -> Compared:
-        """The estimated and the true alignment, for registered metrics."""
-        raise InputError("there are no registered metrics", where="metrics")
-
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row | None]:
@@ -289,10 +285,8 @@ class Benchmark:
         if isinstance(row, Exception):
             return row
         instance, estimate = pair
-        found = attempt(self.setting.compared, instance, estimate)
-        if isinstance(found, Exception):
-            return found
         given = self.setting.given(instance)
+        found = Compared.of(estimate, given.gt)
         for each in self.metrics:
             value = attempt(each.measure, found, given)
             if isinstance(value, Exception):

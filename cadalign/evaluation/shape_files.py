@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,11 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.files import read_bytes, writing
 from cadalign.shapes.model import ShapeModel
+
+if TYPE_CHECKING:
+    from cadalign.retrieval.library import Library
+
+logger = logging.getLogger("cadalign")
 
 _SUFFIX = ".shape"
 
@@ -75,24 +80,12 @@ class ShapeFiles:
 
     def fingerprint(self) -> str:
         """Hash of the files: a run must not go on with others."""
-        digest = hashlib.sha256()
-        for name, path in self.paths:
-            digest.update(name.encode() + b"\0" + read_bytes(path))
-        return digest.hexdigest()[:16]
+        return _hash(
+            *(part for name, path in self.paths for part in (f"{name}\0", read_bytes(path)))
+        )
 
 
 NO_SHAPES = ShapeFiles(())
-
-
-@lru_cache(maxsize=32)
-def _open(path: Path | str) -> ShapeModel:
-    return ShapeModel.open(path)
-
-
-if TYPE_CHECKING:
-    from cadalign.retrieval.library import Library
-
-logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True)
@@ -112,21 +105,16 @@ class LearnedFiles:
 
     def fingerprint(self) -> str:
         """Hash of the shape models and the library."""
-        digest = hashlib.sha256(self.opened_library().fingerprint.encode())
+        parts: list[Any] = [self.opened_library().fingerprint]
         for category, path in self.shapes:
             shape = _open(path)
-            digest.update(
-                f"{category}\0{shape.inflation!r}\0{shape.degrees_of_freedom!r}\0".encode()
-            )
+            parts.append(f"{category}\0{shape.inflation!r}\0{shape.degrees_of_freedom!r}\0")
             if shape.few_keypoints is not None:
-                digest.update(f"{shape.few_keypoints!r}\0".encode())
+                parts.append(f"{shape.few_keypoints!r}\0")
             if shape.box_margins is not None:
-                digest.update(shape.box_margins.margins.tobytes())
-                digest.update(shape.box_margins.tolerances.tobytes())
-            for part in shape.components:
-                numbers = [part.weight, *part.mean.ravel(), *part.modes.ravel()]
-                digest.update(np.append(numbers, part.residual_sigma).tobytes())
-        return digest.hexdigest()[:16]
+                parts += [shape.box_margins.margins, shape.box_margins.tolerances]
+            parts += _numbers(shape)
+        return _hash(*parts)
 
 
 def learn(
@@ -153,7 +141,7 @@ def learn(
         place.mkdir(exist_ok=True)
     shapes = []
     for category in categories:
-        file = place / f"{category}-{_hash(train[category])}.shape"
+        file = place / f"{category}-{_hash_of_models(train[category])}.shape"
         if not _is_readable(file):
             logger.info("learning the shape of %s from %d models", category, len(train[category]))
             ShapeModel.from_dataset(dataset, category, split=split, meshes=False).save(file)
@@ -170,12 +158,9 @@ def learn(
     return LearnedFiles(tuple(shapes), str(file.absolute()))
 
 
-def _hash(models: Sequence[AnnotatedModel]) -> str:
-    digest = hashlib.sha256()
-    for model in models:
-        digest.update(model.model_id.encode() + b"\0")
-        digest.update(model.keypoints.xyz.tobytes() + model.keypoints.semantic_ids.tobytes())
-    return digest.hexdigest()[:16]
+def _hash_of_models(models: Sequence[AnnotatedModel]) -> str:
+    keypoints = ((each.model_id, each.keypoints) for each in models)
+    return _hash(*(part for name, k in keypoints for part in (f"{name}\0", k.xyz, k.semantic_ids)))
 
 
 def _is_readable(file: Path) -> bool:
@@ -185,6 +170,11 @@ def _is_readable(file: Path) -> bool:
     except DataError:
         return False
     return True
+
+
+@lru_cache(maxsize=32)
+def _open(path: Path | str) -> ShapeModel:
+    return ShapeModel.open(path)
 
 
 @lru_cache(maxsize=2)
@@ -220,10 +210,24 @@ def shapes_fingerprint(shapes: Sequence[ShapeModel]) -> str:
     """Hash of shape models; empty of none."""
     if not shapes:
         return ""
-    digest = hashlib.sha256()
+    parts: list[Any] = []
     for shape in shapes:
-        digest.update(f"{shape.category}\0{shape.inflation!r}\0{shape.unit}\0".encode())
-        for part in shape.components:
-            numbers = [part.weight, *part.mean.ravel(), *part.modes.ravel()]
-            digest.update(np.append(numbers, part.residual_sigma).tobytes())
+        parts += [f"{shape.category}\0{shape.inflation!r}\0{shape.unit}\0", *_numbers(shape)]
+    return _hash(*parts)
+
+
+def _numbers(shape: ShapeModel) -> list[Any]:
+    """The numbers of a shape's components."""
+    return [
+        np.append([part.weight, *part.mean.ravel(), *part.modes.ravel()], part.residual_sigma)
+        for part in shape.components
+    ]
+
+
+def _hash(*parts: Any) -> str:
+    """Hash of texts, bytes and arrays."""
+    digest = hashlib.sha256()
+    for part in parts:
+        data = part.tobytes() if isinstance(part, np.ndarray) else part
+        digest.update(data.encode() if isinstance(data, str) else data)
     return digest.hexdigest()[:16]

@@ -1,7 +1,54 @@
-"""The page: one HTML file with everything inside, and perhaps a folder of pictures beside it."""
+"""The page: one HTML file with everything inside, and perhaps a folder of pictures beside it.
+
+Its payload is one JSON object, which ``cadalign/web/report`` reads ::
+
+    {
+      "format": 1,
+      "title": "...", "summary": "one paragraph of plain text",
+      "runs": [{"name", "what": the experiment's name,
+                "state": "finished" | "unfinished", "done", "total", "settings": [[name, value]]}],
+      "methods": [{"key", "label", "color", "color_dark", "dash": "solid" | "dash", "is_limit"}],
+      "metrics": [{"key", "label", "unit", "factor", "digits", "better": "low" | "high", "log",
+                   "limit"}],
+      "headline": {"group", "columns": [{"key", "label", "unit", "digits", "better"}],
+                   "rows": [{"run", "category", "method", "cells": {key: number}, "best": [key]}],
+                   "failures": [{"run", "category", "method", "reason", "count"}],
+                   "skipped": likewise,
+                   "paper": [{"category", "method", "cells"}], "note"},
+      "tables": {
+        "strings": [...],
+        "instances": {"id", "run", "category", "model", "view", "keypoints", "true_y", "true_z",
+                      "noise", "visibility", "symmetry", "exhibit", "thumb"},
+        "rows": {"instance", "method", "status", "reason", each metric's key}
+      },
+      "plots": [{"id", "title", "kind": "lines", "x": {"label", "unit", "log"}, "y",
+                 "traces": [{"run", "method", "x", "y", "low", "high"}], "note"}],
+      "pictures": {key: URL}, "thumbs": {key: URL},
+      "exhibits": {key: exhibit}, "meshes": {key: mesh}
+    }
+
+``tables`` holds columns, each a list: ``category``, ``model``, ``visibility``, ``symmetry`` and
+``reason`` are places in ``strings`` (``reason`` -1 where there is none), ``method`` and ``run``
+places in the lists above, ``status`` is 1 for a failure. ``id`` is the same for the same instance
+of several runs; ``true_y`` and ``true_z`` are what the model was stretched by. Numbers of rows are
+as results have them: shown is the value times the metric's ``factor``. ``limit``, the cells of the
+headline and the values of ``plots`` are as shown. What is unknown or not finite is null.
+
+``exhibit`` and ``thumb`` are keys, -1 for none. An exhibit is an instance record
+(`cadalign.evaluation.instances.record`) with the keys of its ``picture``, which has no boxes drawn
+in as thumbs have, and of its ``mesh``, both null where there is none. A mesh is a preview
+(`cadalign.evaluation.instances.pictures`) of the dataset's model: that, times the exhibit's
+``stretch``, is the model that methods were given.
+
+Where pictures are in a folder beside the page, instead of ``exhibits`` and ``meshes`` there are
+``exhibit_files``, scripts that call ``cadalignExhibit(key, exhibit)`` for ``exhibits_per_file``
+keys each (key k is in file k / exhibits_per_file), and ``mesh_files``, by key, that call
+``cadalignMesh(key, mesh)``. A page opened from a file may load scripts, but not fetch.
+"""
 
 from __future__ import annotations
 
+import colorsys
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,15 +56,27 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from cadalign.evaluation.options import LIMIT
+from cadalign.evaluation.plots import look_of
+from cadalign.evaluation.registry import spec_of
+from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import dense_json, write_text, writing
-from cadalign.report.headline import headline_of
-from cadalign.report.instances import instance_table
+from cadalign.report.headline import Headline, headline_of
+from cadalign.report.instances import InstanceTable, instance_table
 from cadalign.report.media import INLINE_LIMIT, AssetStore, inline_bytes
-from cadalign.report.payload import payload_of
-from cadalign.report.runs import all_methods, read_runs, shown_metrics
-from cadalign.report.text import title_of
+from cadalign.report.runs import (
+    all_methods,
+    read_runs,
+    settings_of,
+    shown_metrics,
+    summary_of,
+    title_of,
+)
 from cadalign.web import asset, fill
 
+_FORMAT = 1
+_INK, _INK_ON_DARK = "#1b1d21", "#e8e9ec"
+_LEAST_LIGHTNESS_ON_DARK = 0.62
 # JSON may have these escaped anywhere they can stand; HTML must not see them.
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
@@ -84,3 +143,63 @@ def render_page(payload: dict[str, Any]) -> str:
         payload=dense_json(payload).translate(_ESCAPES),
         script=asset("report.js"),
     )
+
+
+def payload_of(
+    runs: Sequence[Run],
+    headline: Headline,
+    table: InstanceTable | None,
+    media: dict[str, Any],
+    *,
+    title: str,
+) -> dict[str, Any]:
+    """Put the payload of a page on runs of one kind together.
+
+    ``table`` is None for runs without instances; ``media`` is from
+    `cadalign.report.media.AssetStore`.
+    """
+    spec = spec_of(runs[0])
+    return {
+        "format": _FORMAT,
+        "title": title,
+        "summary": summary_of(runs),
+        "runs": [
+            {
+                "name": run.name,
+                "what": run.experiment,
+                "state": "finished" if run.is_finished else "unfinished",
+                "done": run.done,
+                "total": run.total,
+                "settings": [list(pair) for pair in settings_of(run)],
+            }
+            for run in runs
+        ],
+        "methods": [method_dict(name) for name in all_methods(runs)],
+        "metrics": [metric.page() for metric in shown_metrics(runs)],
+        "headline": headline.to_dict(),
+        "tables": None if table is None else table.to_dict(),
+        "plots": [plot.to_dict() for plot in spec.plots(runs)],
+        **media,
+    }
+
+
+def method_dict(name: str) -> dict[str, Any]:
+    """A method for the page."""
+    look = look_of(name)
+    is_limit = name == LIMIT
+    return {
+        "key": name,
+        "label": look.label,
+        "color": _INK if is_limit else look.color,
+        "color_dark": _INK_ON_DARK if is_limit else _on_dark(look.color),
+        "dash": "dash" if is_limit else "solid",
+        "is_limit": is_limit,
+    }
+
+
+def _on_dark(color: str) -> str:
+    """The colour, made lighter if it would hardly be seen on a dark ground."""
+    red, green, blue = (int(color[place : place + 2], 16) / 255 for place in (1, 3, 5))
+    hue, lightness, saturation = colorsys.rgb_to_hls(red, green, blue)
+    lighter = colorsys.hls_to_rgb(hue, max(lightness, _LEAST_LIGHTNESS_ON_DARK), saturation)
+    return "#" + "".join(f"{round(255 * part):02x}" for part in lighter)

@@ -26,7 +26,8 @@ from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import RetrievalQuery, RetrievalTask, observe_model
-from cadalign.evaluation.instances.unseen import UnseenSighting, UnseenTasks, observe_object
+from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
+from cadalign.evaluation.methods.unseen import UnseenObject
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel, Match
 from cadalign.retrieval.models import ModelKey
@@ -168,7 +169,7 @@ class UnseenRetrieval:
         times: dict[str, list[float]] = {name: [] for name in ious}
         for model_id, seen in self._sightings(dataset, category, count):
             known = np.isin(seen.semantic_ids, shape.ids)
-            gt = Box.from_model(seen.bounds, seen.gt)
+            gt = Box.from_model(seen.task.hull.bounds, seen.gt)
             if known.sum() < _LEAST_SHARED or gt.volume < 1e-9:
                 continue
             call = partial(
@@ -197,7 +198,7 @@ class UnseenRetrieval:
 
     def _sightings(
         self, dataset: KeypointNet, category: str, count: int
-    ) -> Iterator[tuple[str, UnseenSighting]]:
+    ) -> Iterator[tuple[str, UnseenObject]]:
         """Ids and views of a category's objects."""
         options = UnseenOptions(
             root=dataset.root,

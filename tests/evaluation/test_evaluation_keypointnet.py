@@ -16,9 +16,9 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.keypointnet import (
     SPEC,
+    TABLE,
     KeypointNetOptions,
     summarize_cells,
-    texts,
 )
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.pictures import draw_instance
@@ -186,7 +186,7 @@ def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Pat
     instance = make_instance(model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=scene)
     behind = Alignment(instance.gt.rotation, -instance.gt.translation, instance.gt.scale)
     folder = RunFolder(tmp_path / "run").made_for_pictures()
-    draw_instance(folder, instance, behind, category="chair", model_id="behind")
+    draw_instance(folder, instance, behind, "chair", "behind")
     assert (folder.overlays / "chair_behind.png").is_file()
 
 
@@ -279,7 +279,7 @@ def test_skipped_rows_count_neither_in_medians_nor_in_success() -> None:
 
 def test_a_category_where_all_failed_has_empty_cells() -> None:
     summaries = summaries_of([row("optimal", None)])
-    assert texts(summaries[0]) == ["-"] * 6
+    assert [column.text(summaries[0][column.key]) for column in TABLE] == ["-"] * 6
     assert summary_csv(summaries, rename={}).splitlines()[1].startswith("chair,optimal,1,1,,,")
 
 

@@ -15,7 +15,6 @@ from cadalign.evaluation.api import evaluate
 from cadalign.evaluation.experiments.evidence import METHODS, EvidenceRunOptions, summarize
 from cadalign.evaluation.instances.evidence import (
     BOUNDS,
-    EvidenceInstance,
     ObjectScene,
     bound_of,
     evidence_benchmark,
@@ -66,10 +65,9 @@ def test_shots_without_noise_show_the_truth(car: ObjectScene) -> None:
 
 
 @pytest.mark.parametrize("method", QUICK)
-def test_bound_is_that_of_the_estimate(car: ObjectScene, root: Path, method: str) -> None:
+def test_bound_is_that_of_the_estimate(car: ObjectScene, method: str) -> None:
     """Without noise the estimate is the truth, where its stated covariance is the bound."""
-    options = EvidenceRunOptions(root, noise_px=0.0)
-    given = evidence_for(method, EvidenceInstance(car, options))
+    given = evidence_for(method, car)
     result = align(car.model, given.views, size=given.size)
     bound = bound_of(result, given, car)
     stated = result.covariance
@@ -80,10 +78,9 @@ def test_bound_is_that_of_the_estimate(car: ObjectScene, root: Path, method: str
 
 
 @pytest.mark.long
-def test_every_method_gives_what_it_is_named_after(car: ObjectScene, root: Path) -> None:
-    options = EvidenceRunOptions(root)
+def test_every_method_gives_what_it_is_named_after(car: ObjectScene) -> None:
     for method in METHODS:
-        given = evidence_for(method, EvidenceInstance(car, options))
+        given = evidence_for(method, car)
         first = given.views[0]
         assert (first.up is not None) == ("gravity" in method or method == "all")
         assert (given.size is not None) == ("length" in method or method == "all")
@@ -133,7 +130,7 @@ def test_model_that_fails_gives_failed_rows(root: Path) -> None:
     options = EvidenceRunOptions(root, methods=("keypoints", "depth"))
     experiment = evidence_benchmark(options)
     (model,) = KeypointNet(root).subset(categories=["car"])
-    from cadalign.evaluation.instances.views import KeypointTask
+    from cadalign.evaluation.instances.instance import KeypointTask
 
     task = KeypointTask.of_model(
         KeypointNet(root), model.category, model.model_id, visibility="rays"

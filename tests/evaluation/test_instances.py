@@ -13,9 +13,9 @@ from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     Instance,
     InstanceSymmetry,
+    KeypointTask,
     make_hull_instances,
 )
-from cadalign.evaluation.instances.views import KeypointTask
 from cadalign.evaluation.methods.fitted import fit_methods, fit_options
 from cadalign.evaluation.methods.registry import checked_names
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate

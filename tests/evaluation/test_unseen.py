@@ -19,9 +19,8 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
 from cadalign.evaluation.instances.unseen import (
-    UnseenTask,
     UnseenTasks,
     keep_preview,
     observe_object,
@@ -127,8 +126,8 @@ class TestRecords:
     def test_mesh_previews_are_kept_on_demand(self, tmp_path: Path, sample_root: Path) -> None:
         folder = RunFolder(tmp_path)
         options = UnseenOptions(sample_root, split="all", train="none", meshes=True)
-        model = KeypointNet(sample_root)["chair", "sample_chair_000"]
-        task = UnseenTask("chair", model.model_id, 0, model.keypoints.xyz, np.arange(1))
+        key = ("chair", "sample_chair_000")
+        task = KeypointTask.of_model(KeypointNet(sample_root), *key, visibility="hull")
         keep_preview(folder, options.root, task)
         (preview,) = folder.previews.iterdir()
         assert preview.name == "chair_sample_chair_000.json"
@@ -163,7 +162,7 @@ class TestViews:
         doubled = observe_object(task, replace(options, noise_px=2.0)).points_2d - clean.points_2d
         np.testing.assert_allclose(doubled, 2 * noisy)
         spoiled = observe_object(task, replace(options, outliers=0.3))
-        assert spoiled.is_outlier.sum() == round(0.3 * len(task.xyz))
+        assert spoiled.is_outlier.sum() == round(0.3 * len(task.hull.xyz))
         moved = np.abs(spoiled.points_2d - clean.points_2d).max(axis=1) > 6
         np.testing.assert_array_equal(moved, spoiled.is_outlier)
 

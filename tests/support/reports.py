@@ -19,8 +19,7 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.pictures import preview_of
 from cadalign.evaluation.metrics.table import INSTANCE_METRICS as METRICS
 from cadalign.render import look_at
-from cadalign.report.looks import method_dict
-from cadalign.report.page import render_page
+from cadalign.report.page import method_dict, render_page
 
 HOSTILE = "<img src=x onerror=alert(1)><b>&lt;"
 METHODS = ("optimal", "aepnp", "aepnp-paper")

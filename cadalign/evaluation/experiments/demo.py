@@ -18,7 +18,7 @@ from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, csv_text
 from cadalign.io.files import write_text
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.instances.views import KeypointTask
+    from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
     from cadalign.evaluation.runs.work import Plan
@@ -69,7 +69,8 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     Another demonstration in the folder is replaced, one that was interrupted goes on.
     """
     from cadalign.datasets import write_sample_dataset
-    from cadalign.evaluation.instances.views import AUTO, KeypointTask, keypointnet_benchmark
+    from cadalign.evaluation.instances.instance import AUTO, KeypointTask
+    from cadalign.evaluation.instances.views import keypointnet_benchmark
     from cadalign.evaluation.runs.work import Plan
 
     root = options.root

@@ -28,12 +28,10 @@ import tyro
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods.registry import is_registered
-from cadalign.evaluation.metrics import kitti
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.bop import BOP
-from cadalign.evaluation.metrics.kitti import KITTI
-from cadalign.evaluation.metrics.nine_dof import NINE_DOF
-from cadalign.evaluation.metrics.pascal3d import ROTATION, VIEWPOINT
+from cadalign.evaluation.metrics.photos import DEPTH as DEPTH_ERROR
+from cadalign.evaluation.metrics.photos import IOU_3D, KITTI, NINE_DOF, ROTATION, VIEWPOINT
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import medians_of, score_columns, shares_of
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
@@ -246,9 +244,9 @@ def _mean(found: Sequence[Summary]) -> Summary:
 
 _CURVES = (
     (ROTATION, np.array([0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 45, 90])),
-    (replace(kitti.DEPTH, log=False), np.array([1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
+    (replace(DEPTH_ERROR, log=False), np.array([1, 2, 3, 5, 7.5, 10, 15, 20, 30])),
     (replace(BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
-    (replace(kitti.IOU_3D, log=False), np.arange(0, 1.01, 0.05)),
+    (replace(IOU_3D, log=False), np.arange(0, 1.01, 0.05)),
 )
 
 

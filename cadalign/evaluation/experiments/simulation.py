@@ -23,7 +23,6 @@ from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.outcome import OK
@@ -219,16 +218,13 @@ class SweepProblems(Setting):
         return [SweepTask(self.kind.values[0], 0)]
 
     def case(self, task: SweepTask) -> Case:
-        """The problem of a task, and the standard deviation of its noise."""
         instance = self.problem(task), self._setting(task)["noise_px"] or 1.0
         return Case(self._names(task), instance=instance)
 
     def failed(self, task: SweepTask) -> list[Case]:
-        """The case of a task without a problem."""
         return [Case(self._names(task))]
 
     def given(self, instance: tuple[Problem, float]) -> MethodInput:
-        """The points of the problem: methods are told the standard deviation of the noise."""
         problem, sigma = instance
         inliers = None if problem.outliers is None else ~problem.outliers
         return MethodInput(
@@ -243,15 +239,9 @@ class SweepProblems(Setting):
     def answered(
         self, method: Method, instance: tuple[Problem, float], answer: Alignment | Result
     ) -> Alignment:
-        """The alignment."""
         return answer if isinstance(answer, Alignment) else answer.alignment
 
-    def compared(self, instance: tuple[Problem, float], estimate: Alignment) -> Compared:
-        """The estimated and the true alignment."""
-        return Compared(estimate, instance[0].alignment)
-
     def row(self, method: Method, instance: tuple[Problem, float], estimate: Alignment) -> Row:
-        """Errors of pose and stretch."""
         return {**alignment_errors(est=estimate, gt=instance[0].alignment)}
 
     def problem(self, task: SweepTask) -> Problem:

@@ -47,7 +47,6 @@ from cadalign.evaluation.experiments.correspondences import (
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
@@ -162,12 +161,10 @@ class SpoiledImages(Setting):
         return [CorrespondenceTask("warm-up", 0.2, 0, seen)]
 
     def failed(self, task: CorrespondenceTask) -> list[Case]:
-        """The case of a task without an instance."""
         points = None if task.seen is None else len(task.seen)
         return [Case(task.names, {"points": points, "success": False})]
 
     def case(self, task: CorrespondenceTask) -> Case:
-        """The spoiled image of a task."""
         if task.seen is None:
             raise DataError(task.problem)
         (case,) = self.failed(task)
@@ -178,18 +175,11 @@ class SpoiledImages(Setting):
         return replace(case, instance=SpoiledImage(truth, ransac))
 
     def given(self, image: SpoiledImage) -> MethodInput:
-        """All points of the image."""
         truth = image.truth
-        return MethodInput(truth.points_3d, truth.points_2d, truth.camera, 1.0, ransac=image.ransac)
-
-    def compared(self, image: SpoiledImage, estimate: Alignment | Result) -> Compared:
-        """The estimated and the true alignment."""
-        if isinstance(estimate, Alignment):
-            return Compared(estimate, image.truth.alignment)
-        return Compared(estimate.alignment, image.truth.alignment, estimate)
+        given = (truth.points_3d, truth.points_2d, truth.camera)
+        return MethodInput(*given, 1.0, ransac=image.ransac, gt=truth.alignment)
 
     def row(self, method: Method, image: SpoiledImage, estimate: Alignment | Result) -> Row:
-        """Errors by column."""
         return errors_of(estimate, image.truth, method=method)
 
 

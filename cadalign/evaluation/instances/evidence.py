@@ -55,13 +55,15 @@ from cadalign.evaluation.experiments.evidence import (
     VIEWS_KNOWN,
     EvidenceRunOptions,
 )
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    KeypointTask,
+    example_view,
+)
 from cadalign.evaluation.instances.scene import ObjectScene, Shot, make_scene, truth_in
-from cadalign.evaluation.instances.views import KeypointTask
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.evaluation.metrics.errors import alignment_errors, overlap
-from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -86,39 +88,28 @@ class Given:
 
 
 @dataclass(frozen=True, eq=False)
-class EvidenceInstance:
-    """A scene, and the accuracy of its evidence."""
-
-    scene: ObjectScene
-    options: EvidenceRunOptions
-
-
-@dataclass(frozen=True, eq=False)
 class EvidenceEstimate:
     """An estimate, and what it was made from, unless a registered function made it."""
 
-    answer: Alignment | Result
-    given: Given | None
-
-    @property
-    def alignment(self) -> Alignment:
-        """The estimated alignment."""
-        return self.answer if isinstance(self.answer, Alignment) else self.answer.alignment
+    alignment: Alignment
+    result: Result | None = None
+    given: Given | None = None
 
 
-def align_with(method: str, instance: EvidenceInstance) -> EvidenceEstimate:
+def align_with(method: str, scene: ObjectScene) -> EvidenceEstimate:
     """Align the scene's model with the evidence that a method gives."""
-    given = evidence_for(method, instance)
-    return EvidenceEstimate(align(instance.scene.model, given.views, size=given.size), given)
+    given = evidence_for(method, scene)
+    result = align(scene.model, given.views, size=given.size)
+    return EvidenceEstimate(result.alignment, result, given)
 
 
 OWN_METHODS = {name: Method(name, partial(align_with, name)) for name in METHODS}
 """The experiment's methods by name: each is `align` with some evidence."""
 
 
-def evidence_for(method: str, instance: EvidenceInstance) -> Given:
+def evidence_for(method: str, scene: ObjectScene) -> Given:
     """The views and the size that a method gives."""
-    scene, options = instance.scene, instance.options
+    options = scene.options
     kinds = COMBINED.get(method, (method,))
     count = next((VIEWS_KNOWN[kind] for kind in kinds if kind in VIEWS_KNOWN), 1)
     shots = scene.shots[:count]
@@ -135,7 +126,7 @@ def evidence_for(method: str, instance: EvidenceInstance) -> Given:
             ids=shot.rows.tolist(),
             sigma=options.sigma,
             cam_from_rig=shot.cam_from_first if count > 1 else None,
-            **(_of_first(kinds, scene, options) if number == 0 else {}),
+            **(_of_first(kinds, scene) if number == 0 else {}),
         )
         for number, shot in enumerate(shots)
     )
@@ -164,11 +155,9 @@ def bound_of(result: Result, given: Given, scene: ObjectScene) -> FloatArray:
     return pose_and_lengths(evidence, true_state, unknowns)
 
 
-def _of_first(
-    kinds: tuple[str, ...], scene: ObjectScene, options: EvidenceRunOptions
-) -> dict[str, Any]:
+def _of_first(kinds: tuple[str, ...], scene: ObjectScene) -> dict[str, Any]:
     """Fields of the first view beyond its keypoints."""
-    shot = scene.shots[0]
+    shot, options = scene.shots[0], scene.options
     fields: dict[str, Any] = {}
     if DEPTH in kinds:
         fields |= {"depth": shot.depths, "depth_sigma": options.depth_sigma}
@@ -191,9 +180,7 @@ class EvidenceScenes(Setting):
 
     def warm_up(self) -> Sequence[KeypointTask]:
         """Compile the kernels."""
-        points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
-        pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
-        pixels = KEYPOINT_CAMERA.project(pose.apply(points))
+        points, pixels, pose = example_view()
         for up in (None, [0.0, 1.0, 0.0]):
             align(Model(points_3d=points), View(KEYPOINT_CAMERA, pixels, up=up))
         box = Box.from_model([points.min(axis=0), points.max(axis=0)], pose)
@@ -201,42 +188,35 @@ class EvidenceScenes(Setting):
         return ()
 
     def case(self, task: KeypointTask) -> Case:
-        """The scene of a view."""
         if task.problem:
             raise DataError(task.problem)
         assert task.model is not None
-        scene = make_scene(task.model, task.view, self.options)
-        return Case(task.names, instance=EvidenceInstance(scene, self.options))
+        return Case(task.names, instance=make_scene(task.model, task.view, self.options))
 
-    def given(self, instance: EvidenceInstance) -> MethodInput:
-        """The first view's keypoints; for functions of views, two views with all evidence."""
-        scene, shot = instance.scene, instance.scene.shots[0]
+    def given(self, scene: ObjectScene) -> MethodInput:
+        shot = scene.shots[0]
         return MethodInput(
             np.asarray(scene.model.points_3d)[shot.rows],
             shot.points_2d,
             KEYPOINT_CAMERA,
             self.options.sigma,
             bounds=np.asarray(scene.model.bounds),
-            make_views=lambda: (scene.model, evidence_for(EVERYTHING, instance).views),
+            gt=scene.gt,
+            make_views=lambda: (scene.model, evidence_for(EVERYTHING, scene).views),
         )
 
     def answered(
-        self, method: Method, instance: EvidenceInstance, answer: Alignment | Result
+        self, method: Method, scene: ObjectScene, answer: Alignment | Result
     ) -> EvidenceEstimate:
-        """The answer beside the first view, whose bound is not known."""
-        return EvidenceEstimate(answer, None)
+        # The first view alone was given, for which no bound is known.
+        if isinstance(answer, Alignment):
+            return EvidenceEstimate(answer)
+        return EvidenceEstimate(answer.alignment, answer)
 
-    def compared(self, instance: EvidenceInstance, estimate: EvidenceEstimate) -> Compared:
-        """The estimated and the true alignment."""
-        result = estimate.answer if isinstance(estimate.answer, Result) else None
-        return Compared(estimate.alignment, instance.scene.gt, result)
-
-    def row(self, method: Method, instance: EvidenceInstance, estimate: EvidenceEstimate) -> Row:
-        """Errors, and their bounds, by column."""
-        scene = instance.scene
-        result, given = estimate.answer, estimate.given
+    def row(self, method: Method, scene: ObjectScene, estimate: EvidenceEstimate) -> Row:
+        result, given = estimate.result, estimate.given
         values = _errors(estimate.alignment, scene)
-        if given is None or isinstance(result, Alignment):
+        if given is None or result is None:
             return values
         values["keypoints"] = sum(len(shot.rows) for shot in given.shots)
         bounds = self._bounds(bound_of(result, given, scene), scene)

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets import AnnotatedModel, check_solid
+from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
 from cadalign.datasets.models.annotated_symmetry import rotations_of
 from cadalign.datasets.models.keypoints import Symmetries
-from cadalign.errors import TooFewVisibleError
+from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.instances.hull import HullView, KeypointHull, sample_hull_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -28,6 +28,7 @@ from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
     # Workers that look at annotations only are not to carry the renderer's libraries.
+    from cadalign.evaluation.runs.tables import Row
     from cadalign.render import Scene
 
 KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
@@ -35,8 +36,146 @@ KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy
 STRETCH_RANGE = (0.5, 2.0)
 RAYS = "rays"
 """Visibility found by casting rays at the mesh."""
+AUTO = "auto"
+"""Rays where there is a mesh, the hull's rule elsewhere."""
 HULL = "hull"
 """Visibility by the rule of `cadalign.evaluation.instances.hull`, without a mesh."""
+
+
+@dataclass(frozen=True, eq=False)
+class InstanceSymmetry:
+    """Rotations about one point that map an object onto itself.
+
+    Parameters
+    ----------
+    center : (3,) float
+        The point [model units].
+    rotations : (g, 3, 3) float
+        Single rotations; the first is the identity.
+    axis : (3,) float, optional
+        Any rotation about this axis, of length 1, through the point is a symmetry as well.
+    """
+
+    center: FloatArray
+    rotations: FloatArray
+    axis: FloatArray | None = None
+
+    @property
+    def is_trivial(self) -> bool:
+        """True where the identity is the only symmetry."""
+        return self.axis is None and len(self.rotations) == 1
+
+    def __str__(self) -> str:
+        if self.axis is not None:
+            return "circle"
+        return "none" if self.is_trivial else f"{len(self.rotations)} rotations"
+
+    def nearest_truth(self, *, est: Alignment, gt: Alignment) -> Alignment:
+        """The truth, among those that look the same, whose rotation is nearest to the estimate's.
+
+        The symmetries are the object's, so they act on the model after the stretch that makes the
+        object of it: x -> R (c + G (S x - c)) + t with the truth's R, S, t. That is again an
+        alignment, of the rotation R G and the same scale S, which is why a stretched model's
+        truth may be turned without shearing it. An estimate that looks like the truth has zero
+        error; one with wrong scales about a right axis keeps the error of its scales.
+
+        The best angle about an axis a follows in closed form: with N = G' R_gt' R_est the trace
+        of Rot(a, angle)' N is A cos(angle) + B sin(angle) + a'N a, where A = tr N - a'N a and
+        B = a . (N_32 - N_23, N_13 - N_31, N_21 - N_12).
+        """
+        if self.is_trivial:
+            return gt
+        relative = gt.rotation.T @ est.rotation
+        candidates = [self._turned(rotation, relative) for rotation in self.rotations]
+        traces = [float(np.sum(candidate * relative)) for candidate in candidates]
+        best = candidates[int(np.argmax(traces))]
+        return Alignment(
+            gt.rotation @ best,
+            gt.translation + gt.rotation @ (self.center - best @ self.center),
+            gt.scale,
+            is_valid=True,
+        )
+
+    def _turned(self, rotation: FloatArray, relative: FloatArray) -> FloatArray:
+        """The rotation, turned about the axis as near as possible to ``relative``."""
+        if self.axis is None:
+            return rotation
+        n = rotation.T @ relative
+        along = float(self.axis @ n @ self.axis)
+        turn = np.array([n[2, 1] - n[1, 2], n[0, 2] - n[2, 0], n[1, 0] - n[0, 1]])
+        angle = np.arctan2(float(self.axis @ turn), float(np.trace(n)) - along)
+        return np.asarray(rotation @ rotation_from_vector(self.axis * float(angle)))
+
+
+def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> InstanceSymmetry:
+    """The rotations that map a model with the keypoints (k, 3) onto itself."""
+    return InstanceSymmetry(*rotations_of(xyz, symmetries))
+
+
+NO_SYMMETRY = InstanceSymmetry(np.zeros(3), np.eye(3)[None])
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointTask:
+    """One view of one model.
+
+    Parameters
+    ----------
+    hull : KeypointHull
+        Keypoints (k, 3), and what views without a mesh need to know of them.
+    model : AnnotatedModel, optional
+        The model with its mesh; None where it is evaluated on its keypoints alone.
+    problem : str
+        Reason why the model cannot be evaluated; empty otherwise.
+    """
+
+    category: str
+    model_id: str
+    view: int
+    hull: KeypointHull
+    semantic_ids: IntArray
+    symmetry: InstanceSymmetry
+    model: AnnotatedModel | None
+    problem: str = ""
+
+    @property
+    def names(self) -> Row:
+        """The cells that name its rows, but for the method."""
+        return {"category": self.category, "model_id": self.model_id, "view": self.view}
+
+    @classmethod
+    def of_model(
+        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str
+    ) -> KeypointTask:
+        """The first view of a dataset's model; a malformed one gives a task with a problem."""
+        try:
+            model = dataset[category, model_id]
+        except CadalignError as error:
+            return cls(
+                category=category,
+                model_id=model_id,
+                view=0,
+                hull=KeypointHull(np.empty((0, 3))),
+                semantic_ids=np.empty(0, dtype=np.int64),
+                symmetry=NO_SYMMETRY,
+                model=None,
+                problem=str(error),
+            )
+        return cls(
+            category=category,
+            model_id=model_id,
+            view=0,
+            hull=KeypointHull(model.keypoints.xyz),
+            semantic_ids=model.keypoints.semantic_ids,
+            symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
+            model=mesh_of(model, visibility),
+        )
+
+
+def mesh_of(model: AnnotatedModel, visibility: str) -> AnnotatedModel | None:
+    """The model if its mesh is to be used, which `load_scene` looks for."""
+    use_mesh = visibility == RAYS or (visibility == AUTO and model.mesh_path is not None)
+    return model if use_mesh else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +223,13 @@ class Instance:
         return Box.from_model(self.bounds, self.gt)
 
 
+def example_view() -> tuple[FloatArray, FloatArray, Alignment]:
+    """Nine points, their pixels and their pose, to compile kernels with."""
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
+    pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
+    return points, KEYPOINT_CAMERA.project(pose.apply(points)), pose
+
+
 def load_scene(model: AnnotatedModel) -> Scene:
     """Read a model's mesh for `make_instance`."""
     from cadalign.render import Scene
@@ -118,32 +264,8 @@ def make_instance(
     return instance
 
 
-class AnnotatedView(Protocol):
-    """A view of a model of which only the keypoints are known."""
-
-    @property
-    def category(self) -> str:
-        """Name of the category."""
-
-    @property
-    def model_id(self) -> str:
-        """The model's id."""
-
-    @property
-    def view(self) -> int:
-        """Index of the view."""
-
-    @property
-    def hull(self) -> KeypointHull:
-        """The keypoints."""
-
-    @property
-    def semantic_ids(self) -> IntArray:
-        """Their semantic ids."""
-
-
 def make_hull_instances(
-    views: Sequence[AnnotatedView], *, noise_px: float, min_visible: int, seed: int
+    views: Sequence[KeypointTask], *, noise_px: float, min_visible: int, seed: int
 ) -> list[Instance | TooFewVisibleError]:
     """Draw views, stretches and keypoint noise, as `make_instance`, for models without a mesh.
 
@@ -215,73 +337,3 @@ def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) 
             views, stretches, 1 / stretches, bounds * stretches[:, None], points_2d, strict=True
         )
     ]
-
-
-@dataclass(frozen=True, eq=False)
-class InstanceSymmetry:
-    """Rotations about one point that map an object onto itself.
-
-    Parameters
-    ----------
-    center : (3,) float
-        The point [model units].
-    rotations : (g, 3, 3) float
-        Single rotations; the first is the identity.
-    axis : (3,) float, optional
-        Any rotation about this axis, of length 1, through the point is a symmetry as well.
-    """
-
-    center: FloatArray
-    rotations: FloatArray
-    axis: FloatArray | None = None
-
-    @property
-    def is_trivial(self) -> bool:
-        """True where the identity is the only symmetry."""
-        return self.axis is None and len(self.rotations) == 1
-
-    def __str__(self) -> str:
-        if self.axis is not None:
-            return "circle"
-        return "none" if self.is_trivial else f"{len(self.rotations)} rotations"
-
-    def nearest_truth(self, *, est: Alignment, gt: Alignment) -> Alignment:
-        """The truth, among those that look the same, whose rotation is nearest to the estimate's.
-
-        The symmetries are the object's, so they act on the model after the stretch that makes the
-        object of it: x -> R (c + G (S x - c)) + t with the truth's R, S, t. That is again an
-        alignment, of the rotation R G and the same scale S, which is why a stretched model's
-        truth may be turned without shearing it. An estimate that looks like the truth has zero
-        error; one with wrong scales about a right axis keeps the error of its scales.
-
-        The best angle about an axis a follows in closed form: with N = G' R_gt' R_est the trace
-        of Rot(a, angle)' N is A cos(angle) + B sin(angle) + a'N a, where A = tr N - a'N a and
-        B = a . (N_32 - N_23, N_13 - N_31, N_21 - N_12).
-        """
-        if self.is_trivial:
-            return gt
-        relative = gt.rotation.T @ est.rotation
-        candidates = [self._turned(rotation, relative) for rotation in self.rotations]
-        traces = [float(np.sum(candidate * relative)) for candidate in candidates]
-        best = candidates[int(np.argmax(traces))]
-        return Alignment(
-            gt.rotation @ best,
-            gt.translation + gt.rotation @ (self.center - best @ self.center),
-            gt.scale,
-            is_valid=True,
-        )
-
-    def _turned(self, rotation: FloatArray, relative: FloatArray) -> FloatArray:
-        """The rotation, turned about the axis as near as possible to ``relative``."""
-        if self.axis is None:
-            return rotation
-        n = rotation.T @ relative
-        along = float(self.axis @ n @ self.axis)
-        turn = np.array([n[2, 1] - n[1, 2], n[0, 2] - n[2, 0], n[1, 0] - n[0, 1]])
-        angle = np.arctan2(float(self.axis @ turn), float(np.trace(n)) - along)
-        return np.asarray(rotation @ rotation_from_vector(self.axis * float(angle)))
-
-
-def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> InstanceSymmetry:
-    """The rotations that map a model with the keypoints (k, 3) onto itself."""
-    return InstanceSymmetry(*rotations_of(xyz, symmetries))

@@ -55,9 +55,8 @@ from cadalign.evaluation.experiments.retrieval import (
     RetrievalRunOptions,
 )
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE, example_view
 from cadalign.evaluation.methods.method import Method
-from cadalign.evaluation.methods.registry import choose_methods
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
@@ -172,18 +171,15 @@ class RetrievalQueries(Setting):
 
     def warm_up(self) -> Sequence[RetrievalTask]:
         """Compile the kernels."""
-        rng = np.random.default_rng(0)
+        (points, pixels, _), ids = example_view(), np.arange(9)
         models = [
-            LibraryModel("box", str(k), rng.uniform(-0.3, 0.3, (9, 3)), np.arange(9), _UNIT_BOUNDS)
-            for k in range(3)
+            LibraryModel("box", str(k), points[:, turn], ids, _UNIT_BOUNDS)
+            for k, turn in enumerate(([0, 1, 2], [1, 2, 0], [2, 0, 1]))
         ]
-        pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
-        pixels = KEYPOINT_CAMERA.project(pose.apply(models[0].xyz))
         Library.from_models(models).retrieve(pixels, np.arange(9), KEYPOINT_CAMERA)
         return ()
 
     def failed(self, task: RetrievalTask) -> list[Case]:
-        """The cases of a task without a query."""
         return [Case(task.names(protocol), _NO_MATCH) for protocol in self.options.protocols]
 
     def _cases(self, task: RetrievalTask) -> list[Case]:
@@ -204,7 +200,6 @@ class RetrievalQueries(Setting):
         ]
 
     def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
-        """Compare matches with the truth; see `match_values`."""
         best = _opened(instance.library)[matches[0].category, matches[0].model_id]
         placed = instance.query.gt
         return match_values(matches, best=best, gt=instance.gt, placed=placed, alike=instance.alike)
@@ -212,7 +207,7 @@ class RetrievalQueries(Setting):
 
 def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:
     """The methods of the options on queries of a library's file."""
-    methods = choose_methods(options.methods, _OWN_METHODS, general=False)
+    methods = tuple(_OWN_METHODS[name] for name in options.methods)
     return Benchmark(RetrievalQueries(library, options), methods)
 
 

@@ -69,8 +69,9 @@ class ObjectScene:
     cam_from_shown : Alignment
         Its pose in the first camera.
     names : tuple of str
-        Of the instance, for its randomness.
-    seed : int
+        Names of the instance, for its randomness.
+    options : EvidenceRunOptions
+        The seed, and the accuracy of the evidence.
     """
 
     model: Model
@@ -81,12 +82,12 @@ class ObjectScene:
     shown: Scene
     cam_from_shown: Alignment
     names: tuple[str, ...]
-    seed: int
+    options: EvidenceRunOptions
 
     def mask(self, damage: str = "exact") -> BoolArray:
         """The object's mask in the first camera; see `damaged_mask`."""
         mask = cast_geometry(self.shown, KEYPOINT_CAMERA, self.cam_from_shown).mask
-        return damaged_mask(mask, damage, instance_rng(self.seed, *self.names, damage))
+        return damaged_mask(mask, damage, instance_rng(self.options.seed, *self.names, damage))
 
 
 _scene_of = lru_cache(maxsize=1)(load_scene)  # views of one model come one after another
@@ -133,7 +134,7 @@ def make_scene(model: AnnotatedModel, view: int, options: EvidenceRunOptions) ->
         shown=shown,
         cam_from_shown=pose,
         names=names,
-        seed=options.seed,
+        options=options,
     )
 
 

@@ -55,8 +55,13 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting
 from cadalign.evaluation.experiments.unseen import COLUMNS, UnseenOptions
-from cadalign.evaluation.instances.hull import sample_hull_view
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    NO_SYMMETRY,
+    KeypointTask,
+    example_view,
+)
 from cadalign.evaluation.instances.pictures import write_preview
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
@@ -67,16 +72,15 @@ from cadalign.evaluation.instances.record import (
     record_stem,
     shape_of_result,
 )
-from cadalign.evaluation.instances.views import KeypointTask, KeypointTasks
+from cadalign.evaluation.instances.views import KeypointTasks
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.methods.unseen import (
     OWN_METHODS,
     ShapeEstimate,
     UnseenInstance,
-    UnseenSighting,
+    UnseenObject,
 )
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
-from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
@@ -126,7 +130,7 @@ class UnseenTasks(KeypointTasks):
         return digest.hexdigest()[:16]
 
 
-def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenSighting:
+def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
     """Draw a view of an object, the keypoints that are given, their noise and outliers.
 
     Views are those of `sample_hull_view`; hidden keypoints may be given, too. Everything random
@@ -153,9 +157,7 @@ def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenSighting
     clean = KEYPOINT_CAMERA.project(gt.apply(xyz[rows]))
     points = clean + options.noise_px * noise[rows]
     points[is_outlier] = elsewhere[rows][is_outlier]
-    return UnseenSighting(
-        points, task.semantic_ids[rows], rows, is_outlier, gt, xyz, task.semantic_ids
-    )
+    return UnseenObject(task, gt, rows, points, is_outlier)
 
 
 def probability_level(
@@ -210,42 +212,38 @@ class UnseenObjects(Setting):
 
     def warm_up(self) -> Sequence[KeypointTask]:
         """Compile the kernels."""
-        rng = np.random.default_rng(0)
-        points = rng.uniform(-0.3, 0.3, (9, 3))
-        pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
-        pixels, ids = KEYPOINT_CAMERA.project(pose.apply(points)), np.arange(9)
-        sighting = UnseenSighting(pixels, ids, ids, np.zeros(9, dtype=bool), pose, points, ids)
+        (points, pixels, pose), ids = example_view(), np.arange(9)
+        task = KeypointTask("", "", 0, KeypointHull(points), ids, NO_SYMMETRY, None)
+        seen = UnseenObject(task, pose, ids, pixels, np.zeros(9, dtype=bool))
         view = View(KEYPOINT_CAMERA, pixels)
         for model in (Model(points_3d=points), ShapeModel.from_basis(points, [points], [0.1])):
-            _coverage(align(model, view), sighting, ids, ids)
-        box = Box.from_model(sighting.bounds, pose)
+            _coverage(align(model, view), seen, ids, ids)
+        box = Box.from_model(task.hull.bounds, pose)
         overlap_up_to_scale(est=box, gt=box)
         return ()
 
     def case(self, task: KeypointTask) -> Case:
-        """The view of an object."""
-        sighting = observe_object(task, self.options)
-        facts = {"keypoints": len(sighting.points_2d)}
-        return Case(task.names, facts, UnseenInstance(task, sighting, self.learned, self.options))
+        seen = observe_object(task, self.options)
+        facts = {"keypoints": len(seen.points_2d)}
+        return Case(task.names, facts, UnseenInstance(seen, self.learned, self.options))
 
     def given(self, instance: UnseenInstance) -> MethodInput:
-        """The category's learned shape and the view; as points, its mean."""
-        shape, sighting = instance.shape, instance.sighting
-        known = np.isin(sighting.semantic_ids, shape.ids)
-        rows = shape.rows(sighting.semantic_ids[known].tolist())
+        shape, seen = instance.shape, instance.seen
+        known = np.isin(seen.semantic_ids, shape.ids)
+        rows = shape.rows(seen.semantic_ids[known].tolist())
         return MethodInput(
             shape.mean[rows],
-            sighting.points_2d[known],
+            seen.points_2d[known],
             KEYPOINT_CAMERA,
             instance.options.sigma,
             bounds=shape.mean[-2:],
+            gt=seen.gt,
             make_views=lambda: (shape, [instance.view_of(shape)]),
         )
 
     def answered(
         self, method: Method, instance: UnseenInstance, answer: Alignment | Result
     ) -> ShapeEstimate:
-        """The estimate of the mean shape, or of a result's own."""
         shape = instance.shape
         ids = np.array(shape.ids, dtype=np.int64)
         if isinstance(answer, Result) and tuple(answer.ids) == tuple(shape.ids):
@@ -253,21 +251,15 @@ class UnseenObjects(Setting):
         found = answer if isinstance(answer, Alignment) else answer.alignment
         return ShapeEstimate(found, shape.mean[-2:], ids, shape.mean[:-2])
 
-    def compared(self, instance: UnseenInstance, estimate: ShapeEstimate) -> Compared:
-        """The estimated alignment of the method's model, and the true one of the object."""
-        return Compared(estimate.alignment, instance.sighting.gt, estimate.result)
-
     def row(self, method: Method, instance: UnseenInstance, estimate: ShapeEstimate) -> Row:
-        """Errors and coverage by column."""
-        return _errors(estimate, instance.sighting)
+        return _errors(estimate, instance.seen)
 
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row]:
-        """The record of the object, and once the preview of its mesh."""
         instance: UnseenInstance = case.instance
-        if self.previews is not None and instance.task.view == 0:
-            keep_preview(self.previews, self.options.root, instance.task)
+        if self.previews is not None and instance.seen.task.view == 0:
+            keep_preview(self.previews, self.options.root, instance.seen.task)
         return outcomes, _record(instance, outcomes, estimates)
 
 
@@ -279,12 +271,12 @@ def unseen_benchmark(
     return Benchmark.chosen(setting, options.methods, OWN_METHODS, metrics=options.metrics)
 
 
-def _errors(found: ShapeEstimate, sighting: UnseenSighting) -> Row:
-    est, gt = found.alignment, sighting.gt
-    known, rows = _shared(found, sighting)
+def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
+    est, gt = found.alignment, seen.gt
+    known, rows = _shared(found, seen)
     own = found.points_3d[rows]
     box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
-    gt_box = Box.from_model(sighting.bounds, gt)
+    gt_box = Box.from_model(seen.task.hull.bounds, gt)
     boxes = {"est": box, "gt": gt_box}
     centre = Alignment(est.rotation, box.center, np.ones(3))
     gt_centre = Alignment(gt.rotation, gt_box.center, np.ones(3))
@@ -298,10 +290,10 @@ def _errors(found: ShapeEstimate, sighting: UnseenSighting) -> Row:
         "stated_box_iou_up_to_scale": overlap_up_to_scale(
             est=Box.from_model(found.bounds, est), gt=gt_box
         ),
-        "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(sighting.xyz[known])),
+        "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(seen.xyz[known])),
     }
     if found.result is not None:
-        values |= _coverage(found.result, sighting, known, rows)
+        values |= _coverage(found.result, seen, known, rows)
     return values
 
 
@@ -311,24 +303,24 @@ def _distance_up_to_scale(est: FloatArray, gt: FloatArray) -> float:
     return float(np.sqrt(((factor * est - gt) ** 2).sum(axis=1).mean()))
 
 
-def _coverage(result: Result, sighting: UnseenSighting, known: IntArray, rows: IntArray) -> Row:
+def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArray) -> Row:
     """Place of the truth in the stated probabilities; metrics by column.
 
     ``known`` are the rows of the object's keypoints that the model has, ``rows`` those of the
     model's keypoints that they are.
     """
     est = result.alignment
-    turn = vector_from_rotation(est.rotation @ sighting.gt.rotation.T)
+    turn = vector_from_rotation(est.rotation @ seen.gt.rotation.T)
     covariance = cast(FloatArray, result.covariance)
     of_points = cast(FloatArray, result.points_covariance)
     lengths = np.ptp(result.bounds, axis=0) * est.scale
-    true_lengths = np.ptp(sighting.bounds, axis=0)
+    true_lengths = np.ptp(seen.task.hull.bounds, axis=0)
     level, freedom = None, result.degrees_of_freedom
     if (lengths > 0).all() and (true_lengths > 0).all():
         ratios = _RATIOS @ np.log(lengths / true_lengths)
         spread = _RATIOS @ covariance[6:, 6:] @ _RATIOS.T
         level = probability_level(ratios, spread, freedom)
-    gaps = result.points_3d[rows] * est.scale - sighting.xyz[known]
+    gaps = result.points_3d[rows] * est.scale - seen.xyz[known]
     levels = [
         found
         for gap, own in zip(gaps, of_points[rows], strict=True)
@@ -371,12 +363,12 @@ def _record(
     estimates: Sequence[ShapeEstimate | CadalignError],
 ) -> Row:
     """The record of a view of an object, whose box is that of its keypoints."""
-    seen, sigma = instance.sighting, instance.options.sigma
+    seen, sigma = instance.seen, instance.options.sigma
     return record_of(
         camera=KEYPOINT_CAMERA,
         gt=seen.gt,
         stretch=1 / seen.gt.scale,
-        bounds=seen.bounds,
+        bounds=seen.task.hull.bounds,
         points_3d=seen.xyz[seen.rows],
         points_2d=seen.points_2d,
         semantic_ids=seen.semantic_ids,
@@ -388,45 +380,45 @@ def _record(
     )
 
 
-def _shared(found: ShapeEstimate, sighting: UnseenSighting) -> tuple[IntArray, IntArray]:
+def _shared(found: ShapeEstimate, seen: UnseenObject) -> tuple[IntArray, IntArray]:
     """Rows of the object's keypoints that an estimate has, and their rows in it."""
     row_of = {name: row for row, name in enumerate(found.ids.tolist())}
-    ids = sighting.all_ids.tolist()
+    ids = seen.task.semantic_ids.tolist()
     known = np.flatnonzero([name in row_of for name in ids])
     return known, np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
 
 
-def _aligned(found: ShapeEstimate, sighting: UnseenSighting, sigma: float) -> AlignedShape:
+def _aligned(found: ShapeEstimate, seen: UnseenObject, sigma: float) -> AlignedShape:
     """An estimate in terms of the object, of which it has some keypoints."""
-    known, rows = _shared(found, sighting)
-    alignment, warp = _warp(found.alignment, found.points_3d[rows], sighting, known)
-    rms = _rms(alignment, warp, sighting, known)
+    known, rows = _shared(found, seen)
+    alignment, warp = _warp(found.alignment, found.points_3d[rows], seen, known)
+    rms = _rms(alignment, warp, seen, known)
     if found.result is None:
         return AlignedShape(alignment, None, rms, sigma, (), (), warp)
     return shape_of_result(
         found.result,
-        lambda each: _warp(each.alignment, each.points_3d[rows], sighting, known),
+        lambda each: _warp(each.alignment, each.points_3d[rows], seen, known),
         rms=rms,
         sigma=sigma,
     )
 
 
 def _warp(
-    found: Alignment, points: FloatArray, sighting: UnseenSighting, known: IntArray
+    found: Alignment, points: FloatArray, seen: UnseenObject, known: IntArray
 ) -> tuple[Alignment, Warp]:
     """The alignment of the object's box with that of estimated points, and what remains."""
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-    alignment = box_alignment(found, bounds, model_bounds=sighting.bounds)
-    return alignment, Warp(sighting.xyz[known], alignment.inverse(found.apply(points)))
+    alignment = box_alignment(found, bounds, model_bounds=seen.task.hull.bounds)
+    return alignment, Warp(seen.xyz[known], alignment.inverse(found.apply(points)))
 
 
-def _rms(alignment: Alignment, warp: Warp, sighting: UnseenSighting, known: IntArray) -> float:
+def _rms(alignment: Alignment, warp: Warp, seen: UnseenObject, known: IntArray) -> float:
     """Root mean square residual [px] of the given keypoints that the method has."""
-    given = np.isin(sighting.rows, known)
-    places = warp.target[np.searchsorted(known, sighting.rows[given])]
+    given = np.isin(seen.rows, known)
+    places = warp.target[np.searchsorted(known, seen.rows[given])]
     in_camera = alignment.apply(places)
     ahead = in_camera[:, 2] > 0
     if not ahead.any():
         return float("nan")
-    residuals = KEYPOINT_CAMERA.project(in_camera[ahead]) - sighting.points_2d[given][ahead]
+    residuals = KEYPOINT_CAMERA.project(in_camera[ahead]) - seen.points_2d[given][ahead]
     return float(np.sqrt((residuals**2).sum(axis=1).mean()))

@@ -45,10 +45,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cadalign.arrays import IntArray
-from cadalign.datasets import AnnotatedModel, KeypointNet
+from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError, DataError
-from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import (
     VIEW_NAMES,
     Benchmark,
@@ -62,13 +60,13 @@ from cadalign.evaluation.benchmark import (
 from cadalign.evaluation.experiments.keypointnet import COLUMNS, KeypointNetOptions
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
-    RAYS,
+    NO_SYMMETRY,
     Instance,
-    InstanceSymmetry,
+    KeypointTask,
     load_scene,
     make_hull_instances,
     make_instance,
-    symmetry_group,
+    mesh_of,
 )
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
@@ -79,7 +77,6 @@ from cadalign.evaluation.instances.record import (
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.errors import estimate_errors, overlap_up_to_scale
-from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
 from cadalign.evaluation.options import SHAPE
 from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
@@ -88,67 +85,6 @@ from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
-
-AUTO = "auto"
-"""Rays where there is a mesh, the hull's rule elsewhere."""
-_NO_SYMMETRY = InstanceSymmetry(np.zeros(3), np.eye(3)[None])
-
-
-@dataclass(frozen=True, eq=False)
-class KeypointTask:
-    """One view of one model.
-
-    Parameters
-    ----------
-    hull : KeypointHull
-        Keypoints (k, 3), and what views without a mesh need to know of them.
-    model : AnnotatedModel, optional
-        The model with its mesh; None where it is evaluated on its keypoints alone.
-    problem : str
-        Reason why the model cannot be evaluated; empty otherwise.
-    """
-
-    category: str
-    model_id: str
-    view: int
-    hull: KeypointHull
-    semantic_ids: IntArray
-    symmetry: InstanceSymmetry
-    model: AnnotatedModel | None
-    problem: str = ""
-
-    @property
-    def names(self) -> Row:
-        """The cells that name its rows, but for the method."""
-        return {"category": self.category, "model_id": self.model_id, "view": self.view}
-
-    @classmethod
-    def of_model(
-        cls, dataset: KeypointNet, category: str, model_id: str, *, visibility: str
-    ) -> KeypointTask:
-        """The first view of a dataset's model; a malformed one gives a task with a problem."""
-        try:
-            model = dataset[category, model_id]
-        except CadalignError as error:
-            return cls(
-                category=category,
-                model_id=model_id,
-                view=0,
-                hull=KeypointHull(np.empty((0, 3))),
-                semantic_ids=np.empty(0, dtype=np.int64),
-                symmetry=_NO_SYMMETRY,
-                model=None,
-                problem=str(error),
-            )
-        return cls(
-            category=category,
-            model_id=model_id,
-            view=0,
-            hull=KeypointHull(model.keypoints.xyz),
-            semantic_ids=model.keypoints.semantic_ids,
-            symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
-            model=_mesh_of(model, visibility),
-        )
 
 
 class TaskOptions(Protocol):
@@ -204,14 +140,8 @@ class KeypointTasks(Tasks[KeypointTask]):
             digest.update(model.keypoints.xyz.tobytes())
             rotations = [rotation.keypoints for rotation in model.symmetries.rotations]
             digest.update(repr((model.symmetries.reflections, rotations)).encode())
-            digest.update(b"mesh" if _mesh_of(model, self._visibility) else b"")
+            digest.update(b"mesh" if mesh_of(model, self._visibility) else b"")
         return digest.hexdigest()[:16]
-
-
-def _mesh_of(model: AnnotatedModel, visibility: str) -> AnnotatedModel | None:
-    """The model if its mesh is to be used, which `load_scene` looks for."""
-    use_mesh = visibility == RAYS or (visibility == AUTO and model.mesh_path is not None)
-    return model if use_mesh else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,13 +184,12 @@ class KeypointViews(Setting):
                 view=0,
                 hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
                 semantic_ids=np.arange(12),
-                symmetry=_NO_SYMMETRY,
+                symmetry=NO_SYMMETRY,
                 model=None,
             )
         ]
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
-        """The instance of every task, or why there is none."""
         start, found = time.perf_counter(), []
         instances = self._instances(tasks)
         share = (time.perf_counter() - start) / max(len(tasks), 1)
@@ -274,7 +203,6 @@ class KeypointViews(Setting):
         return found
 
     def failed(self, task: KeypointTask) -> list[Case]:
-        """The case of a task without an instance."""
         facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
         has_shape = task.category in dict(self.shapes.paths)
         return [Case(task.names, facts, without=() if has_shape else (SHAPE,))]
@@ -295,7 +223,6 @@ class KeypointViews(Setting):
         return instances
 
     def given(self, view: KeypointView) -> MethodInput:
-        """The visible keypoints of the stretched model."""
         found = view.instance
         return MethodInput(
             found.points_3d,
@@ -306,13 +233,7 @@ class KeypointViews(Setting):
             gt=found.gt,
         )
 
-    def compared(self, view: KeypointView, estimate: Alignment | Result | AlignedShape) -> Compared:
-        """The estimated and the true alignment."""
-        result = estimate if isinstance(estimate, Result) else None
-        return Compared(pose_of(estimate), view.instance.gt, result)
-
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
-        """Metrics by column of each estimate."""
         rows: list[Row | Exception] = [
             *estimate_errors(
                 [pose_of(estimate) for _, estimate in pairs],
@@ -334,7 +255,6 @@ class KeypointViews(Setting):
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row | None]:
-        """Draw the first method's estimate, whose row fails where that is impossible."""
         view: KeypointView = case.instance
         first = outcomes[0]
         if self.drawn_in is not None and first.is_ok:

@@ -43,7 +43,9 @@ class MethodInput:
     ransac : RansacOptions, optional
         Options of searches for inliers.
     gt : Alignment, optional
-        The truth, and ``inliers`` (n,) bool the true inliers: for the Cramer-Rao bound alone.
+        The truth, for metrics and for the Cramer-Rao bound; no method is given it.
+    inliers : (n,) bool, optional
+        The true inliers, for the bound.
     make_views : callable, optional
         Makes the model and its views where they tell more than the keypoints.
     """

@@ -108,7 +108,7 @@ def _parameters(function: Callable[..., Any]) -> tuple[int, bool]:
 
 
 def choose_methods(
-    names: Iterable[str], own: Mapping[str, Method] | None = None, *, general: bool = True
+    names: Iterable[str], own: Mapping[str, Method] | None = None
 ) -> tuple[Method, ...]:
     """The methods of these names, each once.
 
@@ -117,8 +117,6 @@ def choose_methods(
     names : iterable of str
     own : mapping of str to Method, optional
         A benchmark's own methods; by default those of `cadalign.fit`.
-    general : bool
-        Registered functions can be chosen, too.
 
     Raises
     ------
@@ -126,35 +124,32 @@ def choose_methods(
         If one is unknown, or none is given.
     """
     table = fit_methods() if own is None else own
-    checked = checked_names(names, table, general=general)
+    checked = checked_names(names, table)
     return tuple(table[name] if name in table else registered_method(name) for name in checked)
 
 
-def checked_names(
-    names: Iterable[str], own: Collection[str] | None = None, *, general: bool = True
-) -> tuple[str, ...]:
+def checked_names(names: Iterable[str], own: Collection[str] | None = None) -> tuple[str, ...]:
     """The names of methods, each once, if all are known; see `choose_methods`."""
     table = fit_methods() if own is None else own
     chosen = tuple(dict.fromkeys(names))
     for name in chosen:
         if name in table:
-            if general and name in _REGISTERED:
+            if name in _REGISTERED:
                 fix = "register the function by another name"
                 what = f"{quote(name)} is a method of the experiment"
                 raise InputError(what, where="methods", fix=fix)
-        elif not general or not is_registered(name):
-            raise _unknown(name, known_names(table, general=general))
+        elif not is_registered(name):
+            raise _unknown(name, known_names(table))
     if not chosen:
-        fix = f"known are {', '.join(known_names(table, general=general))}"
+        fix = f"known are {', '.join(known_names(table))}"
         raise InputError("none is given", where="methods", fix=fix)
     return chosen
 
 
-def known_names(own: Iterable[str], *, general: bool = True) -> list[str]:
+def known_names(own: Iterable[str]) -> list[str]:
     """Names of some methods, and of registered ones."""
-    if general:
-        import_module(_EXAMPLES)
-    return list(dict.fromkeys([*own, *((*_REGISTERED, *_entry_points()) if general else ())]))
+    import_module(_EXAMPLES)
+    return list(dict.fromkeys([*own, *_REGISTERED, *_entry_points()]))
 
 
 def _unknown(name: object, known: Sequence[str]) -> InputError:

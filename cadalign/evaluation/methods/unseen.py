@@ -24,8 +24,7 @@ from cadalign.evaluation.experiments.unseen import (
     RANDOM_STRETCHED,
     UnseenOptions,
 )
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.instances.views import KeypointTask
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
 from cadalign.evaluation.methods.method import Method
 from cadalign.evaluation.metrics.cramer_rao import limit_estimate
 from cadalign.evaluation.options import LIMIT, SHAPE
@@ -40,38 +39,6 @@ _SIMILAR = 0.02  # of retrieval: misfit of the best model, as a share of its ext
 _INLIER_BOUND = 3.5  # standard deviations
 _MISFIT_PX = 30.0  # a residual that another model of the category leaves
 _LEAST_SHARED = 6
-
-
-@dataclass(frozen=True, eq=False)
-class UnseenSighting:
-    """Content of a view of an object, and the truth.
-
-    Parameters
-    ----------
-    points_2d : (n, 2) float
-        The given keypoints [px], with noise and outliers.
-    semantic_ids : (n,) int
-    rows : (n,) int
-        Their rows among all keypoints of the object.
-    is_outlier : (n,) bool
-    gt : Alignment
-        The object's pose; its scale is 1.
-    xyz, all_ids
-        All keypoints of the object.
-    """
-
-    points_2d: FloatArray
-    semantic_ids: IntArray
-    rows: IntArray
-    is_outlier: BoolArray
-    gt: Alignment
-    xyz: FloatArray
-    all_ids: IntArray
-
-    @property
-    def bounds(self) -> FloatArray:
-        """The least and greatest coordinates of the object's keypoints, (2, 3) float."""
-        return np.array([self.xyz.min(axis=0), self.xyz.max(axis=0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,22 +71,55 @@ class ShapeEstimate:
 
 
 @dataclass(frozen=True, eq=False)
+class UnseenObject:
+    """View of an object, whose scale is 1.
+
+    Parameters
+    ----------
+    task : KeypointTask
+        Names and keypoints of the object.
+    gt : Alignment
+        The pose.
+    rows : (n,) int
+        Rows of the given keypoints among all of the object.
+    points_2d : (n, 2) float
+        The given keypoints [px], with noise and outliers.
+    is_outlier : (n,) bool
+    """
+
+    task: KeypointTask
+    gt: Alignment
+    rows: IntArray
+    points_2d: FloatArray
+    is_outlier: BoolArray
+
+    @property
+    def xyz(self) -> FloatArray:
+        """All keypoints of the object, (k, 3) float."""
+        return self.task.hull.xyz
+
+    @property
+    def semantic_ids(self) -> IntArray:
+        """Semantic ids of the given keypoints, (n,) int."""
+        return self.task.semantic_ids[self.rows]
+
+
+@dataclass(frozen=True, eq=False)
 class UnseenInstance:
     """A view of an object, and what was learned of its category from others."""
 
-    task: KeypointTask
-    sighting: UnseenSighting
+    seen: UnseenObject
     learned: LearnedFiles
     options: UnseenOptions
 
     @property
     def shape(self) -> ShapeModel:
         """The shape model of the category."""
-        return self.learned.shape(self.task.category)
+        return self.learned.shape(self.seen.task.category)
 
     def view_of(self, model: Model | ShapeModel) -> View:
         """Those given keypoints that a model has."""
-        seen = self.sighting
+        seen = self.seen
         shared = np.isin(seen.semantic_ids, np.array(model.ids, dtype=np.int64))
         ids = seen.semantic_ids[shared].tolist()
         return View(KEYPOINT_CAMERA, seen.points_2d[shared], ids=ids, sigma=self.options.sigma)
@@ -130,8 +130,8 @@ def _of_shape(instance: UnseenInstance) -> ShapeEstimate:
 
 
 def _of_own_model(instance: UnseenInstance) -> ShapeEstimate:
-    seen = instance.sighting
-    return _aligned(Model(points_3d=seen.xyz, ids=seen.all_ids.tolist()), instance)
+    seen = instance.seen
+    return _aligned(Model(points_3d=seen.xyz, ids=seen.task.semantic_ids.tolist()), instance)
 
 
 def _of_mean(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
@@ -163,11 +163,11 @@ def _nearest(instance: UnseenInstance) -> ShapeEstimate:
     """The best match of the library."""
     library, options = instance.learned.opened_library(), instance.options
     first = library.retrieve(
-        instance.sighting.points_2d,
-        instance.sighting.semantic_ids,
+        instance.seen.points_2d,
+        instance.seen.semantic_ids,
         KEYPOINT_CAMERA,
         top=1,
-        category=instance.task.category,
+        category=instance.seen.task.category,
         sigma=max(options.noise_px, _LEAST_SIGMA),
         shape_sigma=_SIMILAR,
         loss="cauchy" if options.outliers else "linear",
@@ -179,8 +179,8 @@ def _nearest(instance: UnseenInstance) -> ShapeEstimate:
 
 def _random_model(instance: UnseenInstance) -> LibraryModel:
     """A random model of the category, among those that share enough keypoints with the image."""
-    library, task = instance.learned.opened_library(), instance.task
-    given = instance.sighting.semantic_ids
+    library, task = instance.learned.opened_library(), instance.seen.task
+    given = instance.seen.semantic_ids
     keys = [key for key in library.keys if key[0] == task.category]
     names = (task.category, task.model_id, str(task.view))
     rng = instance_rng(instance.options.seed, *names, "another model")
@@ -194,12 +194,12 @@ def _random_model(instance: UnseenInstance) -> LibraryModel:
 
 def _bound(instance: UnseenInstance) -> ShapeEstimate:
     """The ideal estimate with the object's own model from the keypoints that are no outliers."""
-    seen = instance.sighting
+    seen = instance.seen
     kept = ~seen.is_outlier
     alignment = limit_estimate(
         seen.xyz[seen.rows[kept]], seen.points_2d[kept], KEYPOINT_CAMERA, seen.gt
     )
-    return ShapeEstimate(alignment, seen.bounds, seen.all_ids, seen.xyz)
+    return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.semantic_ids, seen.xyz)
 
 
 _SOLVERS: dict[str, Callable[[UnseenInstance], ShapeEstimate]] = {

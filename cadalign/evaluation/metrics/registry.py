@@ -42,6 +42,16 @@ class Compared:
     gt: Alignment | None
     result: Result | None = None
 
+    @classmethod
+    def of(cls, estimate: Any, gt: Alignment | None) -> Compared:
+        """An alignment, a result, or another estimate with an ``alignment`` and perhaps one."""
+        from cadalign.estimation.result import Result
+
+        if isinstance(estimate, Alignment):
+            return cls(estimate, gt)
+        result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
+        return cls(estimate.alignment, gt, result)
+
 
 @dataclass(frozen=True)
 class RegisteredMetric:

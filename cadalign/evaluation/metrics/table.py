@@ -93,11 +93,23 @@ def told(metric: Metric, numbers: Sequence[float | None]) -> bool:
     return any(known) if metric == SKIPPED else bool(known)
 
 
+def rate(key: str, label: str, symbol: str = "", *, head: str = "", **look: Any) -> Metric:
+    """A share of objects, in per cent."""
+    shown = {"digits": 1, "better": HIGH, **look}
+    return Metric(key, label, "%", factor=100.0, head=head, symbol=symbol, log=False, **shown)
+
+
+def _like(metric: Metric, key: str, label: str, head: str = "", symbol: str = "") -> Metric:
+    """A metric with the unit and the look of another one."""
+    head = head or label
+    return replace(metric, key=key, label=label, head=head, symbol=symbol or head)
+
+
 INSTANCES = Metric("instances", "instances", digits=0, better=None, symbol="n")
 FAILED = Metric("failed", "failed", digits=0, better=None)
 SKIPPED = Metric("skipped", "skipped", digits=0, better=None, symbol="skip")
 """Shown only where something was skipped."""
-LEFT_OUT = replace(FAILED, key="left_out", label="left out", head="left out", symbol="out")
+LEFT_OUT = _like(FAILED, "left_out", "left out", symbol="out")
 KEYPOINTS = Metric("keypoints", "keypoints", digits=1, better=None, symbol="kpts")
 
 ROTATION = Metric(
@@ -116,87 +128,48 @@ TRANSLATION_OF_DISTANCE = replace(
 SCALE_Y = Metric(
     "scale_y_error", "error of s_y", "%", factor=100.0, head="s_y error", symbol="s_y %", limit=20.0
 )
-SCALE_Z = replace(
-    SCALE_Y, key="scale_z_error", label="error of s_z", head="s_z error", symbol="s_z %"
-)
+SCALE_Z = _like(SCALE_Y, "scale_z_error", "error of s_z", "s_z error", "s_z %")
 BOX_IOU = Metric("box_iou", "box IoU", digits=3, better=HIGH, symbol="IoU", log=False)
-TRANSLATION_UP_TO_SCALE = replace(
+TRANSLATION_UP_TO_SCALE = _like(
     TRANSLATION,
-    key="translation_error_up_to_scale",
-    label="translation error, up to scale",
-    head="t error, up to scale",
-    symbol="t~",
+    "translation_error_up_to_scale",
+    "translation error, up to scale",
+    "t error, up to scale",
+    "t~",
 )
 """After the estimate was scaled about the camera centre: one image does not tell the size."""
-BOX_IOU_UP_TO_SCALE = replace(
+BOX_IOU_UP_TO_SCALE = _like(BOX_IOU, "box_iou_up_to_scale", "box IoU, up to scale", symbol="IoU~")
+STATED_BOX_IOU_UP_TO_SCALE = _like(
     BOX_IOU,
-    key="box_iou_up_to_scale",
-    label="box IoU, up to scale",
-    head="box IoU, up to scale",
-    symbol="IoU~",
-)
-STATED_BOX_IOU_UP_TO_SCALE = replace(
-    BOX_IOU_UP_TO_SCALE,
-    key="stated_box_iou_up_to_scale",
-    label="IoU of the stated box, up to scale",
-    head="stated box IoU, up to scale",
+    "stated_box_iou_up_to_scale",
+    "IoU of the stated box, up to scale",
+    "stated box IoU, up to scale",
+    "IoU~",
 )
 RMS = Metric("rms_px", "reprojection error", "px", limit=5.0)
 
 # From the nearest truth that looks the same.
-SYM_ROTATION = replace(
-    ROTATION,
-    key="sym_rotation_error_deg",
-    label="rotation error, symmetry-aware",
-    head="R error, sym.",
-    symbol="R deg*",
+SYM_ROTATION = _like(
+    ROTATION, "sym_rotation_error_deg", "rotation error, symmetry-aware", "R error, sym.", "R deg*"
 )
 SYM_TRANSLATION = replace(
     TRANSLATION, key="sym_translation_error", label="translation error, symmetry-aware"
 )
 SYM_BOX_IOU = replace(BOX_IOU, key="sym_box_iou", label="box IoU, symmetry-aware")
 
-_RATE = Metric("", "", "%", 1, better=HIGH, factor=100.0, log=False)
-
-
-def rate(key: str, label: str, symbol: str) -> Metric:
-    """A share of objects, in per cent."""
-    return replace(_RATE, key=key, label=label, head=label, symbol=symbol)
-
-
-SUCCESS = replace(_RATE, key="success", label="success", head="success", symbol="succ%")
-SUCCESS_5 = replace(
-    _RATE,
-    key="success_5deg_5pct",
-    label="within 5 deg, 5 %",
-    head="within 5 deg, 5 %",
-    symbol="5/5 %*",
-)
-SUCCESS_10 = replace(
-    _RATE, key="success_10deg_10pct", label="within 10 deg, 10 %", head="within 10 deg, 10 %"
-)
+SUCCESS = rate("success", "success", "succ%")
+SUCCESS_5 = rate("success_5deg_5pct", "within 5 deg, 5 %", "5/5 %*")
+SUCCESS_10 = rate("success_10deg_10pct", "within 10 deg, 10 %")
 OVER_BOUND = Metric("over_limit", "R error over Cramer-Rao bound", better=None)
-INLIER_RECALL = replace(
-    _RATE, key="inlier_recall", label="inliers kept", head="inliers kept", symbol="found%"
-)
+INLIER_RECALL = rate("inlier_recall", "inliers kept", "found%")
 
-RANK_1 = replace(
-    _RATE, key="rank_1", label="true model first", head="true model first", symbol="first%"
-)
-RANK_5 = replace(
-    _RATE,
-    key="rank_5",
-    label="true model among the first 5",
-    head="among the first 5",
-    symbol="top5%",
-)
+RANK_1 = rate("rank_1", "true model first", "first%")
+RANK_5 = rate("rank_5", "true model among the first 5", "top5%", head="among the first 5")
 RECIPROCAL_RANK = Metric(
     "reciprocal_rank", "mean reciprocal rank", digits=3, better=HIGH, symbol="MRR", log=False
 )
-SCORE = replace(_RATE, key="score", label="score", head="score", symbol="score%", better=None)
-NONE = replace(
-    _RATE, key="none", label="none of the models", head="none of these", symbol="none%", better=None
-)
+SCORE = rate("score", "score", "score%", better=None)
+NONE = rate("none", "none of the models", "none%", head="none of these", better=None)
 """More likely none of the library's models than one: false in one protocol, true in the other."""
 SHAPE_DISTANCE = Metric(
     "shape_distance", "shape distance", "%", factor=100.0, symbol="shape%", log=False
@@ -210,42 +183,32 @@ QUERY_MILLISECONDS = replace(
 )
 MICROSECONDS = Metric("microseconds", "time of one call", "µs", digits=1)
 
-ROTATION_90 = replace(
+ROTATION_90 = _like(
     ROTATION,
-    key="rotation_error_deg_90",
-    label="90th percentile of the rotation error",
-    head="R error, 90 %",
-    symbol="R90",
+    "rotation_error_deg_90",
+    "90th percentile of the rotation error",
+    "R error, 90 %",
+    "R90",
 )
-BEST_ROTATION = replace(
+BEST_ROTATION = _like(
     ROTATION,
-    key="best_rotation_error_deg",
-    label="rotation error of the best alternative",
-    head="R error, best alternative",
-    symbol="best R",
+    "best_rotation_error_deg",
+    "rotation error of the best alternative",
+    "R error, best alternative",
+    "best R",
 )
 KEYPOINT_ERROR = Metric("keypoint_error", "keypoint error", "diagonals", 4, symbol="kp")
 """Root mean square, up to scale, of a method's estimate of all keypoints."""
 # Shares of the truths within regions of a stated probability.
-_COVERED = replace(_RATE, digits=0, better=None)
-ROTATION_IN_68 = replace(
-    _COVERED, key="rotation_in_68", label="rotations within 68 %", symbol="R in 68%"
-)
-ROTATION_IN_95 = replace(
-    _COVERED, key="rotation_in_95", label="rotations within 95 %", symbol="95%"
-)
-STRETCH_IN_68 = replace(
-    _COVERED, key="stretch_in_68", label="stretches within 68 %", symbol="s in 68%"
-)
-STRETCH_IN_95 = replace(_COVERED, key="stretch_in_95", label="stretches within 95 %", symbol="95%")
-KEYPOINTS_IN_68 = replace(
-    _COVERED, key="keypoints_within_68", label="keypoints within 68 %", symbol="kp in 68%"
-)
-KEYPOINTS_IN_95 = replace(
-    _COVERED, key="keypoints_within_95", label="keypoints within 95 %", symbol="95%"
-)
-COVERED = replace(_COVERED, key="covered", label="truths within the region")
-NOMINAL = replace(_COVERED, key="nominal", label="stated probability of a region")
+_COVERED: dict[str, Any] = {"digits": 0, "better": None}
+ROTATION_IN_68 = rate("rotation_in_68", "rotations within 68 %", "R in 68%", **_COVERED)
+ROTATION_IN_95 = rate("rotation_in_95", "rotations within 95 %", "95%", **_COVERED)
+STRETCH_IN_68 = rate("stretch_in_68", "stretches within 68 %", "s in 68%", **_COVERED)
+STRETCH_IN_95 = rate("stretch_in_95", "stretches within 95 %", "95%", **_COVERED)
+KEYPOINTS_IN_68 = rate("keypoints_within_68", "keypoints within 68 %", "kp in 68%", **_COVERED)
+KEYPOINTS_IN_95 = rate("keypoints_within_95", "keypoints within 95 %", "95%", **_COVERED)
+COVERED = rate("covered", "truths within the region", **_COVERED)
+NOMINAL = rate("nominal", "stated probability of a region", **_COVERED)
 
 # What tasks are grouped by.
 CATEGORY = Metric("category", "category", better=None)

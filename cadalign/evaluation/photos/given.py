@@ -61,11 +61,9 @@ class PosesOfObjects(Setting):
     columns = COLUMNS
 
     def case(self, task: GivenPoses) -> Case:
-        """An object with its poses."""
         return Case(task.target.names, _FACTS, task)
 
     def row(self, method: Method, instance: GivenPoses, estimate: PhotoEstimate) -> Row:
-        """Errors by the metrics of the data set."""
         sets = instance.protocol.metrics
         return score_alignment(instance.target, sets, estimate.alignment, estimate.box)
 
@@ -87,11 +85,9 @@ class PosesOfFiles(PosesOfObjects):
     drawn_in: RunFolder = field(repr=False)
 
     def failed(self, task: PhotoTask) -> list[Case]:
-        """The case of a photo that cannot be scored."""
         return [Case(task.names, _FACTS)]
 
     def _cases(self, task: PhotoTask) -> list[Case]:
-        """The objects of a photo, with their poses."""
         found = targets_of(task, self.options.root)
         targets = [each for each in found if isinstance(each, PhotoTarget)]
         files = [self._poses(path, targets) for path in self.options.estimates if targets]
@@ -122,7 +118,6 @@ class PosesOfFiles(PosesOfObjects):
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row | None]:
-        """The outcomes with their files' times, the record and the pictures of an object."""
         instance: GivenPoses = case.instance
         outcomes = [
             replace(outcome, seconds=pose.seconds if isinstance(pose, PoseEstimate) else None)

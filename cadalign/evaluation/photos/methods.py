@@ -125,6 +125,7 @@ def given_of(instance: PhotoInstance) -> MethodInput:
         sighting.camera,
         sighting.sigma,
         bounds=sighting.bounds * sighting.width,
+        gt=sighting.target.gt,
         make_views=lambda: _with_all_evidence(instance),
     )
 

@@ -17,7 +17,7 @@ scan2cad_translation_m, scan2cad_scale, scan2cad_aligned, scan2cad_aligned_axes
     Scan2CAD's errors, 1 where all are within their thresholds, and 1 where the scale of each axis
     is too; see `cadalign.evaluation.metrics.scan2cad`.
 yaw_error_deg, depth_error, depth_error_relative, iou_3d, iou_bev
-    KITTI's; see `cadalign.evaluation.metrics.kitti`.
+    KITTI's; see `cadalign.evaluation.metrics.photos`.
 mssd, mspd_px, mssd_recall, mspd_recall, vsd_recall
     BOP's: the first in diameters, the last three averaged over the thresholds; see
     `cadalign.evaluation.metrics.bop`.
@@ -52,6 +52,7 @@ from cadalign.evaluation.benchmark import (
     write_picture,
 )
 from cadalign.evaluation.experiments.photos import COLUMNS, PhotosOptions
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, example_view
 from cadalign.evaluation.instances.pictures import write_preview, write_webp
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
@@ -63,7 +64,6 @@ from cadalign.evaluation.instances.record import (
     shape_of_result,
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.metrics.registry import Compared
 from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.photos.methods import (
@@ -110,20 +110,15 @@ class PhotoObjects(Setting):
 
     def warm_up(self) -> Sequence[PhotoTask]:
         """Compile the kernels."""
-        points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
-        pose = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
-        camera = Camera(640, 480, 500, 500, 319.5, 239.5)
-        pixels = camera.project(pose.apply(points))
+        points, pixels, _ = example_view()
         for model in (Model(points_3d=points), Model(points_3d=points, shape_sigma=0.01)):
-            align(model, View(camera, pixels))
+            align(model, View(KEYPOINT_CAMERA, pixels))
         return ()
 
     def failed(self, task: PhotoTask) -> list[Case]:
-        """The case of a photo that could not be evaluated."""
         return [Case(task.names, {"source": ""})]
 
     def _cases(self, task: PhotoTask) -> list[Case]:
-        """The objects of a photo."""
         wanted = self.options.categories
         found = []
         for each in targets_of(task, self.options.root):
@@ -144,21 +139,14 @@ class PhotoObjects(Setting):
         return Case(target.names, facts, instance)
 
     def given(self, instance: PhotoInstance) -> MethodInput:
-        """The keypoints; for functions of views, the model to be stretched and all evidence."""
         return given_of(instance)
 
     def answered(
         self, method: Method, instance: PhotoInstance, answer: Alignment | Result
     ) -> PhotoEstimate:
-        """The estimate of the data set's model."""
         return estimate_of_answer(answer, instance.sighting)
 
-    def compared(self, instance: PhotoInstance, estimate: PhotoEstimate) -> Compared:
-        """The estimated and the true alignment of the data set's model."""
-        return Compared(estimate.alignment, instance.sighting.target.gt, estimate.result)
-
     def row(self, method: Method, instance: PhotoInstance, estimate: PhotoEstimate) -> Row:
-        """Errors by the metrics of the data set."""
         sighting, sets = instance.sighting, instance.protocol.metrics
         scores = score_alignment(sighting.target, sets, estimate.alignment, estimate.box)
         return {"rms_px": _rms(estimate, sighting)} | scores
@@ -166,7 +154,6 @@ class PhotoObjects(Setting):
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row | None]:
-        """The record and the pictures of an object, where a method has an estimate of it."""
         if not any(outcome.is_ok for outcome in outcomes):
             return outcomes, None
         instance: PhotoInstance = case.instance

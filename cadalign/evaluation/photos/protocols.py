@@ -17,9 +17,7 @@ from cadalign.datasets.photos.posed_photos import PosedPhotos
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
 from cadalign.evaluation.metrics.bop import BOP
-from cadalign.evaluation.metrics.kitti import KITTI
-from cadalign.evaluation.metrics.nine_dof import NINE_DOF
-from cadalign.evaluation.metrics.pascal3d import VIEWPOINT
+from cadalign.evaluation.metrics.photos import KITTI, NINE_DOF, VIEWPOINT
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.options import SHAPE

@@ -1,5 +1,5 @@
 // The payload as the page speaks of it: instances with their rows, and what is fetched on demand.
-// Its format is described in cadalign/report/payload.py.
+// Its format is described in cadalign/report/page.py.
 
 import { median } from "./statistics.js";
 

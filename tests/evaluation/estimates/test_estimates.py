@@ -19,7 +19,8 @@ from cadalign.datasets import Bop, Scan2CAD
 from cadalign.datasets.photos.bop_files import write_bop_results, write_scene_gt
 from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.photos.given import match_estimates, method_names
+from cadalign.evaluation.experiments.estimates import method_names
+from cadalign.evaluation.photos.given import match_estimates
 from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run

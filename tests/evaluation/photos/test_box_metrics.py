@@ -8,15 +8,14 @@ from scipy.spatial.transform import Rotation
 
 import cadalign.datasets
 from cadalign.datasets.photos.kitti_keypoints import car_box
-from cadalign.errors import InputError
-from cadalign.evaluation.metrics.kitti import kitti_errors
-from cadalign.evaluation.metrics.nine_dof import (
+from cadalign.evaluation.metrics.photos import (
+    NINE_DOF,
+    VIEWPOINT,
     degree_cm,
-    degree_cm_shares,
-    iou_shares,
+    kitti_errors,
     nine_dof_iou,
 )
-from cadalign.evaluation.metrics.pascal3d import viewpoint_error_deg, viewpoint_scores
+from cadalign.evaluation.metrics.sets import MetricSet, shares_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.symmetry import Symmetry
@@ -114,38 +113,32 @@ def test_degrees_and_centimetres():
     assert degree_cm(est=est, gt=gt, symmetry=bottle, metres=1e-3)[0] == pytest.approx(0, abs=1e-6)
 
 
+def shares(chosen: MetricSet, **columns: list[float]) -> dict[str, float]:
+    """Shares of a set by its metrics' names, of objects that are all ok."""
+    cells = {name: np.array(values, dtype=object) for name, values in columns.items()}
+    cells["status"] = np.array(["ok"] * len(next(iter(columns.values()))), dtype=object)
+    return shares_of([chosen], cells, cells)
+
+
 def test_shares_over_thresholds():
     """IoU must be over, degrees and cm within: 0.5 is not over 0.5, (5, 5) is within (5, 5)."""
-    assert iou_shares([1.0, 1.0]) == {0.25: 1.0, 0.5: 1.0, 0.75: 1.0}
-    assert iou_shares([0.5, 0.76, 0.1, 0.3]) == {0.25: 0.75, 0.5: 0.25, 0.75: 0.25}
-    assert np.isnan(iou_shares([])[0.5])
-    shares = degree_cm_shares([(5, 5), (5.1, 1), (0, 10)], thresholds=[(5, 5), (10, 5), (10, 10)])
-    assert shares == {(5, 5): pytest.approx(1 / 3), (10, 5): pytest.approx(2 / 3), (10, 10): 1}
-    assert degree_cm_shares([(0, 0)])[(5.0, 2.0)] == 1.0
-    with pytest.raises(InputError, match="shape"):
-        degree_cm_shares([1.0, 2.0])
+    found = shares(
+        NINE_DOF,
+        box_iou=[0.5, 0.76, 0.1],
+        rotation_error_deg=[5.0, 5.1, 0.0],
+        translation_cm=[5.0, 1.0, 10.0],
+    )
+    assert found["iou_25"] == pytest.approx(2 / 3)
+    assert found["iou_50"] == pytest.approx(1 / 3)
+    assert found["deg_5_cm_5"] == pytest.approx(1 / 3)
+    assert found["deg_10_cm_5"] == pytest.approx(2 / 3)
+    assert found["deg_10_cm_10"] == 1.0
 
 
 # --- PASCAL3D+ -------------------------------------------------------------------------------
 
 
-def test_viewpoint_scores():
-    """Cars: 2 of 4 below 30 deg, median (20 + 40) / 2. Buses: 30 is not below 30."""
-    scores = viewpoint_scores({"car": [10, 20, 40, 50], "bus": [30.0], "tv": [0.0, 0.0], "x": []})
-    assert scores.accuracy == {"car": 0.5, "bus": 0.0, "tv": 1.0}
-    assert scores.median_deg == {"car": 30.0, "bus": 30.0, "tv": 0.0}
-    assert scores.mean_accuracy == 0.5
-    assert scores.mean_median_deg == 20.0
-    assert np.isnan(viewpoint_scores({}).mean_accuracy)
-    with pytest.raises(InputError, match="negative"):
-        viewpoint_scores({"car": [-1.0]})
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-6, 29.0, 90.0, 180.0])
-def test_the_viewpoint_error_is_the_geodesic_distance(angle):
-    first = Rotation.random(random_state=3)
-    second = first * Rotation.from_rotvec(np.radians(angle) * np.array([0.6, 0, 0.8]))
-    error = viewpoint_error_deg(est=first.as_matrix(), gt=second.as_matrix())
-    assert error == pytest.approx(angle, abs=1e-9 if angle < 180 else 1e-5)
-    with pytest.raises(InputError, match="rotation"):
-        viewpoint_error_deg(est=np.ones((3, 3)), gt=np.eye(3))
+def test_accuracy_at_pi_6():
+    """Two of four errors are below 30 degrees; 30 is not below 30."""
+    found = shares(VIEWPOINT, rotation_error_deg=[10.0, 29.9, 30.0, 50.0])
+    assert found["accuracy_pi_6"] == 0.5

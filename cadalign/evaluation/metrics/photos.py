@@ -1,0 +1,287 @@
+"""Metrics of PASCAL3D+'s viewpoints, of boxes with nine degrees of freedom, and of KITTI's cars.
+
+Tulsiani, Malik, "Viewpoints and Keypoints", CVPR 2015, section 4.1: accuracy at pi/6, median error.
+Wang et al., "Normalized Object Coordinate Space for Category-Level 6D Object Pose and Size
+Estimation" (NOCS), CVPR 2019, section 5: IoU at 25, 50 and 75 %, and degrees and cm.
+Geiger et al., "Are we ready for Autonomous Driving?", CVPR 2012, and the benchmark's evaluation:
+yaw, depth, and the overlap of boxes in space and from above.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cadalign.arrays import BoolArray
+from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.errors import overlap_up_to_scale
+from cadalign.evaluation.metrics.sets import MetricSet, Rate, numbers
+from cadalign.evaluation.metrics.table import Metric
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
+from cadalign.geometry.metrics import box_iou
+from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.photos.target import PhotoTarget
+    from cadalign.evaluation.runs.opened import Cells
+    from cadalign.evaluation.runs.tables import Row
+
+# PASCAL3D+ ----------------------------------------------------------------------------------------
+
+ACCURACY_DEG = 30.0
+"""pi/6 [degrees]."""
+
+
+ROTATION = replace(metrics.ROTATION, digits=2)
+ACCURACY = metrics.rate("accuracy_pi_6", "accuracy at pi/6", "Acc pi/6")
+
+
+def _measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    error = symmetric_rotation_error(est=est, gt=gt, symmetry=target.found.symmetry)
+    return {ROTATION.key: error}
+
+
+VIEWPOINT = MetricSet(
+    "viewpoint",
+    _measure_viewpoint,
+    columns=(ROTATION.key,),
+    medians=(ROTATION,),
+    rates=(Rate(ACCURACY, ROTATION, lambda cells: numbers(cells, ROTATION) < ACCURACY_DEG),),
+    headline=(ROTATION, ACCURACY),
+    console=(ROTATION, ACCURACY),
+)
+
+# Nine degrees of freedom --------------------------------------------------------------------------
+
+IOU_THRESHOLDS = (0.25, 0.5, 0.75)
+DEGREE_CM = ((5.0, 2.0), (5.0, 5.0), (10.0, 2.0), (10.0, 5.0), (10.0, 10.0))
+"""Thresholds [degrees, cm]."""
+# NOCS tries 20 rotations about an axis of symmetry.
+_MAX_STEP = np.pi / 20
+
+
+def nine_dof_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
+    """Largest IoU of the true box and the estimated one over the object's symmetries.
+
+    As in NOCS, the estimate is turned about its own centre by the symmetries' rotations, those
+    about an axis in 20 steps.
+
+    Parameters
+    ----------
+    est, gt : Box
+        Boxes whose axes are the model's.
+    symmetry : Symmetry
+
+    Raises
+    ------
+    InputError
+        If a box has no volume.
+    """
+    rotations = symmetry.poses(max_step=_MAX_STEP)[:, :3, :3]
+    return max(
+        box_iou(est=Box(est.center, est.rotation @ turn, est.extents), gt=gt) for turn in rotations
+    )
+
+
+def degree_cm(
+    *, est: Alignment, gt: Alignment, symmetry: Symmetry, metres: float
+) -> tuple[float, float]:
+    """Rotation error [degrees], symmetry-aware, and translation error [cm].
+
+    Parameters
+    ----------
+    est, gt : Alignment
+    symmetry : Symmetry
+    metres : float
+        Length of one unit of the camera frame [m].
+
+    Examples
+    --------
+    >>> gt = Alignment(np.eye(3), [0, 0, 1000], [1, 1, 1])
+    >>> est = Alignment(np.eye(3), [0, 30, 1040], [1, 1, 1])
+    >>> degrees, cm = degree_cm(est=est, gt=gt, symmetry=Symmetry.none(), metres=0.001)
+    >>> degrees, round(cm, 9)
+    (0.0, 5.0)
+    """
+    gap = float(np.linalg.norm(est.translation - gt.translation))
+    degrees = symmetric_rotation_error(est=est, gt=gt, symmetry=symmetry)
+    return degrees, 100 * metres * gap
+
+
+TRANSLATION = Metric("translation_cm", "translation error", "cm", symbol="t cm", limit=50.0)
+_IOUS = {
+    limit: metrics.rate(
+        f"iou_{100 * limit:.0f}", f"IoU over {100 * limit:.0f} %", f"IoU{100 * limit:.0f}"
+    )
+    for limit in IOU_THRESHOLDS
+}
+_DEGREE_CM = {
+    (deg, cm): metrics.rate(
+        f"deg_{deg:.0f}_cm_{cm:.0f}",
+        f"within {deg:.0f} deg, {cm:.0f} cm",
+        f"{deg:.0f}deg{cm:.0f}cm",
+    )
+    for deg, cm in DEGREE_CM
+}
+
+
+def _measure_nine_dof(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    found, gt_box = target.found, target.gt_box
+    values: Row = {}
+    if found.truth.metres is not None:
+        how: dict[str, Any] = {"symmetry": found.symmetry, "metres": found.truth.metres}
+        values[TRANSLATION.key] = degree_cm(est=est, gt=gt, **how)[1]
+    if gt_box is not None and min(box.volume, gt_box.volume) > 0:
+        iou = nine_dof_iou(est=box, gt=gt_box, symmetry=found.symmetry)
+        values[metrics.BOX_IOU.key] = iou
+        values[metrics.BOX_IOU_UP_TO_SCALE.key] = overlap_up_to_scale(est=box, gt=gt_box)
+    return values
+
+
+def _is_over(cells: Cells, *, limit: float) -> BoolArray:
+    return np.asarray(numbers(cells, metrics.BOX_IOU) > limit)
+
+
+def _is_within(cells: Cells, *, limits: tuple[float, float]) -> BoolArray:
+    rotation, translation = numbers(cells, ROTATION), numbers(cells, TRANSLATION)
+    return np.asarray((rotation <= limits[0]) & (translation <= limits[1]))
+
+
+NINE_DOF = MetricSet(
+    "nine_dof",
+    _measure_nine_dof,
+    columns=(TRANSLATION.key, metrics.BOX_IOU.key, metrics.BOX_IOU_UP_TO_SCALE.key),
+    medians=(TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    rates=(
+        *(
+            Rate(metric, metrics.BOX_IOU, partial(_is_over, limit=limit))
+            for limit, metric in _IOUS.items()
+        ),
+        *(
+            Rate(metric, TRANSLATION, partial(_is_within, limits=limits))
+            for limits, metric in _DEGREE_CM.items()
+        ),
+    ),
+    headline=(
+        *(*_IOUS.values(), TRANSLATION, *_DEGREE_CM.values()),
+        *(metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
+    ),
+    console=(TRANSLATION, _DEGREE_CM[10.0, 10.0], _IOUS[0.5]),
+)
+
+# KITTI --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class KittiErrors:
+    """Errors and overlaps of one car.
+
+    Parameters
+    ----------
+    yaw_deg : float
+        Difference of the headings [degrees], 0 to 180.
+    depth : float
+        Difference of the centres' depths [m].
+    depth_relative : float
+        The same as a fraction of the true depth.
+    iou_3d : float
+        Intersection over union of the boxes.
+    iou_bev : float
+        The same of their footprints: from a bird's eye.
+    """
+
+    yaw_deg: float
+    depth: float
+    depth_relative: float
+    iou_3d: float
+    iou_bev: float
+
+
+def kitti_errors(*, est: Box, gt: Box) -> KittiErrors:
+    """Errors of a car's box in the frame of the camera.
+
+    The boxes' axes are the car's: x to its left, y to its rear, z up (see
+    `cadalign.datasets.KittiCars`). KITTI knows cars by their yaw alone: an estimate that is tilted
+    counts as the upright box of its heading, centre and extents.
+
+    Raises
+    ------
+    InputError
+        If a box has no volume.
+
+    Examples
+    --------
+    >>> gt = car_box(np.array([1.5, 1.6, 4.0]), np.array([0.0, 1.5, 10.0]), 0.0)
+    >>> est = car_box(np.array([1.5, 1.6, 4.0]), np.array([0.0, 1.5, 10.8]), 0.1)
+    >>> errors = kitti_errors(est=est, gt=gt)
+    >>> round(errors.yaw_deg, 3), round(errors.depth, 3), round(errors.depth_relative, 3)
+    (5.73, 0.8, 0.08)
+    """
+    turn = yaw_of_car(est.rotation) - yaw_of_car(gt.rotation)
+    depth = float(abs(est.center[2] - gt.center[2]))
+    return KittiErrors(
+        yaw_deg=float(np.degrees(abs(np.arctan2(np.sin(turn), np.cos(turn))))),
+        depth=depth,
+        depth_relative=depth / float(gt.center[2]),
+        iou_3d=box_iou(est=_upright(est), gt=_upright(gt)),
+        iou_bev=box_iou(est=_footprint(est), gt=_footprint(gt)),
+    )
+
+
+def _upright(box: Box) -> Box:
+    width, length, height = box.extents
+    bottom = box.center + np.array([0, height / 2, 0])
+    return car_box(np.array([height, width, length]), bottom, yaw_of_car(box.rotation))
+
+
+def _footprint(box: Box) -> Box:
+    """The prism of height 1 on the footprint: volumes of prisms are areas of footprints."""
+    width, length, _ = box.extents
+    bottom = np.array([box.center[0], 0.0, box.center[2]])
+    return car_box(np.array([1.0, width, length]), bottom, yaw_of_car(box.rotation))
+
+
+YAW = Metric("yaw_error_deg", "yaw error", "deg", symbol="yaw", limit=30.0)
+YAW_90 = replace(
+    YAW,
+    key="yaw_error_deg_90",
+    label="90th percentile of the yaw error",
+    head="yaw error, 90 %",
+    symbol="yaw90",
+)
+DEPTH = Metric(
+    "depth_error_relative", "depth error", "%", 1, factor=100.0, symbol="depth %", limit=50.0
+)
+IOU_3D = replace(metrics.BOX_IOU, key="iou_3d", label="3D IoU", head="3D IoU", symbol="IoU3D")
+IOU_BEV = replace(
+    metrics.BOX_IOU, key="iou_bev", label="bird's-eye IoU", head="bird's-eye IoU", symbol="BEV"
+)
+
+
+def _measure_kitti(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Row:
+    if target.gt_box is None:
+        return {}
+    errors = kitti_errors(est=box, gt=target.gt_box)
+    return {
+        YAW.key: errors.yaw_deg,
+        "depth_error": errors.depth,
+        DEPTH.key: errors.depth_relative,
+        IOU_3D.key: errors.iou_3d,
+        IOU_BEV.key: errors.iou_bev,
+    }
+
+
+KITTI = MetricSet(
+    "kitti",
+    _measure_kitti,
+    columns=(YAW.key, "depth_error", DEPTH.key, IOU_3D.key, IOU_BEV.key),
+    medians=(YAW, DEPTH, IOU_3D, IOU_BEV),
+    tails=((YAW_90, YAW),),
+    headline=(YAW, YAW_90, DEPTH, IOU_3D, IOU_BEV),
+    console=(YAW, YAW_90, DEPTH, IOU_3D, IOU_BEV),
+)

@@ -31,9 +31,9 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 import numpy as np
@@ -52,7 +52,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
-    from cadalign.estimation.result_parts import Alternative
+    pass
 
 RECORD_COLUMNS: Columns = (
     ("category", str),
@@ -69,6 +69,19 @@ _LONGEST_NAME = 200  # bytes
 _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
 _LEAST_SCALE = 1e-6
+
+
+class Placed(Protocol):
+    """An estimate of pose and shape: a result, an alternative to it, or of another method."""
+
+    @property
+    def alignment(self) -> Alignment: ...
+
+    @property
+    def points_3d(self) -> FloatArray: ...
+
+    @property
+    def bounds(self) -> FloatArray: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,42 +173,59 @@ def align_instance(
     )
     result = align(shape, view)
     ids = np.asarray(own_ids)
-    rows = np.isin(shape.ids, ids)
-    given = np.asarray(own_xyz)[np.isin(ids, shape.ids)] / instance.gt.scale
-    order = shape.rows(ids[np.isin(ids, shape.ids)].tolist())
+    shared = np.isin(ids, shape.ids)
+    rows = shape.rows(ids[shared].tolist())
+    given = np.asarray(own_xyz)[shared] / instance.gt.scale
+    return shape_of_result(
+        result,
+        rows,
+        given,
+        rms=_rms(result),
+        sigma=sigma,
+        model_bounds=instance.bounds,
+        spans_points=instance.scene is None and len(rows) > 0,
+    )
 
-    def in_terms_of_the_model(
-        alignment: Alignment, points: FloatArray, bounds: FloatArray
-    ) -> Alignment:
-        if instance.scene is None and rows.any():
-            bounds = np.stack([points[rows].min(axis=0), points[rows].max(axis=0)])
-        return box_alignment(alignment, bounds, model_bounds=instance.bounds)
 
-    def found(each: Result | Alternative) -> tuple[Alignment, Warp]:
-        alignment = in_terms_of_the_model(each.alignment, each.points_3d, each.bounds)
-        target = alignment.inverse(each.alignment.apply(each.points_3d[order]))
-        return alignment, Warp(given, target)
+def placed_in_model(
+    found: Placed,
+    rows: Sequence[int] | IntArray,
+    source: FloatArray,
+    *,
+    model_bounds: FloatArray,
+    spans_points: bool = False,
+) -> tuple[Alignment, Warp]:
+    """The alignment of a model's box with an estimated one, and what remains of the shape.
 
-    return shape_of_result(result, found, rms=_rms(result), sigma=sigma)
+    ``rows`` are those of the estimated keypoints that the model has at the places ``source``; the
+    estimated box is theirs where it ``spans_points``.
+    """
+    points = found.points_3d[rows]
+    bounds = found.bounds
+    if spans_points:
+        bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+    alignment = box_alignment(found.alignment, bounds, model_bounds=model_bounds)
+    return alignment, Warp(source, alignment.inverse(found.alignment.apply(points)))
 
 
 def shape_of_result(
     result: Result,
-    placed: Callable[[Result | Alternative], tuple[Alignment, Warp]],
+    rows: Sequence[int] | IntArray,
+    source: FloatArray,
     *,
     rms: float,
     sigma: float,
+    **how: Any,
 ) -> AlignedShape:
-    """The aligned shape of a result.
+    """The aligned shape of a result; see `placed_in_model`.
 
-    ``placed`` tells the alignment of an estimate's box and what remains of its shape; ``rms`` and
-    ``sigma`` are those of `AlignedShape` [px].
+    ``rms`` and ``sigma`` are those of `AlignedShape` [px].
     """
     alternatives = []
     for other in result.alternatives:
-        alignment, warp = placed(other)
+        alignment, warp = placed_in_model(other, rows, source, **how)
         alternatives.append(AlignedAlternative(alignment, other.relative_likelihood, warp))
-    alignment, warp = placed(result)
+    alignment, warp = placed_in_model(result, rows, source, **how)
     return AlignedShape(
         alignment, result.std, rms, sigma, result.warnings, tuple(alternatives), warp
     )

@@ -67,7 +67,7 @@ from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     AlignedShape,
     Warp,
-    box_alignment,
+    placed_in_model,
     record_of,
     record_stem,
     shape_of_result,
@@ -391,25 +391,13 @@ def _shared(found: ShapeEstimate, seen: UnseenObject) -> tuple[IntArray, IntArra
 def _aligned(found: ShapeEstimate, seen: UnseenObject, sigma: float) -> AlignedShape:
     """An estimate in terms of the object, of which it has some keypoints."""
     known, rows = _shared(found, seen)
-    alignment, warp = _warp(found.alignment, found.points_3d[rows], seen, known)
+    how: dict[str, Any] = {"model_bounds": seen.task.hull.bounds, "spans_points": True}
+    source = seen.xyz[known]
+    alignment, warp = placed_in_model(found, rows, source, **how)
     rms = _rms(alignment, warp, seen, known)
     if found.result is None:
         return AlignedShape(alignment, None, rms, sigma, (), (), warp)
-    return shape_of_result(
-        found.result,
-        lambda each: _warp(each.alignment, each.points_3d[rows], seen, known),
-        rms=rms,
-        sigma=sigma,
-    )
-
-
-def _warp(
-    found: Alignment, points: FloatArray, seen: UnseenObject, known: IntArray
-) -> tuple[Alignment, Warp]:
-    """The alignment of the object's box with that of estimated points, and what remains."""
-    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-    alignment = box_alignment(found, bounds, model_bounds=seen.task.hull.bounds)
-    return alignment, Warp(seen.xyz[known], alignment.inverse(found.apply(points)))
+    return shape_of_result(found.result, rows, source, rms=rms, sigma=sigma, **how)
 
 
 def _rms(alignment: Alignment, warp: Warp, seen: UnseenObject, known: IntArray) -> float:

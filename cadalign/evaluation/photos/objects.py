@@ -41,7 +41,6 @@ from cadalign.errors import CadalignError, DataError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import (
     VIEW_NAMES,
@@ -57,8 +56,6 @@ from cadalign.evaluation.instances.pictures import write_preview, write_webp
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     Estimate,
-    Warp,
-    box_alignment,
     record_of,
     record_stem,
     shape_of_result,
@@ -227,26 +224,12 @@ def _described(estimate: PhotoEstimate | CadalignError, sighting: Sighting) -> E
     result = estimate.result
     if result is None:
         return estimate.alignment
-    return shape_of_result(
-        result,
-        lambda each: (_of_box(each, sighting), _warp(result, each, sighting)),
-        rms=result.rms,
-        sigma=sighting.sigma,
-    )
-
-
-def _of_box(found: Result | Alternative, sighting: Sighting) -> Alignment:
-    """The alignment of the model's box with an estimated one."""
-    return box_alignment(found.alignment, found.bounds, model_bounds=sighting.bounds)
-
-
-def _warp(result: Result, found: Result | Alternative, sighting: Sighting) -> Warp:
-    """The places of the model's keypoints on the estimated object, in the model's coordinates."""
     row_of = {str(name): row for row, name in enumerate(result.ids)}
     known = [row for row, name in enumerate(sighting.model.names) if name in row_of]
     rows = [row_of[sighting.model.names[row]] for row in known]
-    places = _of_box(found, sighting).inverse(found.alignment.apply(found.points_3d[rows]))
-    return Warp(sighting.model.xyz[known], places)
+    source = sighting.model.xyz[known]
+    how: dict[str, Any] = {"sigma": sighting.sigma, "model_bounds": sighting.bounds}
+    return shape_of_result(result, rows, source, rms=result.rms, **how)
 
 
 _MOST = 1024  # pixels of a picture's longer side

@@ -165,7 +165,7 @@ class NoiseOption(ExperimentOptions):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the keypoints that methods are told [px]."""
+        """Standard deviation of the keypoints that methods are given [px]."""
         return self.noise_px or 1.0
 
 

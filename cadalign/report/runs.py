@@ -84,7 +84,7 @@ def _read(path: Path, name: str) -> Run:
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """As few of the paths' last parts as tell them apart."""
+    """The fewest last parts of the paths that are distinct."""
     parts = [path.absolute().parts for path in paths]
     for count in range(1, max(map(len, parts)) + 1):
         names = ["/".join(some[-count:]) for some in parts]

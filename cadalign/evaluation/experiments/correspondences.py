@@ -54,7 +54,7 @@ class CorrespondenceOptions(FunctionOptions):
     For every image, share of outliers and draw, the scene is stretched by factors from 0.5 to 2
     along y and z, and the share of the image points is moved to anywhere in the image; all methods
     get the same input. The run's folder gets results.parquet with a row per input and method,
-    summary.csv, figures and report.html. Killed, it goes on where it was when the same command is
+    summary.csv, figures and report.html. A killed run continues when the same command is
     started again. Times are best measured with --workers 1.
     """
 

@@ -64,8 +64,8 @@ class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     Each view shows a model with a mesh as it is; methods get its visible keypoints with noise, the
     model stretched by factors from 0.5 to 2 along y and z, and one kind of evidence or several.
     Every error is compared with the Cramer-Rao bound of its own instance. The run's folder gets
-    results.parquet with a row per view and method, summary.csv, figures and report.html. Killed, it
-    goes on where it was when the same command is started again.
+    results.parquet with a row per view and method, summary.csv, figures and report.html. A killed
+    run continues when the same command is started again.
     """
 
     experiment = "evidence"

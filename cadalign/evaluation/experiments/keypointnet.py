@@ -52,7 +52,7 @@ class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
     Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
     stretched by factors from 0.5 to 2 along y and z. The run's folder gets results.parquet with a
     row per model, view and method, summary.csv, figures, report.html and, if asked for, overlays.
-    Killed, it goes on where it was when the same command is started again.
+    A killed run continues when the same command is started again.
     """
 
     experiment = "keypointnet"
@@ -70,7 +70,7 @@ class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
     shape: Path | None = None
     """File of `cadalign shape learn`, or a folder of such files: adds the method shape, which
     aligns the learned shape of the category and knows nothing of the model; and errors up to scale,
-    since one image does not tell the object's size."""
+    since one image does not determine the object's size."""
     visibility: Literal["auto", "rays", "hull"] = "auto"
     """Keypoints are seen that rays cast at the mesh reach, or by a rule on the hull of the
     keypoints; auto takes rays where there is a mesh."""
@@ -176,7 +176,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         "Medians per category and method; success over all instances",
         summaries,
         (*told, *TABLE, *rest, *run.metrics),
-        note="t in model diagonals; ~ up to scale: one image does not tell the size"
+        note="t in model diagonals; scaled about the camera centre: one image leaves the size open"
         if is_up_to_scale
         else "t in model diagonals; * rotations that map a model onto itself are no errors",
     )

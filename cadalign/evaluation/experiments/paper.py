@@ -51,8 +51,8 @@ Announce = Callable[[str], Callable[[Progress], object]]
 def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda _: None) -> Path:
     """Run everything, or what is left of it; returns ``report.md``, beside figures and tables.
 
-    ``index.html`` is the same as a page. ``announce`` is told the name of the next run, and gives
-    the function to tell its progress to.
+    ``index.html`` is the same as a page. ``announce`` gets the name of the next run, and returns
+    the function that gets its progress.
     """
     figures = plan.out / "figures"
     with writing(figures):

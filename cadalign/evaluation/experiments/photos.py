@@ -88,9 +88,9 @@ class PhotosOptions(FunctionOptions):
     The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
     are the annotated or detected ones; where there are none, visible points of the model's mesh are
     projected with the true pose, with noise, and called simulated. The model's width (x) is given,
-    as one image does not tell size; with depth, or a shape model in metres, it is estimated. The
+    as one image leaves size open; with depth, or a shape model in metres, it is estimated. The
     run's folder gets results.parquet with a row per object and method, summary.csv, figures and
-    report.html. Killed, it goes on where it was when the same command is started again.
+    report.html. A killed run continues when the same command is started again.
     """
 
     experiment = "photos"
@@ -114,7 +114,7 @@ class PhotosOptions(FunctionOptions):
     simulated_points: int = 24
     """Number of points on a model of which the visible ones are simulated keypoints."""
     sigma: float | None = None
-    """Standard deviation of annotated or detected keypoints that methods are told, in pixels; by
+    """Standard deviation of annotated or detected keypoints that methods are given, in pixels; by
     default that of the data set."""
     similar_sigma: float = 0.04
     """Standard deviation of the object's keypoints from the model's, for the method similar, in
@@ -351,8 +351,8 @@ SPEC = Spec(
     note=(
         "Medians over the objects that did not fail, and shares of all, of which failures count as "
         "misses; objects without camera, model or enough keypoints are left out. The model's width "
-        "is the object's, as one image does not tell size, where neither depth nor a shape model "
-        "in metres does. Simulated: the data set has no keypoints, so that visible points of the "
-        "model were projected with the true pose, with noise; all methods get the same."
+        "is the object's, as one image leaves size open, where neither depth nor a shape model "
+        "in metres determines it. Simulated: the data set has no keypoints, so that visible points "
+        "of the model were projected with the true pose, with noise; all methods get the same."
     ),
 )

@@ -55,11 +55,11 @@ METHODS = (
 class UnseenOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate alignment to objects that are no stretched copy of any model.
 
-    Objects of one split of KeypointNet are aligned with what the other split tells of their
+    Objects of one split of KeypointNet are aligned with models of the other split, by
     category: another model, the nearest one of a library, the mean shape, or the learned shape
     model; and, for comparison, with the object's own model. The run's folder gets results.parquet
     with a row per object, view and method, summary.csv, figures, report.html and the learned
-    shapes. Killed, it goes on where it was when the same command is started again.
+    shapes. A killed run continues when the same command is started again.
     """
 
     experiment = "unseen"
@@ -162,7 +162,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         "Medians per category and method, and truths within stated regions",
         summaries,
         shown,
-        note="lengths in model diagonals; ~ scaled about the camera centre",
+        note="lengths in model diagonals; scaled: about the camera centre",
         narrow=True,
         wraps=True,
     )
@@ -249,8 +249,8 @@ SPEC = Spec(
     ),
     note=(
         "Medians over the objects that did not fail; lengths in diagonals of the object. Up to "
-        "scale: the estimate is scaled about the camera centre first, since one image does not "
-        "tell an object's size. Within 68 % and 95 %: how often the truth lies in the regions of "
+        "scale: the estimate is scaled about the camera centre first, since one image leaves "
+        "an object's size open. Within 68 % and 95 %: how often the truth lies in the regions of "
         "these probabilities that a method states; the uncertainties are right where the two agree."
     ),
 )

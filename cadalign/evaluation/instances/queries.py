@@ -27,8 +27,8 @@ box_iou
     Overlap of its box with the true model's, both posed and stretched; empty for a model without
     volume.
 box_iou_up_to_scale
-    The same after its box was scaled about the camera centre: one image does not tell the size of
-    an object that is not in the library.
+    The same after its box was scaled about the camera centre: one image leaves the size open
+    of an object that is not in the library.
 rotation_error_deg
     [degrees]
 """
@@ -69,7 +69,7 @@ from cadalign.retrieval.shape import SAME_SHAPE, distances, shape_distance
 from cadalign.seeding import instance_rng
 
 TOP = 50
-"""Ranks beyond this are not told apart."""
+"""Ranks beyond this are one."""
 _LEAST_SIGMA = 0.5  # keypoints without noise would leave no other model any chance
 _UNIT_BOUNDS = np.array([[-0.3] * 3, [0.3] * 3])
 _OPTIONS: dict[str, dict[str, Any]] = {

@@ -258,7 +258,7 @@ def _rms(result: Result) -> float:
 
 
 Estimate = Result | AlignedShape | Alignment | CadalignError
-"""A fit, the estimate of the object's own shape, the alignment of a method that tells no more, or
+"""A fit, the estimate of the object's own shape, the alignment of a method that returns no more, or
 the reason why there is none."""
 
 

@@ -8,11 +8,11 @@ keypoints
 rotation_error_deg
     [degrees]
 best_rotation_error_deg
-    The least of the estimate and its alternatives, which the keypoints cannot tell apart [degrees].
+    The least of the estimate and its alternatives [degrees].
 translation_error, translation_error_up_to_scale
     Distance of the boxes' centres, since models differ in the place of their origin [diagonals of
     the object's bounding box]; the second after the estimate was scaled about the camera centre,
-    since one image does not tell an object's size.
+    since one image does not determine an object's size.
 box_iou, box_iou_up_to_scale
     Overlap of the boxes that the object's keypoints span, in truth and as estimated, the second
     likewise; empty for an object without volume.

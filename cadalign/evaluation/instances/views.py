@@ -14,8 +14,8 @@ rotation_error_deg
 translation_error
     [diagonals of the model's bounding box]
 translation_error_up_to_scale
-    The same after the estimate was scaled about the camera centre, since one image does not tell
-    the size of an object; empty in earlier runs.
+    The same after the estimate was scaled about the camera centre, since one image leaves the
+    size of an object open; empty in earlier runs.
 scale_y_error, scale_z_error
     Relative errors, fractions.
 box_iou

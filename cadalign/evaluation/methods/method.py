@@ -37,7 +37,7 @@ class MethodInput:
         Their observations [px].
     camera : Camera
     sigma : float
-        Standard deviation of the observations that methods are told [px].
+        Standard deviation of the observations that methods are given [px].
     bounds : (2, 3) float, optional
         Least and greatest coordinates of the model.
     ransac : RansacOptions, optional
@@ -47,7 +47,7 @@ class MethodInput:
     inliers : (n,) bool, optional
         The true inliers, for the bound.
     make_views : callable, optional
-        Makes the model and its views where they tell more than the keypoints.
+        Makes the model and its views where they hold more than the keypoints.
     """
 
     points_3d: FloatArray

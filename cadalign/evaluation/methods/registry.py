@@ -52,7 +52,7 @@ def register_method(
         `cadalign.Alignment` or the result of `cadalign.fit` or `cadalign.align`, and raises where
         it finds none. A parameter ``sigma`` gets the standard deviation of the keypoints [px].
     takes : {"points", "views"}, optional
-        The arguments, where the number of required ones, 3 or 2, does not tell them.
+        The arguments, where the number of required ones, 3 or 2, does not determine them.
 
     Returns
     -------

@@ -109,8 +109,8 @@ def register_metric(
         Of keywords, any of ``est`` and ``gt``, the estimated and the true `cadalign.Alignment`;
         ``points_3d`` (n, 3) float [model units], ``points_2d`` (n, 2) float [px], ``camera``,
         ``sigma`` [px] and ``bounds`` (2, 3), what methods were given; and ``result``, the method's
-        `cadalign.Result`, None of one that tells an alignment only. It returns a number, or None
-        where it has none.
+        `cadalign.Result`, None where the method returns an alignment only. It returns a number, or
+        None where it has none.
     label, unit : str
         Shown in tables, on pages and at axes; by default the name.
     digits : int

@@ -88,7 +88,7 @@ class Metric:
 
 
 def told(metric: Metric, numbers: Sequence[float | None]) -> bool:
-    """Say whether a column of these numbers, None where there is none, tells anything."""
+    """True for a column worth showing, of these numbers, None where there is none."""
     known = [number for number in numbers if number is not None]
     return any(known) if metric == SKIPPED else bool(known)
 
@@ -135,16 +135,18 @@ TRANSLATION_UP_TO_SCALE = _like(
     "translation_error_up_to_scale",
     "translation error, up to scale",
     "t error, up to scale",
-    "t~",
+    "t scaled",
 )
-"""After the estimate was scaled about the camera centre: one image does not tell the size."""
-BOX_IOU_UP_TO_SCALE = _like(BOX_IOU, "box_iou_up_to_scale", "box IoU, up to scale", symbol="IoU~")
+"""After the estimate was scaled about the camera centre: one image leaves the size open."""
+BOX_IOU_UP_TO_SCALE = _like(
+    BOX_IOU, "box_iou_up_to_scale", "box IoU, up to scale", symbol="IoU scaled"
+)
 STATED_BOX_IOU_UP_TO_SCALE = _like(
     BOX_IOU,
     "stated_box_iou_up_to_scale",
     "IoU of the stated box, up to scale",
     "stated box IoU, up to scale",
-    "IoU~",
+    "IoU scaled",
 )
 RMS = Metric("rms_px", "reprojection error", "px", limit=5.0)
 

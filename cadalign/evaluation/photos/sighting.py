@@ -163,7 +163,7 @@ def _in_mask(mask: BoolArray, pixels: FloatArray) -> BoolArray:
 
 
 def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions, source: str) -> float:
-    """The standard deviation of keypoints [px] that methods are told."""
+    """The standard deviation of keypoints [px] that methods are given."""
     if source == SIMULATED:
         return max(options.simulated_noise_px, _LEAST_PX)
     if options.sigma is not None:

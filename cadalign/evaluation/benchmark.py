@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.method import LIMIT, Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, fingerprints
 from cadalign.evaluation.metrics.registry import (
     Compared,
@@ -21,7 +21,7 @@ from cadalign.evaluation.metrics.registry import (
     choose_metrics,
     metrics_config,
 )
-from cadalign.evaluation.options import LIMIT, ExperimentOptions
+from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.outcome import FAILED, Outcome, reason_of, status_of
 from cadalign.evaluation.runs.work import AbortError, Plan, Rows
 

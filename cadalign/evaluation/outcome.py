@@ -14,6 +14,8 @@ OK = "ok"
 FAILED = "failed"
 LEFT_OUT = "left out"
 """Status of an instance, or a method on it, that lacks what is asked for: neither failed nor ok."""
+UNREADABLE = "unreadable"
+"""The category of records that cannot be read."""
 SKIPPED = "skipped"
 """Status of an instance that no view shows enough keypoints of: no method was run."""
 

@@ -16,9 +16,9 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.methods.fitted import fit_methods
+from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import HIGH, Metric
-from cadalign.evaluation.options import LIMIT
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.summary import Quartiles, known
 from cadalign.io.files import write_whole

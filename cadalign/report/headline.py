@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import HIGH, Metric
-from cadalign.evaluation.options import LIMIT
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run

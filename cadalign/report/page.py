@@ -56,7 +56,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cadalign.evaluation.options import LIMIT
+from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run

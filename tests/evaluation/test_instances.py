@@ -17,9 +17,9 @@ from cadalign.evaluation.instances.instance import (
     make_hull_instances,
 )
 from cadalign.evaluation.methods.fitted import fit_methods, fit_options
+from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.methods.registry import checked_names
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate
-from cadalign.evaluation.options import LIMIT
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

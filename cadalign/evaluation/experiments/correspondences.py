@@ -22,9 +22,10 @@ import tyro
 from cadalign.datasets import open_correspondences
 from cadalign.errors import InputError
 from cadalign.estimation.options import RansacOptions
+from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.options import LIMIT, FunctionOptions
+from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.spec import Spec

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from cadalign.datasets import KeypointNet
-from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, SceneOptions
 from cadalign.evaluation.plots import Plot, cumulative
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
@@ -58,7 +57,7 @@ _DEFAULT = tuple(name for name in METHODS if name not in DAMAGED or name == "mas
 
 
 @dataclass(frozen=True)
-class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
+class EvidenceRunOptions(ModelOptions, SceneOptions, FunctionOptions):
     """Evaluate what masks, further views, depth, gravity and lengths add to keypoints.
 
     Each view shows a model with a mesh as it is; methods get its visible keypoints with noise, the
@@ -74,8 +73,6 @@ class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     _: KW_ONLY
     split: str | None = None
     """The dataset's split to take, such as test; all models by default."""
-    min_visible: int = 6
-    """Least number of keypoints that the first view must show."""
     views_per_model: int = 1
     """Number of instances of each model."""
     methods: tuple[str, ...] = _DEFAULT
@@ -84,22 +81,10 @@ class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     camera motion, views-2-free, views-5-free with unknown motion; mask-dilated, mask-eroded (by 2
     px), mask-smoothed (at random, 2 px), mask-hidden (a quarter), mask-hole, mask-blob: damaged
     masks; gravity+length, mask+gravity, mask+depth, mask+views-2, all."""
-    depth_sigma: float = 0.005
-    """Relative noise of the depths."""
-    up_sigma_deg: float = 1.0
-    """Noise of the upward direction about each axis across it, in degrees."""
-    length_sigma: float = 0.01
-    """Relative noise of the height."""
-    turn_deg: float = 25.0
-    """Angle about the object between neighbouring cameras, in degrees."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(min_visible=4, views_per_model=1)
-        for name in ("depth_sigma", "up_sigma_deg", "length_sigma", "turn_deg"):
-            value = getattr(self, name)
-            if not 0 < value < 90:
-                raise InputError(f"{value} is not between 0 and 90", where=name)
+        self.check_least(views_per_model=1)
         self.check_methods(METHODS)
 
 

@@ -20,9 +20,10 @@ import numpy as np
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
+from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE, Metric
-from cadalign.evaluation.options import LIMIT, FunctionOptions, ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
 from cadalign.evaluation.spec import Reference, Spec

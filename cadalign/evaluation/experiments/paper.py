@@ -18,8 +18,9 @@ from cadalign.evaluation.experiments.keypointnet import (
 from cadalign.evaluation.experiments.keypointnet import SPEC as KEYPOINTNET
 from cadalign.evaluation.experiments.simulation import SPEC as SIMULATION
 from cadalign.evaluation.experiments.simulation import SWEEPS, SweepOptions
+from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.options import LIMIT, ExperimentOptions, RunOptions
+from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress

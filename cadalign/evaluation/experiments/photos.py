@@ -36,13 +36,15 @@ from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import medians_of, score_columns, shares_of
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
 from cadalign.evaluation.options import FunctionOptions
-from cadalign.evaluation.outcome import FAILED, LEFT_OUT, OK
+from cadalign.evaluation.outcome import FAILED, LEFT_OUT, OK, UNREADABLE
 from cadalign.evaluation.photos.protocols import (
     DEPTH,
     GRAVITY,
     MASK,
     RIGID,
     SETS,
+    SIMULATED,
+    KeypointOptions,
     check_method,
     default_methods,
     is_own,
@@ -70,10 +72,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Columns
     from cadalign.evaluation.runs.work import Plan
 
-SIMULATED = "simulated"
-"""Source of keypoints that are projected with the true pose."""
-UNREADABLE = "unreadable"
-"""The category of records that cannot be read."""
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
     *(("rms_px", float), *score_columns(SETS)),
@@ -82,7 +80,7 @@ COLUMNS: Columns = (
 
 
 @dataclass(frozen=True)
-class PhotosOptions(FunctionOptions):
+class PhotosOptions(FunctionOptions, KeypointOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
     The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
@@ -109,35 +107,17 @@ class PhotosOptions(FunctionOptions):
     one, and the evidence that the data have."""
     shape: tuple[Path, ...] = ()
     """Files of `cadalign shape learn`, each for its category."""
-    simulated_noise_px: float = 1.0
-    """Standard deviation of simulated keypoints, in pixels."""
-    simulated_points: int = 24
-    """Number of points on a model of which the visible ones are simulated keypoints."""
-    sigma: float | None = None
-    """Standard deviation of annotated or detected keypoints that methods are given, in pixels; by
-    default that of the data set."""
     similar_sigma: float = 0.04
     """Standard deviation of the object's keypoints from the model's, for the method similar, in
     diagonals of the model."""
-    min_keypoints: int = 6
-    """Objects with fewer keypoints are left out."""
-    min_score: float = 0.4
-    """Detected keypoints with lower scores are not used."""
     pictures: int = 100
     """Number of photos whose pictures the report shows, the first ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(max_photos=1, simulated_points=4, min_keypoints=1, pictures=0)
-        for name in ("sigma", "similar_sigma"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{value} is not positive", where=name)
-        if not 0 <= self.simulated_noise_px < math.inf:
-            what = f"{self.simulated_noise_px} is not a noise level"
-            raise InputError(what, where="simulated_noise_px")
-        if not math.isfinite(self.min_score):
-            raise InputError(f"{self.min_score} is not a score", where="min_score")
+        self.check_least(max_photos=1, pictures=0)
+        if not 0 < self.similar_sigma < math.inf:
+            raise InputError(f"{self.similar_sigma} is not positive", where="similar_sigma")
         self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
         for name in self.methods:
             if is_own(name) or not is_registered(name):

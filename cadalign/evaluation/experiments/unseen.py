@@ -19,8 +19,9 @@ import numpy as np
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
+from cadalign.evaluation.methods.method import LIMIT, SHAPE
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.options import LIMIT, SHAPE, FunctionOptions, ModelOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 from cadalign.evaluation.plots import Plot, Trace, cumulative
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
@@ -41,13 +42,9 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Columns
     from cadalign.evaluation.runs.work import Plan
 
-RANDOM_RIGID, RANDOM_STRETCHED = "random-rigid", "random-stretched"
-NEAREST = "nearest"
-MEAN_RIGID, MEAN_STRETCHED = "mean-rigid", "mean-stretched"
-EXACT = "exact"
 METHODS = (
-    *(RANDOM_RIGID, RANDOM_STRETCHED, NEAREST, MEAN_RIGID, MEAN_STRETCHED),
-    *(SHAPE, EXACT, LIMIT),
+    *("random-rigid", "random-stretched", "nearest", "mean-rigid", "mean-stretched"),
+    *(SHAPE, "exact", LIMIT),
 )
 
 

@@ -13,8 +13,8 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets import AnnotatedModel
 from cadalign.errors import InputError, quote
 from cadalign.estimation.model import Model
-from cadalign.evaluation.experiments.evidence import EvidenceRunOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, load_scene, make_instance
+from cadalign.evaluation.options import SceneOptions
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import rotation_from_vector
@@ -70,7 +70,7 @@ class ObjectScene:
         Its pose in the first camera.
     names : tuple of str
         Names of the instance, for its randomness.
-    options : EvidenceRunOptions
+    options : SceneOptions
         The seed, and the accuracy of the evidence.
     """
 
@@ -82,7 +82,7 @@ class ObjectScene:
     shown: Scene
     cam_from_shown: Alignment
     names: tuple[str, ...]
-    options: EvidenceRunOptions
+    options: SceneOptions
 
     def mask(self, damage: str = "exact") -> BoolArray:
         """The object's mask in the first camera; see `damaged_mask`."""
@@ -93,7 +93,7 @@ class ObjectScene:
 _scene_of = lru_cache(maxsize=1)(load_scene)  # views of one model come one after another
 
 
-def make_scene(model: AnnotatedModel, view: int, options: EvidenceRunOptions) -> ObjectScene:
+def make_scene(model: AnnotatedModel, view: int, options: SceneOptions) -> ObjectScene:
     """Draw a view of a model, its stretch, the other cameras, and the noise of everything.
 
     Everything random follows from (seed, category, model id, view). The cameras turn about the
@@ -152,7 +152,7 @@ def _shoot(
     pose: Alignment,
     motion: FloatArray,
     rng: np.random.Generator,
-    options: EvidenceRunOptions,
+    options: SceneOptions,
 ) -> Shot:
     noise, of_depths = rng.standard_normal((len(xyz), 2)), rng.standard_normal(len(xyz))
     about = rng.standard_normal(2)

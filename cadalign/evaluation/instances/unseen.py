@@ -225,7 +225,9 @@ class UnseenObjects(Setting):
     def case(self, task: KeypointTask) -> Case:
         seen = observe_object(task, self.options)
         facts = {"keypoints": len(seen.points_2d)}
-        return Case(task.names, facts, UnseenInstance(seen, self.learned, self.options))
+        o = self.options
+        own = UnseenInstance(seen, self.learned, o.seed, o.noise_px, o.sigma, o.outliers)
+        return Case(task.names, facts, own)
 
     def given(self, instance: UnseenInstance) -> MethodInput:
         shape, seen = instance.shape, instance.seen
@@ -235,7 +237,7 @@ class UnseenObjects(Setting):
             shape.mean[rows],
             seen.points_2d[known],
             KEYPOINT_CAMERA,
-            instance.options.sigma,
+            instance.sigma,
             bounds=shape.mean[-2:],
             gt=seen.gt,
             make_views=lambda: (shape, [instance.view_of(shape)]),
@@ -363,7 +365,7 @@ def _record(
     estimates: Sequence[ShapeEstimate | CadalignError],
 ) -> Row:
     """The record of a view of an object, whose box is that of its keypoints."""
-    seen, sigma = instance.seen, instance.options.sigma
+    seen, sigma = instance.seen, instance.sigma
     return record_of(
         camera=KEYPOINT_CAMERA,
         gt=seen.gt,

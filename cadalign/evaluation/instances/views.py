@@ -75,10 +75,9 @@ from cadalign.evaluation.instances.record import (
     pose_of,
     record_row,
 )
-from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods.method import SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.errors import estimate_errors, overlap_up_to_scale
 from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
-from cadalign.evaluation.options import SHAPE
 from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row

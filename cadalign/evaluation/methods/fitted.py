@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import METHODS, RansacOptions
-from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.options import LIMIT
+from cadalign.evaluation.methods.method import LIMIT, Method, MethodInput
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:

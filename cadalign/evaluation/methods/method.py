@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from cadalign.estimation.view import View
     from cadalign.shapes.model import ShapeModel
 
+LIMIT = "limit"
+"""The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.cramer_rao`."""
+SHAPE = "shape"
+"""The alignment of a category's learned shape, in runs that have one."""
 POINTS, VIEWS = "points", "views"
 """Arguments of a registered function: arrays and a camera, or a model and its views."""
 

@@ -15,19 +15,9 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.experiments.unseen import (
-    EXACT,
-    MEAN_RIGID,
-    MEAN_STRETCHED,
-    NEAREST,
-    RANDOM_RIGID,
-    RANDOM_STRETCHED,
-    UnseenOptions,
-)
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
-from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.methods.method import LIMIT, SHAPE, Method
 from cadalign.evaluation.metrics.cramer_rao import limit_estimate
-from cadalign.evaluation.options import LIMIT, SHAPE
 from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.retrieval.models import LibraryModel
@@ -106,11 +96,18 @@ class UnseenObject:
 
 @dataclass(frozen=True, eq=False)
 class UnseenInstance:
-    """A view of an object, and what was learned of its category from others."""
+    """A view of an object, what was learned of its category from others, and the run's options.
+
+    ``sigma`` is the standard deviation of the keypoints that methods are given, ``noise_px`` that
+    of their noise [px], ``outliers`` the share of wrong ones.
+    """
 
     seen: UnseenObject
     learned: LearnedFiles
-    options: UnseenOptions
+    seed: int
+    noise_px: float
+    sigma: float
+    outliers: float
 
     @property
     def shape(self) -> ShapeModel:
@@ -122,7 +119,7 @@ class UnseenInstance:
         seen = self.seen
         shared = np.isin(seen.semantic_ids, np.array(model.ids, dtype=np.int64))
         ids = seen.semantic_ids[shared].tolist()
-        return View(KEYPOINT_CAMERA, seen.points_2d[shared], ids=ids, sigma=self.options.sigma)
+        return View(KEYPOINT_CAMERA, seen.points_2d[shared], ids=ids, sigma=self.sigma)
 
 
 def _of_shape(instance: UnseenInstance) -> ShapeEstimate:
@@ -152,8 +149,8 @@ def _aligned(
     model: Model | ShapeModel, instance: UnseenInstance, *, misfit_px: float = 0.0
 ) -> ShapeEstimate:
     """Align a model with those given keypoints that it has."""
-    bound = max(_INLIER_BOUND * instance.options.sigma, misfit_px)
-    ransac = RansacOptions(max_reproj_error=bound) if instance.options.outliers else None
+    bound = max(_INLIER_BOUND * instance.sigma, misfit_px)
+    ransac = RansacOptions(max_reproj_error=bound) if instance.outliers else None
     result = align(model, instance.view_of(model), ransac=ransac)
     ids = np.array(model.ids, dtype=np.int64)
     return ShapeEstimate(result.alignment, result.bounds, ids, result.points_3d, result)
@@ -161,16 +158,16 @@ def _aligned(
 
 def _nearest(instance: UnseenInstance) -> ShapeEstimate:
     """The best match of the library."""
-    library, options = instance.learned.opened_library(), instance.options
+    library = instance.learned.opened_library()
     first = library.retrieve(
         instance.seen.points_2d,
         instance.seen.semantic_ids,
         KEYPOINT_CAMERA,
         top=1,
         category=instance.seen.task.category,
-        sigma=max(options.noise_px, _LEAST_SIGMA),
+        sigma=max(instance.noise_px, _LEAST_SIGMA),
         shape_sigma=_SIMILAR,
-        loss="cauchy" if options.outliers else "linear",
+        loss="cauchy" if instance.outliers else "linear",
         workers=1,
     )[0]
     model = library[first.category, first.model_id]
@@ -183,7 +180,7 @@ def _random_model(instance: UnseenInstance) -> LibraryModel:
     given = instance.seen.semantic_ids
     keys = [key for key in library.keys if key[0] == task.category]
     names = (task.category, task.model_id, str(task.view))
-    rng = instance_rng(instance.options.seed, *names, "another model")
+    rng = instance_rng(instance.seed, *names, "another model")
     least = min(_LEAST_SHARED, len(given))
     for place in rng.permutation(len(keys)).tolist():
         model = library[keys[place]]
@@ -203,13 +200,13 @@ def _bound(instance: UnseenInstance) -> ShapeEstimate:
 
 
 _SOLVERS: dict[str, Callable[[UnseenInstance], ShapeEstimate]] = {
-    RANDOM_RIGID: partial(_of_random_model, stretch="none"),
-    RANDOM_STRETCHED: partial(_of_random_model, stretch=None),
-    NEAREST: _nearest,
-    MEAN_RIGID: partial(_of_mean, stretch="none"),
-    MEAN_STRETCHED: partial(_of_mean, stretch=None),
+    "random-rigid": partial(_of_random_model, stretch="none"),
+    "random-stretched": partial(_of_random_model, stretch=None),
+    "nearest": _nearest,
+    "mean-rigid": partial(_of_mean, stretch="none"),
+    "mean-stretched": partial(_of_mean, stretch=None),
     SHAPE: _of_shape,
-    EXACT: _of_own_model,
+    "exact": _of_own_model,
     LIMIT: _bound,
 }
 OWN_METHODS = {name: Method(name, solve) for name, solve in _SOLVERS.items()}

@@ -17,8 +17,7 @@ from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import box_alignment
-from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.options import SHAPE
+from cadalign.evaluation.methods.method import SHAPE, Method, MethodInput
 from cadalign.evaluation.outcome import LeftOutError
 from cadalign.evaluation.photos.protocols import (
     DEPTH,

@@ -5,6 +5,7 @@ A method's name is a base, and the evidence beside the keypoints, as in ``rigid+
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -16,12 +17,15 @@ from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.posed_photos import PosedPhotos
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
+from cadalign.evaluation.methods.method import SHAPE
 from cadalign.evaluation.metrics.bop import BOP
 from cadalign.evaluation.metrics.photos import KITTI, NINE_DOF, VIEWPOINT
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import MetricSet
-from cadalign.evaluation.options import SHAPE
+from cadalign.evaluation.options import ExperimentOptions
 
+SIMULATED = "simulated"
+"""Source of keypoints that are projected with the true pose."""
 EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
 TRUTH = "truth"
 BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
@@ -89,6 +93,34 @@ def default_methods(
         sets = [[kind] for kind in kinds] + ([kinds] if len(kinds) > 1 else [])
         more += ["+".join((base, *each)) for each in sets]
     return (*bases, *more)
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeypointOptions(ExperimentOptions):
+    """Keypoints of objects in photos: which are given, and those that are simulated."""
+
+    simulated_noise_px: float = 1.0
+    """Standard deviation of simulated keypoints, in pixels."""
+    simulated_points: int = 24
+    """Number of points on a model of which the visible ones are simulated keypoints."""
+    sigma: float | None = None
+    """Standard deviation of annotated or detected keypoints that methods are given, in pixels; by
+    default that of the data set."""
+    min_keypoints: int = 6
+    """Objects with fewer keypoints are left out."""
+    min_score: float = 0.4
+    """Detected keypoints with lower scores are not used."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(simulated_points=4, min_keypoints=1)
+        if self.sigma is not None and not 0 < self.sigma < math.inf:
+            raise InputError(f"{self.sigma} is not positive", where="sigma")
+        if not 0 <= self.simulated_noise_px < math.inf:
+            what = f"{self.simulated_noise_px} is not a noise level"
+            raise InputError(what, where="simulated_noise_px")
+        if not math.isfinite(self.min_score):
+            raise InputError(f"{self.min_score} is not a score", where="min_score")
 
 
 SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI, BOP)

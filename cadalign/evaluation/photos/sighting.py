@@ -10,9 +10,8 @@ from scipy import ndimage
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.photos.photo import NamedPoints, PhotoObject
 from cadalign.estimation.fit import fit
-from cadalign.evaluation.experiments.photos import SIMULATED, PhotosOptions
 from cadalign.evaluation.outcome import LeftOutError
-from cadalign.evaluation.photos.protocols import Protocol
+from cadalign.evaluation.photos.protocols import SIMULATED, KeypointOptions, Protocol
 from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
 from cadalign.geometry.camera import Camera
 from cadalign.render.views.visibility import visible_keypoints
@@ -69,7 +68,7 @@ class Sighting:
         return self.model.xyz[[row_of[name] for name in self.names]]
 
 
-def sight(target: PhotoTarget, protocol: Protocol, options: PhotosOptions) -> Sighting:
+def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> Sighting:
     """Collect what methods are given of an object.
 
     Raises
@@ -125,7 +124,11 @@ def _marked(
 
 
 def _simulated(
-    target: PhotoTarget, camera: Camera, cad: Cad, model: NamedPoints | None, options: PhotosOptions
+    target: PhotoTarget,
+    camera: Camera,
+    cad: Cad,
+    model: NamedPoints | None,
+    options: KeypointOptions,
 ) -> tuple[NamedPoints, tuple[str, ...], FloatArray]:
     """Points of the model, those that the photo shows, and their pixels with noise.
 
@@ -162,7 +165,7 @@ def _in_mask(mask: BoolArray, pixels: FloatArray) -> BoolArray:
     return np.asarray(near[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)])
 
 
-def _sigma(target: PhotoTarget, protocol: Protocol, options: PhotosOptions, source: str) -> float:
+def _sigma(target: PhotoTarget, protocol: Protocol, options: KeypointOptions, source: str) -> float:
     """The standard deviation of keypoints [px] that methods are given."""
     if source == SIMULATED:
         return max(options.simulated_noise_px, _LEAST_PX)

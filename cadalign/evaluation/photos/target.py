@@ -16,9 +16,8 @@ from cadalign.datasets.photos.formats import open_photos
 from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import Tasks
-from cadalign.evaluation.experiments.photos import UNREADABLE
 from cadalign.evaluation.instances.record import box_alignment
-from cadalign.evaluation.outcome import LeftOutError
+from cadalign.evaluation.outcome import UNREADABLE, LeftOutError
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

@@ -382,3 +382,14 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
         note="over all categories; failures count",
         title=title,
     )
+
+
+def cumulative_curves(
+    runs: Sequence[Run], curves: Sequence[tuple[Metric, FloatArray]], *, of: str
+) -> list[Plot]:
+    """Curves of the metrics that some run has, each at its places; see `cumulative`."""
+    return [
+        cumulative(runs, metric, places, title=f"{metric.label} {of}")
+        for metric, places in curves
+        if any(len(known(run.cells[metric.key])) for run in runs)
+    ]

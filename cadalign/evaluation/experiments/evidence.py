@@ -18,7 +18,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, SceneOptions
-from cadalign.evaluation.plots import Plot, cumulative
+from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ConsoleTable,
@@ -151,10 +151,7 @@ _CURVES = (
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Shares of objects within an error, by evidence."""
-    return [
-        cumulative(runs, metric, places, title=f"{metric.label} by evidence")
-        for metric, places in _CURVES
-    ]
+    return cumulative_curves(runs, _CURVES, of="by evidence")
 
 
 _CHUNK = 2

@@ -50,14 +50,13 @@ from cadalign.evaluation.photos.protocols import (
     is_own,
     protocol_of,
 )
-from cadalign.evaluation.plots import Plot, cumulative
+from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ALL,
     Conclusion,
     ConsoleTable,
     Summary,
-    known,
     mean_of,
     milliseconds,
     summaries_of,
@@ -232,11 +231,7 @@ _CURVES = (
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Shares of objects within an error, for the errors that the data sets have."""
-    return [
-        cumulative(runs, metric, places, title=f"{metric.label} on photos")
-        for metric, places in _CURVES
-        if any(len(known(run.cells[metric.key])) for run in runs)
-    ]
+    return cumulative_curves(runs, _CURVES, of="on photos")
 
 
 _CHUNK, _LARGE_CHUNK = 4, 32

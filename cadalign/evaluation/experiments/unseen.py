@@ -22,7 +22,7 @@ from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods.method import LIMIT, SHAPE
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
-from cadalign.evaluation.plots import Plot, Trace, cumulative
+from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ConsoleTable,
@@ -175,10 +175,7 @@ _CALIBRATED = (("rotation_level", "rotation"), ("stretch_level", "stretch"))
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Shares of objects within an error, and of truths within stated regions, by method."""
-    curves = [
-        cumulative(runs, metric, places, title=f"{metric.label} of unseen objects")
-        for metric, places in _CURVES
-    ]
+    curves = cumulative_curves(runs, _CURVES, of="of unseen objects")
     return [*curves, *(_calibration(runs, column, name) for column, name in _CALIBRATED)]
 
 

@@ -33,7 +33,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
-from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views
+from cadalign.solvers.evidence import Keypoints, LogFocalPrior, Views
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
@@ -183,7 +183,7 @@ def find_consensus(search: RobustSearch) -> Consensus:
             Keypoints(
                 np.ascontiguousarray(points[order]), views.rays[0], views.whitening[0], LINEAR, 1.0
             ),
-            ScalePrior(options.prior_weight),
+            options.scale_prior,
         ),
         views,
         np.log(views.focals),

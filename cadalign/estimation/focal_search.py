@@ -27,8 +27,9 @@ from cadalign.solvers.constants import (
     POSE_SIZE,
     TOO_FEW,
     UNKNOWNS,
+    ScalePrior,
 )
-from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior, Views
+from cadalign.solvers.evidence import Keypoints, LogFocalPrior, Views
 from cadalign.solvers.focal import FocalObjective, focal_covariance, linear_focal, refine_focal
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
 from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
@@ -65,11 +66,17 @@ class _Task:
             Objective(
                 self.options.free,
                 Keypoints(self.points, rays, whitening, loss, bend),
-                ScalePrior(self.options.prior_weight * self.noise**2),
+                self.scale_prior,
             ),
             focal_slopes(self.points_2d, self.camera.with_focal(focal), rays),
             prior._replace(weight=prior.weight * self.noise**2),
         )
+
+    @property
+    def scale_prior(self) -> ScalePrior:
+        """The prior on the log scales, in units of the whitening's sigma."""
+        weight, width = self.options.scale_prior
+        return ScalePrior(weight * self.noise**2, width)
 
     def thinned(self, most: int) -> _Task:
         """The task of at most ``most`` of its points, evenly spread over their order."""
@@ -216,7 +223,8 @@ def _starts(task: _Task) -> tuple[float, FloatArray, int, int]:
         np.arange(count + 1) * n,
         LOSSES[task.options.loss],
         np.full(count, task.options.loss_scale * task.noise),
-        np.full(count, task.options.prior_weight * task.noise**2),
+        np.full(count, task.scale_prior.weight),
+        task.scale_prior.width,
         task.options.free,
         0,
     )

@@ -64,6 +64,7 @@ class Estimate(NamedTuple):
     """An estimate: points, the box's corners last, ``lengths`` of the box, covariances.
 
     Poses and covariances (9, 9) are those in every view; ``likelihood`` is relative to the best.
+    The optimum is the one of the least cost, which a shape without latent unknowns has.
     """
 
     points: FloatArray
@@ -75,6 +76,7 @@ class Estimate(NamedTuple):
     of_seen: FloatArray
     likelihood: float
     cameras: tuple[Camera, ...]
+    is_optimum: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +132,14 @@ def result_of(found: Found) -> Result:
     if found.is_curved:
         for covariance in covariances:
             covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
-    others = tuple(
+    is_far = moments[0].distances > SAME_SQUARES
+    others = [each for each, far in zip(found.estimates, is_far, strict=True) if far]
+    alternatives = tuple(
         Alternative(
             each.poses[0], each.likelihood, each.cameras[0], each.points[:-2], each.points[-2:]
         )
-        for each, far in zip(found.estimates, moments[0].distances, strict=True)
-        if far > SAME_SQUARES
+        for each, far in zip(found.estimates, is_far, strict=True)
+        if far or (each.is_optimum and each is not best)
     )
     pose, points = best.poses[0], best.points[:-2]
     statistics = Stated(
@@ -148,8 +152,8 @@ def result_of(found: Found) -> Result:
             *found.warnings,
             *another_pose(
                 pose,
-                [each.alignment for each in others],
-                [each.relative_likelihood for each in others],
+                [each.poses[0] for each in others],
+                [each.likelihood for each in others],
             ),
         ),
         evidence=found.evidence,
@@ -184,7 +188,7 @@ def result_of(found: Found) -> Result:
         focal_prior=found.focal_prior,
         sigma=found.sigma,
         cost=found.cost,
-        alternatives=others,
+        alternatives=alternatives,
         stats=found.stats,
         symmetry=found.symmetry,
         model=found.model,
@@ -225,12 +229,14 @@ def found_in_minima(
         given = len(minimum.evidence.sightings.point)
         inflation = inflation_with(given, inflation, prior.few_keypoints)
     likely: Sequence[Estimate] = ()
+    optimum = min(minima, key=lambda each: each.cost) if is_exact(minimum.evidence) else minimum
     for each in minima:
         likelihood = float(np.exp((minimum.score - each.score) / 2))
-        if likelihood >= LEAST_LIKELIHOOD:
+        if likelihood >= LEAST_LIKELIHOOD or each is optimum:
             evidence, state = widened(each.evidence, each.state, inflation)
             wide = each._replace(evidence=evidence, state=state)
-            likely = [*likely, _estimate(wide, likelihood, prior)]
+            estimate = _estimate(wide, likelihood, prior)._replace(is_optimum=each is optimum)
+            likely = [*likely, estimate]
     symmetry, known_axis = getattr(model, "symmetry", None), getattr(model, "known_axis", None)
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z

@@ -164,6 +164,7 @@ def _hypotheses(
         LINEAR,
         np.ones(len(draws)),
         np.zeros(len(draws)),
+        0.0,
         free,
         size,
     )

@@ -5,6 +5,7 @@ The command line nests these dataclasses, and shows the text below each field as
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -15,13 +16,19 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_positive, is_number, is_whole
 from cadalign.errors import InputError, quote
 from cadalign.estimation.focal import FocalPrior
-from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS
+from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS, ScalePrior
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
 FOCALS = ("known", "estimate")
 AXES = ("x", "y", "z")
 SIMILAR_SCALE_SIGMA = 0.2
 """Default standard deviation of the log scales of an object that is only similar to its model."""
+USUAL_STRETCH = 5.0
+"""Factor up to which no stretch is less likely than another, where no prior is given."""
+BOUNDING_PRIOR = ScalePrior(0.5**-2, math.log(USUAL_STRETCH))
+"""Prior on the log scales where none is given: flat over usual stretches, so that it leaves what
+keypoints determine as it is, and proper, so that what they leave open has an optimum and a
+volume."""
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
 
@@ -60,7 +67,8 @@ class FitOptions(AlignmentOptions):
     """
 
     scale_prior_sigma: float | None = None
-    """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1."""
+    """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1; by
+    default one that is flat from 1/5 to 5, and falls off beyond."""
     known_axis: str = "x"
     """Axis of the model whose length is right: x, y or z."""
     focal: str = "known"
@@ -156,8 +164,15 @@ class FitOptions(AlignmentOptions):
 
     @property
     def prior_weight(self) -> float:
-        """Inverse variance of the prior on the log scales; 0 for none."""
+        """Inverse variance of the prior on the log scales that is given; 0 for none."""
         return 0.0 if self.scale_prior_sigma is None else float(self.scale_prior_sigma) ** -2
+
+    @property
+    def scale_prior(self) -> ScalePrior:
+        """The prior on the log scales; without one that is given it only bounds them."""
+        if self.scale_prior_sigma is None:
+            return BOUNDING_PRIOR
+        return ScalePrior(self.prior_weight, 0.0)
 
     @property
     def estimates_in_rounds(self) -> bool:

@@ -18,11 +18,13 @@ from cadalign.geometry.camera import Camera
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.joint.evidence import Evidence, Focals, ScalePriors, Shape, State
 
 _COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
 _SAME_SCALE_SIGMA = 1e-4
 _PROPORTION_SIGMA = 3.0  # of free log scales about their mean, lest an unseen axis collapses
+_NO_BOUND = ScalePrior(0.0, 0.0)
 _Y = np.array([0.0, 1.0, 0.0])
 _SETTLED = 1e-8  # change of a log focal length
 LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
@@ -99,7 +101,8 @@ def _of_model(model: Model) -> ShapePrior:
     spread = np.full(len(mean), model.shape_sigma or 0.0)
     options = model.fit_options(1.0)
     free = np.array([float(axis in options.stretched_axes) for axis in "xyz"])
-    scales = ScalePriors(free, np.diag(free * options.prior_weight))
+    bound = _NO_BOUND if options.prior_weight else options.scale_prior
+    scales = ScalePriors(free, np.diag(free * options.prior_weight), bound)
     shape = Shape(mean, np.empty((0, len(mean), 3)), spread)
     return ShapePrior(cast("tuple[Hashable, ...]", model.ids), (shape,), (1.0,), scales, _Y)
 
@@ -115,7 +118,7 @@ def _of_category(model: ShapeModel) -> ShapePrior:
     )
     weights = tuple(component.weight for component in model.components)
     up = None if model.up_axis is None else np.eye(3)["xyz".index(model.up_axis)]
-    held = ScalePriors(np.zeros(3), np.zeros((3, 3)))
+    held = ScalePriors(np.zeros(3), np.zeros((3, 3)), _NO_BOUND)
     return ShapePrior(
         model.ids,
         shapes,
@@ -134,13 +137,15 @@ def scale_priors(prior: ShapePrior, metric: bool) -> ScalePriors:
     if not metric:
         return prior.scales
     if prior.scales.free.sum() == 2 and not prior.scales.precision.any():
-        return ScalePriors(np.ones(3), (np.eye(3) - 1 / 3) / _PROPORTION_SIGMA**2)
+        proportions = (np.eye(3) - 1 / 3) / _PROPORTION_SIGMA**2
+        return ScalePriors(np.ones(3), proportions, prior.scales.bound)
     held = prior.scales.free == 0
     weights = np.where(held, 1 / _SAME_SCALE_SIGMA**2, prior.scales.precision.diagonal())
     common = np.tile(held / held.sum(), (3, 1))
     from_common = np.eye(3) - common
     tied = from_common.T @ (weights[:, None] * from_common)
-    return ScalePriors(np.ones(3), tied + common.T @ common / (3 * _COMMON_SCALE_SIGMA**2))
+    precision = tied + common.T @ common / (3 * _COMMON_SCALE_SIGMA**2)
+    return ScalePriors(np.ones(3), precision, prior.scales.bound)
 
 
 def has_scale_prior(scales: ScalePriors) -> bool:

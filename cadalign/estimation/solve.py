@@ -30,6 +30,7 @@ from cadalign.solvers.optimal import optimal_batch
 from cadalign.solvers.projection import pinhole_rays, reproject_batch
 
 _SIGMA_ROUNDS = 20
+_BOUNDED_ROUNDS = 4  # where only the bound of the scales depends on sigma
 _SIGMA_TOLERANCE = 1e-3
 # No keypoint is known better, over the keypoints' spread in the image: keeps a perfect fit from
 # claiming to be certain of everything.
@@ -148,9 +149,14 @@ def _whitening(
 
 
 def _solve_optimal(
-    problems: Problems, options: FitOptions, points: FloatArray, sigmas: Sequence[Sigma] | None
+    problems: Problems,
+    options: FitOptions,
+    points: FloatArray,
+    sigmas: Sequence[Sigma] | None,
+    rounds: int | None = None,
 ) -> Solutions:
-    """The maximum-likelihood solutions, with sigma estimated in rounds where it is unknown."""
+    """The likeliest solutions, with sigma estimated in so many rounds where it is unknown."""
+    search: Callable[..., Solutions]
     if options.focal == "estimate":
         # Only here: its kernels take time to import, and most cameras are calibrated.
         from cadalign.estimation.focal_search import search_focal
@@ -161,11 +167,18 @@ def _solve_optimal(
         whitening = _whitening(problems, options, rays, sigmas)
         search = partial(_search, problems, options, points, rays, whitening, errors)
     if options.sigma is None and sigmas is None:
-        found = _with_estimated_sigmas(problems, options, points, search)
+        most = rounds or (_SIGMA_ROUNDS if options.estimates_in_rounds else 1)
+        found = _with_estimated_sigmas(problems, options, points, search, most)
+        if most == 1:
+            found = _with_bounded_repeated(problems, options, points, found)
     else:
         found = search(np.ones(len(problems)))
-    exact = (2 * problems.counts == options.unknowns) & (found.info[:, 0] > 1)
-    return _with_exact_sorted(found, exact) if exact.any() else found
+    exact = 2 * problems.counts == options.unknowns
+    if not exact.any():
+        return found
+    if options.focal == "known" and options.sigma is not None:
+        found = _with_exact(found, search(np.ones(len(problems)), is_bounded=False), exact)
+    return _with_exact_sorted(found, exact & (found.info[:, 0] > 1))
 
 
 def _search(
@@ -176,10 +189,12 @@ def _search(
     whitening: FloatArray,
     errors: Errors,
     noises: FloatArray,
+    is_bounded: bool = True,
 ) -> Solutions:
     """Search at known focal lengths; ``noises`` (B,) multiply prior deviations and loss scales."""
     given = points, rays, whitening, problems.offsets
-    scales = options.loss_scale * noises, options.prior_weight * noises**2
+    weight, width = options.scale_prior if is_bounded else (options.prior_weight, 0.0)
+    scales = options.loss_scale * noises, weight * noises**2, width
     loss = LOSSES[options.loss]
     minima = optimal_batch(*given, loss, *scales, options.free, options.min_points)
     return Solutions(*minima, errors=errors)
@@ -190,15 +205,17 @@ def _with_estimated_sigmas(
     options: FitOptions,
     points: FloatArray,
     search: Callable[[FloatArray], Solutions],
+    rounds: int,
 ) -> Solutions:
-    """Search with the standard deviations that the residuals have."""
+    """Search with the standard deviations that the residuals have.
+
+    They matter to the optimum where there is something beside the keypoints.
+    """
     sigmas = np.ones(len(problems))
-    for _ in range(_SIGMA_ROUNDS):
+    for _ in range(rounds):
         found = search(sigmas)
         previous, sigmas = sigmas, _estimate_sigmas(problems, options, points, found)
-        if not options.estimates_in_rounds or np.allclose(
-            sigmas, previous, rtol=_SIGMA_TOLERANCE, atol=0
-        ):
+        if rounds == 1 or np.allclose(sigmas, previous, rtol=_SIGMA_TOLERANCE, atol=0):
             break
     assert found.covariances is not None
     covariances = found.covariances * (sigmas**2)[:, None, None]
@@ -212,6 +229,26 @@ def _with_estimated_sigmas(
         sigmas=sigmas,
         errors={**found.errors, **too_few},
     )
+
+
+def _with_bounded_repeated(
+    problems: Problems, options: FitOptions, points: FloatArray, found: Solutions
+) -> Solutions:
+    """The solutions, those of which the bounding prior holds a scale solved anew in rounds."""
+    usual, scales = math.exp(options.scale_prior.width), found.poses[:, 0, 13:]
+    if scales.max() <= usual and scales.min() >= 1 / usual:
+        return found
+    outside = ((scales > usual) | (scales < 1 / usual)).any(axis=1) & (found.statuses == OK)
+    errors = dict(found.errors)
+    for b in np.flatnonzero(outside).tolist():
+        own = points[problems.rows(b)]
+        one = _solve_optimal(problems.part(b, b + 1), options, own, None, _BOUNDED_ROUNDS)
+        for name in ("poses", "costs", "covariances", "statuses", "info", "focals", "sigmas"):
+            if (values := getattr(found, name)) is not None:
+                values[b] = getattr(one, name)[0]
+        if one.errors:
+            errors[b] = one.errors[0]
+    return found._replace(errors=errors)
 
 
 def _estimate_sigmas(
@@ -269,11 +306,23 @@ def _residuals(
     return residuals, statuses
 
 
+def _with_exact(found: Solutions, unbounded: Solutions, exact: BoolArray) -> Solutions:
+    """Solutions that fit exactly without a bound, where ``exact`` (B,) marks such problems.
+
+    Where none does, the bound keeps the optimum from running off.
+    """
+    chosen = exact & (unbounded.costs[:, 0] < _EXACT_COST)
+    for name in ("poses", "costs", "covariances", "statuses", "info"):
+        getattr(found, name)[chosen] = getattr(unbounded, name)[chosen]
+    return found
+
+
 def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
-    """Order solutions that fit exactly by stretch, where ``exact`` (B,) marks such problems."""
+    """Keep solutions that fit exactly, by stretch, where ``exact`` (B,) marks such problems."""
     order = np.tile(np.arange(found.costs.shape[1]), (len(found.costs), 1))
     for b in np.flatnonzero(exact).tolist():
         count = int((found.costs[b, : found.info[b, 0]] < _EXACT_COST).sum())
+        found.info[b, 0] = count or found.info[b, 0]
         stretch = (np.log(found.poses[b, :count, 13:]) ** 2).sum(axis=1)
         order[b, :count] = np.argsort(stretch, kind="stable")
     return found._replace(

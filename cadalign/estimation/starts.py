@@ -21,6 +21,7 @@ from cadalign.solvers.marginal.search import after_motion, half_turns
 
 _MOST_STARTS = 24
 _MOST_CARRIED = 3  # stretches of the other view
+_MOST_SIZED = 3
 
 ViewStarts = list[tuple[FloatArray, FloatArray]]
 _LEAST_POINTS = 3
@@ -70,9 +71,9 @@ def _poses_and_scales(evidence: Evidence, init: Start | None) -> tuple[FloatArra
             found_of_pose.insert(0, (given, init.log_scales))
     elif is_metric and poses == 1:
         rotations = np.array([pose[:9] for pose, _ in per_pose[0]]).reshape(-1, 3, 3)
-        placed = metric_starts(evidence, rotations)
-        if len(placed[0]):
-            return placed
+        placed, logs = metric_starts(evidence, rotations)
+        if len(placed):
+            return _with_sized(evidence, per_pose[0], placed, logs)
     for view in weakly_determined(evidence):
         carried = carried_starts(evidence, view, per_pose)
         per_pose[rig.pose[view]][:0] = carried
@@ -124,6 +125,19 @@ def _with_rig(
     kept = starts[:_MOST_STARTS]
     poses = np.array([start for start, _ in kept]).reshape(-1, len(per_pose), 12)
     return poses, np.array([logs for _, logs in kept]).reshape(-1, 3)
+
+
+def _with_sized(
+    evidence: Evidence, own: ViewStarts, placed: FloatArray, log_scales: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Starts of one metric pose, and after them the likeliest that keypoints alone suggest.
+
+    Of points nearly in a plane, the scales that a rotation leaves to linear equations are noise.
+    """
+    first = own[:_MOST_SIZED]
+    poses = np.array([pose for pose, _ in first]).reshape(-1, 1, 12)
+    sized = _sized(evidence, poses, np.array([logs for _, logs in first]).reshape(-1, 3))
+    return np.concatenate([placed, sized[0]]), np.concatenate([log_scales, sized[1]])
 
 
 def _of_pose(evidence: Evidence, pose: int) -> Evidence:

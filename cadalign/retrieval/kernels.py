@@ -20,8 +20,8 @@ from cadalign.solvers.alignment import (
     room_for,
     solve_damped,
 )
-from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS
-from cadalign.solvers.evidence import Keypoints, ScalePrior
+from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, ScalePrior
+from cadalign.solvers.evidence import Keypoints
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.search import refine
@@ -147,7 +147,7 @@ def _centred_objective(
         if each:
             whitening[i] = query.whitening[seen[i]]
     keypoints = Keypoints(centred, rays, whitening, query.loss, query.loss_scale)
-    return Objective(query.free, keypoints, ScalePrior(query.prior_weight))
+    return Objective(query.free, keypoints, ScalePrior(query.prior_weight, 0.0))
 
 
 @kernel

@@ -12,11 +12,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import borrowing, inlined, kernel
-from cadalign.solvers.constants import LINEAR, UNKNOWNS
+from cadalign.solvers.constants import LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import (
     BLOCK,
     Keypoints,
-    ScalePrior,
     add_keypoints,
     add_scale_prior,
     keypoint_cost,
@@ -27,13 +26,12 @@ from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,
-    is_estimate,
     move,
     room_of,
     score_of,
     solve,
 )
-from cadalign.solvers.unknowns import has_collapsed, hold_fixed, move_pose
+from cadalign.solvers.unknowns import hold_fixed, move_pose
 
 _LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
 _SAME_CHORD = 1e-3
@@ -79,7 +77,7 @@ def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArr
     """The plain objective: keypoints with squared errors, all unknowns free, no prior."""
     points = np.require(points, np.float64, ["C", "W"])
     keypoints = Keypoints(points, rays, whitening, LINEAR, 1.0)
-    return Objective(np.ones(UNKNOWNS), keypoints, ScalePrior(0.0))
+    return Objective(np.ones(UNKNOWNS), keypoints, ScalePrior(0.0, 0.0))
 
 
 @room_of.of(Objective)
@@ -177,12 +175,6 @@ def are_same_poses(objective: Objective, first: FloatArray, second: FloatArray) 
     for i in range(13, 15):
         square += (np.log(first[i] / second[i])) ** 2
     return square < _SAME_CHORD * _SAME_CHORD
-
-
-@is_estimate.of(Objective)
-@inlined
-def _is_estimate(objective: Objective, pose: FloatArray) -> bool:
-    return not has_collapsed(pose)
 
 
 @kernel

@@ -1,6 +1,6 @@
 """Constants that compiled kernels share with their callers; importing them needs no compiler."""
 
-from typing import Final
+from typing import Final, NamedTuple
 
 UNKNOWNS: Final = 8
 """Unknowns of an alignment: rotation vector (3), translation (3), log s_y, log s_z."""
@@ -20,6 +20,18 @@ AEPNP: Final = 1
 """Minimal solvers of RANSAC."""
 SAMPLE_SIZES: Final = (4, 6)
 """Points per sample, by minimal solver."""
+
+
+class ScalePrior(NamedTuple):
+    """Prior on log s_y and log s_z: flat up to ``width`` about 0, the flank of a Gaussian beyond.
+
+    ``weight`` is the inverse variance of the flank, 0 for no prior; of a whole Gaussian, ``width``
+    is 0.
+    """
+
+    weight: float
+    width: float
+
 
 OK: Final = 0
 """Status of a solved problem; kernels return one in place of an exception."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, fast_sums, inlined, kernel
-from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS
+from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.linalg import Triple, copy_into
 from cadalign.solvers.projection import (
     Scalars,
@@ -38,12 +38,6 @@ class Keypoints(NamedTuple):
     whitening: FloatArray
     loss: int
     loss_scale: float
-
-
-class ScalePrior(NamedTuple):
-    """Gaussian prior on log s_y and log s_z about 0: its inverse variance, 0 for none."""
-
-    weight: float
 
 
 class LogFocalPrior(NamedTuple):
@@ -204,6 +198,12 @@ def take_keypoints(keypoints: Keypoints, chosen: IntArray) -> Keypoints:
 
 
 @inlined
+def beyond(value: float, width: float) -> float:
+    """The part of a value that lies beyond +-width."""
+    return value - min(max(value, -width), width)
+
+
+@inlined
 def add_scale_prior(
     prior: ScalePrior, pose: FloatArray, hessian: FloatArray, gradient: FloatArray
 ) -> float:
@@ -211,16 +211,38 @@ def add_scale_prior(
     cost = 0.0
     for k in range(2):
         log_scale = np.log(pose[13 + k])
-        cost += prior.weight * log_scale * log_scale
-        gradient[6 + k] += prior.weight * log_scale
-        hessian[6 + k, 6 + k] += prior.weight
+        if abs(log_scale) >= prior.width:
+            excess = beyond(log_scale, prior.width)
+            cost += prior.weight * excess * excess
+            gradient[6 + k] += prior.weight * excess
+            hessian[6 + k, 6 + k] += prior.weight
     return cost
 
 
 @kernel
 def scale_prior_cost(prior: ScalePrior, pose: FloatArray) -> float:
     """The cost of the prior on the log scales."""
-    return float(prior.weight * (np.log(pose[13]) ** 2 + np.log(pose[14]) ** 2))
+    y, z = beyond(np.log(pose[13]), prior.width), beyond(np.log(pose[14]), prior.width)
+    return float(prior.weight * (y * y + z * z))
+
+
+@kernel
+def whole_information(prior: ScalePrior) -> float:
+    """Inverse variance of the whole prior, flat part and flanks."""
+    flank, width = 1.0 / np.sqrt(prior.weight), prior.width
+    half = flank * np.sqrt(np.pi / 2.0)  # area of one flank, over the height of the flat part
+    square = width**3 / 3.0 + half * (width**2 + flank**2) + 2.0 * width * flank**2
+    return float((width + half) / square)
+
+
+@inlined
+def score_of_distance(distance: float) -> float:
+    """-2 log of the prior of a translation by which scores of minima are compared.
+
+    It is flat over directions and log distances, t^-3. A flat one would be a prior for large
+    distances, and for the large scales that go with these.
+    """
+    return float(6.0 * np.log(distance))
 
 
 @kernel

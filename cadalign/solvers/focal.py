@@ -44,14 +44,13 @@ from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,
-    is_estimate,
     move,
     refine,
     room_of,
     score_of,
     solve,
 )
-from cadalign.solvers.unknowns import has_collapsed, hold_fixed, leaves_bounds, move_pose
+from cadalign.solvers.unknowns import hold_fixed, leaves_bounds, move_pose
 
 _LARGEST_STEP = 0.5
 _SAME_FOCAL = 0.01
@@ -218,12 +217,6 @@ def _score_of(system: FocalObjective, state: FloatArray, cost: float) -> float:
 def _are_same(system: FocalObjective, first: FloatArray, second: FloatArray) -> bool:
     zoomed = abs(first[POSE_SIZE] - second[POSE_SIZE])
     return zoomed < _SAME_FOCAL and are_same_poses(system.objective, first, second)
-
-
-@is_estimate.of(FocalObjective)
-@inlined
-def _is_estimate(system: FocalObjective, state: FloatArray) -> bool:
-    return not has_collapsed(state)
 
 
 @kernel

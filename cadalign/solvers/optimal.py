@@ -15,14 +15,15 @@ from cadalign.solvers.constants import (
     POSE_SIZE,
     TOO_FEW,
     UNKNOWNS,
+    ScalePrior,
 )
 from cadalign.solvers.covariance import center_and_unit, covariance_of
-from cadalign.solvers.evidence import Keypoints, ScalePrior, take_keypoints
+from cadalign.solvers.evidence import Keypoints, take_keypoints
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.search import Effort, Minima, search
-from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_starts
+from cadalign.solvers.starts import choose_subsets, minimal_starts, relief, rotation_starts
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 MAX_MINIMA = 12
@@ -31,6 +32,7 @@ _GRID_ROTATIONS = 96
 _GRID_REFINED = 20
 _PROBE_ITERATIONS = 6
 _MAX_ITERATIONS = 200
+_LEAST_RELIEF = 3.0  # of points whose subsets tell their depths
 _UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
 
 
@@ -43,15 +45,17 @@ def optimal_batch(
     loss: int,
     loss_scale: FloatArray,
     prior_weight: FloatArray,
+    prior_width: float,
     free: FloatArray,
     min_points: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, IntArray]:
     """Find the optimum of every problem; a single fit is a batch of one.
 
     Problem b has the rows ``offsets[b]`` to ``offsets[b + 1]``. ``loss_scale`` and ``prior_weight``
-    (B,) are in units of the whitening's sigma. Returns the minima's poses (B, MAX_MINIMA, 15) and
-    costs (B, MAX_MINIMA), the covariance of the best (B, 8, 8), statuses (B,), and (B, 4) the
-    number of minima, iterations, hypotheses, and the number of an undetermined unknown or -1.
+    (B,), the weight of a `ScalePrior` of ``prior_width``, are in units of the whitening's sigma.
+    Returns the minima's poses (B, MAX_MINIMA, 15) and costs (B, MAX_MINIMA), the covariance of the
+    best (B, 8, 8), statuses (B,), and (B, 4) the number of minima, iterations, hypotheses, and the
+    number of an undetermined unknown or -1.
     """
     count = offsets.shape[0] - 1
     poses = np.zeros((count, MAX_MINIMA, POSE_SIZE))
@@ -71,7 +75,7 @@ def optimal_batch(
             loss,
             loss_scale[b],
         )
-        objective = Objective(free, keypoints, ScalePrior(prior_weight[b]))
+        objective = Objective(free, keypoints, ScalePrior(prior_weight[b], prior_width))
         info[b, 0], info[b, 1], info[b, 2], info[b, 3] = optimal_kernel(
             objective, poses[b], costs[b], covariances[b]
         )
@@ -160,8 +164,12 @@ def _search_from_all_starts(
     if is_solved:
         copy_into(starts[count], linear)
         count += 1
-    # Other starts serve coplanar points, and where the unstretched model is a better guess.
-    needs_grid = free[6] == 0.0 or free[7] == 0.0 or objective.scale_prior.weight > 0.0
+    # Other starts serve points that are nearly coplanar, or few subsets, and where the unstretched
+    # model is a better guess.
+    prior = objective.scale_prior
+    needs_grid = free[6] == 0.0 or free[7] == 0.0 or (prior.weight > 0.0 and prior.width == 0.0)
+    needs_grid = needs_grid or points.shape[0] == 5
+    needs_grid = needs_grid or relief(points, rays, objective.keypoints.whitening) < _LEAST_RELIEF
     for attempt in range(2):
         if minima.counts[0] > 0 or (attempt == 0 and needs_grid):
             continue

@@ -89,12 +89,6 @@ def are_same(system: Any, first: FloatArray, second: FloatArray) -> bool:
 
 
 @KernelFamily
-def is_estimate(system: Any, state: FloatArray) -> bool:
-    """False for a state that no object has, such as one whose scales ran off to zero."""
-    raise NotImplementedError
-
-
-@KernelFamily
 def integrating(system: Any, integrates: bool) -> Any:
     """The system with the shape integrated out of its objective, or with that of the cost alone.
 
@@ -249,7 +243,7 @@ def search(
             break
         probed[best] = np.inf
         state = states[best]
-        if not is_estimate(system, state) or _find(system, state, cost, label, minima) >= 0:
+        if _find(system, state, cost, label, minima) >= 0:
             continue
         if not converged[best] and effort.iterations > 0:
             cost, used, _ = refine(system, effort.iterations, state)
@@ -298,10 +292,8 @@ def descend(
 def add_minimum(
     system: Any, state: FloatArray, cost: float, label: int, penalty: float, minima: Minima
 ) -> None:
-    """Insert a state by its score, unless it is found already or no estimate."""
-    if not cost < np.inf or not is_estimate(system, state):
-        return
-    if _find(system, state, cost, label, minima) >= 0:
+    """Insert a state by its score, unless it is found already."""
+    if not cost < np.inf or _find(system, state, cost, label, minima) >= 0:
         return
     score = score_of(system, state, cost) + penalty
     found = minima.counts[0]

@@ -97,6 +97,34 @@ def _volume(points: FloatArray, chosen: IntArray) -> float:
 
 
 @kernel
+def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float:
+    """How far points (n, 3) leave a plane, in standard deviations of the noise in their image.
+
+    The root mean square distance from the plane that fits best, about: for small ones, the least
+    eigenvalue of a covariance is its determinant over the sum of its principal minors.
+    """
+    n = points.shape[0]
+    a = b = c = p = q = r = 0.0
+    for i in range(n):  # centred, as the search has them
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        a += x * x
+        b += y * y
+        c += z * z
+        p += x * y
+        q += x * z
+        r += y * z
+    minors = a * b - p * p + a * c - q * q + b * c - r * r
+    determinant = a * (b * c - r * r) - p * (p * c - q * r) + q * (p * r - b * q)
+    information = 0.0
+    for i in range(whitening.shape[0]):
+        information += whitening[i, 0] * whitening[i, 2] / whitening.shape[0]
+    if not minors > 0.0:
+        return 0.0
+    share = max(determinant, 0.0) / minors / (a + b + c)
+    return float(np.sqrt(share * _square_spread(rays) * information))
+
+
+@kernel
 def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> int:
     """Fill ``poses`` (k, 15) with poses of the unstretched model at k evenly spread rotations.
 

@@ -14,7 +14,6 @@ from cadalign.compile import inlined, kernel
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.linalg import polish_rotation
 
-_LARGEST_STRETCH = 1e3
 _LARGEST_LOG_STEP = 2.0
 _ROTATION_ERROR = 1e-10
 _AT_BOUND = 1e-9
@@ -112,15 +111,3 @@ def is_pose(pose: FloatArray) -> bool:
             error = max(error, abs(product)) if product == product else np.inf
         error += 0.0 * (pose[9 + i] + pose[12 + i])
     return error < _ROTATION_ERROR and min(pose[12], pose[13], pose[14]) > 0.0
-
-
-@kernel
-def has_collapsed(pose: FloatArray) -> bool:
-    """Report a pose whose scales ran off to zero or infinity.
-
-    With few points the likelihood may rise forever as a scale goes to zero. No real object is
-    there, and the other minima are of use.
-    """
-    low = min(pose[13], pose[14])
-    high = max(pose[13], pose[14])
-    return not (low > 1.0 / _LARGEST_STRETCH and high < _LARGEST_STRETCH)

@@ -13,7 +13,8 @@ from support.problems import LENS, assert_same, fit_problem, moved, problem_of, 
 
 from cadalign import Alignment, Camera, fit
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
+from cadalign.estimation.options import BOUNDING_PRIOR
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem
 from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 
 # --- what it finds ----------------------------------------------------------------------------
@@ -253,6 +254,13 @@ def test_four_points_give_every_exact_solution_least_stretch_first(seed: int) ->
     assert all(other.relative_likelihood > 0.99 for other in result.alternatives)
 
 
+def cost_at(problem: Problem, alignment: Alignment) -> float:
+    """The objective at a deviation of 1 px, with the bound of the log scales."""
+    weight, width = BOUNDING_PRIOR
+    excess = np.maximum(np.abs(np.log(alignment.scale)) - width, 0.0)
+    return float((residuals_at(problem, alignment) ** 2).sum() + weight * (excess**2).sum())
+
+
 @pytest.mark.parametrize("points", [5, 6])
 def test_alternatives_are_other_minima_with_their_likelihood(points: int) -> None:
     seen = 0
@@ -262,12 +270,12 @@ def test_alternatives_are_other_minima_with_their_likelihood(points: int) -> Non
             result = fit_problem(problem)
         except DegenerateError:  # happens once in hundreds: noise on so few points leaves nothing
             continue
-        best = np.sum(result.residuals**2)
+        best = cost_at(problem, result.alignment)
         likelihoods = [other.relative_likelihood for other in result.alternatives]
         assert likelihoods == sorted(likelihoods, reverse=True)
         for other in result.alternatives:
             seen += 1
-            excess = np.sum(residuals_at(problem, other.alignment) ** 2) - best
+            excess = cost_at(problem, other.alignment) - best
             assert other.relative_likelihood == pytest.approx(np.exp(-excess / 2), rel=1e-4)
             assert 1e-3 <= other.relative_likelihood <= 1.0
             turn = rotation_error(est=other.alignment, gt=result.alignment)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR
+from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, ScalePrior
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.equations import joint_room
 from cadalign.solvers.joint.evidence import (
@@ -35,7 +35,13 @@ POINTS, MODES, VIEWS = 7, 3, 2
 
 
 def evidence_of(
-    seed: int, *, spread: float, poses: tuple[int, int], loss: int, focals: int = 0
+    seed: int,
+    *,
+    spread: float,
+    poses: tuple[int, int],
+    loss: int,
+    focals: int = 0,
+    width: float = 0.0,
 ) -> Evidence:
     rng = np.random.default_rng(seed)
     shape = Shape(
@@ -86,7 +92,7 @@ def evidence_of(
         np.full(2, 2.0),
     )
     precision = rng.normal(size=(3, 3))
-    scales = ScalePriors(np.ones(3), precision @ precision.T)
+    scales = ScalePriors(np.ones(3), precision @ precision.T, ScalePrior(3.0, width))
     lenses = Focals(
         np.minimum(np.arange(VIEWS), focals - 1),
         np.full(focals, -2.0),
@@ -154,7 +160,7 @@ def seen_from(evidence: Evidence, state: State) -> Evidence:
 def test_the_gradient_is_that_of_the_cost(
     seed: int, poses: tuple[int, int], focals: int, loss: int
 ) -> None:
-    evidence = evidence_of(seed, spread=0.0, poses=poses, loss=loss, focals=focals)
+    evidence = evidence_of(seed, spread=0.0, poses=poses, loss=loss, focals=focals, width=0.02)
     state = state_of(seed, max(poses) + 1, focals)
     gradient = gradient_of(evidence, state)
     slopes = np.empty(len(gradient))

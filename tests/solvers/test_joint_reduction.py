@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
 from cadalign.solvers.joint.equations import joint_room
 from cadalign.solvers.joint.evidence import (
@@ -78,7 +79,7 @@ def evidence(rank: int) -> Evidence:
         Planes(
             *(NONE, NONE, np.empty((0, 3)), np.empty((0, 2))), *(NO_VALUE, NO_VALUE, NONE, NO_VALUE)
         ),
-        ScalePriors(np.zeros(3), np.zeros((3, 3))),
+        ScalePriors(np.zeros(3), np.zeros((3, 3)), ScalePrior(0.0, 0.0)),
     )
 
 
@@ -88,6 +89,11 @@ def best_of(evidence: Evidence, rank: int) -> tuple[State, float]:
     minima, _ = search_joint(evidence, start, np.zeros((1, 0)), np.zeros((1, 3)))
     (state,) = minima.states
     return state, float(minima.scores[0])
+
+
+def mean_depth(evidence: Evidence, state: State) -> float:
+    points = points_of(evidence.shape, state)[:SEEN]
+    return float((points @ state.poses[0, 6:9] + state.poses[0, 11]).mean())
 
 
 def test_the_basis_spans_what_moves_the_seen_points(evidence: Evidence, rank: int) -> None:
@@ -107,7 +113,8 @@ def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     evaluate(system, packed(state), room)
     slope = np.linalg.solve(information, room.gradient)
     assert room.gradient @ slope < 1e-9 * max(cost, 1.0)
-    assert score == pytest.approx(cost + np.linalg.slogdet(information)[1], rel=1e-9)
+    volume = np.linalg.slogdet(information)[1] + 6 * np.log(mean_depth(evidence, state))
+    assert score == pytest.approx(cost + volume, rel=1e-9)
 
 
 def test_covariances_are_those_of_all_modes(evidence: Evidence, rank: int) -> None:

@@ -99,10 +99,15 @@ def test_pixel_derivatives_are_those_of_finite_differences(seed: int, camera: Ca
 
 
 @pytest.mark.parametrize("loss", [LINEAR, HUBER, CAUCHY])
-@given(seed=seeds, each=st.booleans(), weight=st.sampled_from([0.0, 10.0]))
+@given(
+    seed=seeds,
+    each=st.booleans(),
+    weight=st.sampled_from([0.0, 10.0]),
+    width=st.sampled_from([0.0, 0.2]),
+)
 @settings(max_examples=30)
 def test_gradient_of_all_evidence_is_that_of_the_cost(
-    loss: int, seed: int, each: bool, weight: float
+    loss: int, seed: int, each: bool, weight: float, width: float
 ) -> None:
     alignment, points = pose_and_points(seed, 40)  # more than a block of points
     rng = np.random.default_rng(seed)
@@ -118,7 +123,7 @@ def test_gradient_of_all_evidence_is_that_of_the_cost(
             loss,
             2.0,
         ),
-        ScalePrior(weight),
+        ScalePrior(weight, width),
     )
     room = room_for(UNKNOWNS)
     cost = evaluate_alignment(objective, pose, room)
@@ -131,10 +136,15 @@ def test_gradient_of_all_evidence_is_that_of_the_cost(
         assert gradient[k] == pytest.approx(slope, rel=1e-5, abs=1e-4 * np.sqrt(cost))
 
 
-@given(seed=seeds, lens=st.booleans(), weight=st.sampled_from([0.0, 10.0]))
+@given(
+    seed=seeds,
+    lens=st.booleans(),
+    weight=st.sampled_from([0.0, 10.0]),
+    width=st.sampled_from([0.0, 0.2]),
+)
 @settings(max_examples=30)
 def test_gradient_with_the_focal_length_is_that_of_the_cost(
-    seed: int, lens: bool, weight: float
+    seed: int, lens: bool, weight: float, width: float
 ) -> None:
     alignment, points = pose_and_points(seed, 40)
     rng = np.random.default_rng(seed)
@@ -142,7 +152,9 @@ def test_gradient_with_the_focal_length_is_that_of_the_cost(
     keypoints = Keypoints(points, rays, np.array([[100.0, 3.0, 90.0]]), CAUCHY, 2.0)
     slopes = rng.normal(scale=0.02, size=(len(points) if lens else 0, 2))
     prior = LogFocalPrior(-2.0, 2.0, 0.1, weight)
-    system = FocalObjective(Objective(np.ones(8), keypoints, ScalePrior(weight)), slopes, prior)
+    system = FocalObjective(
+        Objective(np.ones(8), keypoints, ScalePrior(weight, width)), slopes, prior
+    )
     state = np.append(alignment.packed, rng.normal(scale=0.2))
     room, _ = room_of(system)
     cost = evaluate(system, state, room)

@@ -122,7 +122,9 @@ class Likelihood:
 
     def penalties(self, log_scales: FloatArray, log_focals: FloatArray) -> FloatArray:
         """Squared deviations (k,) from the priors, of the log scales (k, 3) and focals (k,)."""
-        total = self.options.prior_weight * (log_scales**2).sum(axis=1)
+        weight, width = self.options.scale_prior
+        excess = np.maximum(np.abs(log_scales) - width, 0.0)
+        total = weight * (excess**2).sum(axis=1)
         prior = self.options.focal_prior
         if prior is not None:
             total = total + ((log_focals - np.log(prior.focal)) / prior.relative_sigma) ** 2

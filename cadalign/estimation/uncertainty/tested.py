@@ -62,10 +62,16 @@ class Tested:
 
     @property
     def redundancy(self) -> int:
-        """Equations, of the priors too, minus unknowns."""
+        """Equations, of the priors too, minus unknowns.
+
+        A scale that the keypoints leave to the bounding prior has its equation there.
+        """
         priors = int(self.options.focal_prior is not None)
-        if self.options.scale_prior_sigma is not None:
+        width = self.options.scale_prior.width
+        if width == 0:
             priors += len(self.options.stretched_axes)
+        else:
+            priors += int((np.abs(np.log(self.alignment.scale)) > width).sum())
         return 2 * len(self.rows) - self.options.unknowns + priors
 
     @property

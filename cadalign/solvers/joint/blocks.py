@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
-from cadalign.solvers.evidence import loss_and_root
+from cadalign.solvers.evidence import beyond, loss_and_root
 from cadalign.solvers.joint.arrow import Arrow, add_row
 from cadalign.solvers.joint.evidence import Evidence, State
 
@@ -33,6 +33,16 @@ def first_scale(evidence: Evidence) -> int:
 
 
 @kernel
+def bounded_scales(evidence: Evidence) -> FloatArray:
+    """Rows (3, 3) by which log scales give what their bound is on."""
+    free = evidence.scales.free
+    rows = np.diag(free)
+    if free.all():
+        rows -= 1.0 / 3.0
+    return rows
+
+
+@kernel
 def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """Add the priors on focal lengths, log scales and coefficients."""
     border, gradient = arrow.border, arrow.gradient[6 * arrow.blocks.shape[0] :]
@@ -50,6 +60,18 @@ def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
             cost += weight * state.log_scales[a] * state.log_scales[b]
             gradient[first + a] += weight * state.log_scales[b]
             border[first + a, first + b] += weight
+    bound, rows = evidence.scales.bound, bounded_scales(evidence)
+    for a in range(3):
+        bounded = 0.0
+        for b in range(3):
+            bounded += rows[a, b] * state.log_scales[b]
+        if abs(bounded) >= bound.width:
+            excess = beyond(bounded, bound.width)
+            cost += bound.weight * excess * excess
+            for b in range(3):
+                gradient[first + b] += bound.weight * excess * rows[a, b]
+                for c in range(3):
+                    border[first + b, first + c] += bound.weight * rows[a, b] * rows[a, c]
     for k in range(state.coefficients.shape[0]):
         value = state.coefficients[k]
         cost += value * value

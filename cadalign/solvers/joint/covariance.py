@@ -8,6 +8,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, kernel
+from cadalign.solvers.constants import ScalePrior
+from cadalign.solvers.evidence import whole_information
 from cadalign.solvers.joint.arrow import (
     Arrow,
     decide_on_undetermined,
@@ -38,7 +40,14 @@ class JointCovariance(NamedTuple):
 
 
 def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
-    """The inverse information at a state; zero for log scales that are held."""
+    """The inverse information at a state; zero for log scales that are held.
+
+    A scale that only its bound keeps from running off is as uncertain as the whole prior.
+    """
+    bound = evidence.scales.bound
+    if bound.weight > 0:
+        whole = ScalePrior(whole_information(bound), bound.width)
+        evidence = evidence._replace(scales=evidence.scales._replace(bound=whole))
     reduction = reduce_modes(evidence)
     row = packed(reduced_state(reduction, evidence.shape, state))
     basis = np.ascontiguousarray(reduction.basis[: len(evidence.shape.modes)])

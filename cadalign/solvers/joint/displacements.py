@@ -64,7 +64,7 @@ def _whiten(rows: FloatArray, start: int, end: int, spread: float, factor: Float
 
 
 @borrowing
-def shift(evidence: Evidence, equations: JointEquations) -> None:
+def shift_means(evidence: Evidence, equations: JointEquations) -> None:
     """Move the displacements' prior means as the slopes of the log determinant do."""
     spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
     unknowns = rows.shape[0] - 4

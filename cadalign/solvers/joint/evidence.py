@@ -19,6 +19,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
+from cadalign.solvers.constants import ScalePrior
 
 
 class Shape(NamedTuple):
@@ -120,10 +121,15 @@ class Planes(NamedTuple):
 
 
 class ScalePriors(NamedTuple):
-    """Log scales: 1 in ``free`` (3,) where estimated, and the inverse covariance of their prior."""
+    """Log scales: 1 in ``free`` (3,) where estimated, and their priors.
+
+    ``precision`` (3, 3) is the inverse covariance of a Gaussian, and ``bound`` the prior on each of
+    them; where all are free, on each about their mean.
+    """
 
     free: FloatArray
     precision: FloatArray
+    bound: ScalePrior
 
 
 class Evidence(NamedTuple):

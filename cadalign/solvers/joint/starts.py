@@ -8,7 +8,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.constants import UNKNOWNS, ScalePrior
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.optimal import optimal_batch
 from cadalign.solvers.starts import widen_by_shape
@@ -71,6 +71,8 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
         points[:, a] = given.points[:, order[a]]
         if a > 0:
             free[5 + a] = scales.free[order[a]]
+    weight = scales.precision[order[1], order[1]]
+    prior = ScalePrior(weight, 0.0) if weight > 0.0 else scales.bound
     found, costs, _, _, info = optimal_batch(
         points,
         given.rays,
@@ -78,7 +80,8 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
         np.array([0, len(given.rows)]),
         sightings.loss[given.rows[0]],
         np.array([sightings.loss_scale[given.rows[0]]]),
-        np.array([scales.precision[order[1], order[1]]]),
+        np.array([prior.weight]),
+        prior.width,
         free,
         _LEAST_POINTS,
     )

@@ -14,6 +14,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
+from cadalign.solvers.evidence import score_of_distance, whole_information
 from cadalign.solvers.joint.arrow import (
     Arrow,
     add_products,
@@ -26,18 +27,18 @@ from cadalign.solvers.joint.arrow import (
     log_determinant,
     solve_arrow,
 )
-from cadalign.solvers.joint.blocks import add_blocks, first_scale
+from cadalign.solvers.joint.blocks import add_blocks, bounded_scales, first_scale
 from cadalign.solvers.joint.determinant import add_log_determinant
-from cadalign.solvers.joint.displacements import eliminate, follow, shift
+from cadalign.solvers.joint.displacements import eliminate, follow, shift_means
 from cadalign.solvers.joint.equations import JointEquations, joint_room, with_turns
 from cadalign.solvers.joint.evidence import Evidence, State, unpacked
-from cadalign.solvers.joint.rows import count_equations, write_rows
+from cadalign.solvers.joint.rows import count_equations, exp_of, stretched_point, write_rows
+from cadalign.solvers.projection import shift, turn
 from cadalign.solvers.search import (
     are_same,
     cost_at,
     evaluate,
     integrating,
-    is_estimate,
     move,
     room_of,
     score_of,
@@ -100,7 +101,7 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
             return np.inf
         cost += volume + equations.log_determinant[0]
         if poses == 1:
-            shift(evidence, equations)
+            shift_means(evidence, equations)
     for a in range(3):
         if evidence.scales.free[a] == 0.0:
             hold(arrow, first_scale(evidence) + a)
@@ -186,9 +187,44 @@ def joint_score(system: Joint, row: FloatArray, cost: float) -> float:
     if not cost < np.inf:
         return np.inf
     decide_on_undetermined(equations.arrow, equations.arrow.blocks.shape[0])
+    _bound_volume(system.evidence, equations.arrow)
     if not factorize_arrow(equations.arrow):
         return np.inf
-    return float(cost + log_determinant(equations.arrow) + equations.log_determinant[0])
+    score = cost + log_determinant(equations.arrow) + equations.log_determinant[0]
+    return float(score + _score_of_distances(system.evidence, unpacked(system.evidence, row)))
+
+
+@kernel
+def _bound_volume(evidence: Evidence, arrow: Arrow) -> None:
+    """Add the information of a prior that is flat at the estimate: no volume exceeds its own."""
+    bound, first = evidence.scales.bound, first_scale(evidence)
+    if bound.weight > 0.0:
+        rows = bounded_scales(evidence)
+        for a in range(3):
+            for b in range(3):
+                for c in range(3):
+                    share = rows[a, b] * rows[a, c]
+                    arrow.border[first + b, first + c] += share * whole_information(bound)
+
+
+@kernel
+def _score_of_distances(evidence: Evidence, state: State) -> float:
+    """-2 log of the prior of the translations: `score_of_distance` of the sightings' mean one."""
+    sightings, rig, scale = evidence.sightings, evidence.rig, exp_of(state.log_scales)
+    poses = state.poses.shape[0]
+    totals, counts = np.zeros(poses), np.zeros(poses)
+    for n in range(sightings.point.shape[0]):
+        p = rig.pose[sightings.image[n]]
+        camera, motion = rig.cam_from_rig[sightings.image[n]], state.poses[p]
+        point = stretched_point(evidence.shape, state, scale, sightings.point[n])
+        in_rig = shift(motion, turn(motion, point))
+        totals[p] += shift(camera, turn(camera, in_rig))[2]
+        counts[p] += 1.0
+    score = 0.0
+    for p in range(poses):
+        if counts[p] > 0.0:
+            score += score_of_distance(totals[p] / counts[p])
+    return score
 
 
 @are_same.of(Joint)
@@ -205,9 +241,3 @@ def _are_same(system: Joint, first_row: FloatArray, second_row: FloatArray) -> b
     for f in range(first.log_focals.shape[0]):
         square += (first.log_focals[f] - second.log_focals[f]) ** 2
     return square < _SAME_CHORD * _SAME_CHORD
-
-
-@is_estimate.of(Joint)
-@inlined
-def _is_estimate(system: Joint, row: FloatArray) -> bool:
-    return True

@@ -31,7 +31,12 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import borrowing, fast_sums, inlined, kernel
 from cadalign.solvers.alignment import Equations, room_for, solve_damped
 from cadalign.solvers.constants import HUBER, LINEAR, POSE_SIZE
-from cadalign.solvers.evidence import Keypoints, keypoint_cost, loss_and_root
+from cadalign.solvers.evidence import (
+    Keypoints,
+    keypoint_cost,
+    loss_and_root,
+    score_of_distance,
+)
 from cadalign.solvers.linalg import cholesky, copy_into, dot
 from cadalign.solvers.marginal.correlation import (
     factorize_upper,
@@ -55,7 +60,6 @@ from cadalign.solvers.search import (
     cost_at,
     evaluate,
     integrating,
-    is_estimate,
     move,
     room_of,
     score_of,
@@ -393,7 +397,18 @@ def _score_of(system: Posed, state: FloatArray, cost: float) -> float:
         return np.inf
     for k in range(POSE_UNKNOWNS):
         score += 2.0 * np.log(factor[k, k])
-    return score
+    return float(score + score_of_distance(_mean_depth(system.target.mean, state)))
+
+
+@kernel
+def _mean_depth(mean: FloatArray, state: FloatArray) -> float:
+    """Mean depth of the displaced points."""
+    total = 0.0
+    for i in range(mean.shape[0]):
+        total += state[11]
+        for a in range(3):
+            total += state[6 + a] * (mean[i, a] + state[POSE + 3 * i + a])
+    return float(total / mean.shape[0])
 
 
 @are_same.of(Posed)
@@ -403,9 +418,3 @@ def _are_same(system: Posed, first: FloatArray, second: FloatArray) -> bool:
     for k in range(9):
         square += (first[k] - second[k]) ** 2
     return square < _SAME_CHORD * _SAME_CHORD
-
-
-@is_estimate.of(Posed)
-@inlined
-def _is_estimate(system: Posed, state: FloatArray) -> bool:
-    return True

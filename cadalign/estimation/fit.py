@@ -78,7 +78,8 @@ def fit(
         or ``"none"``. The others keep the scale 1.
     scale_prior_sigma : float, optional
         Standard deviation of a Gaussian prior on the logarithm of each scale, about the scale 1.
-        It keeps keypoints in one plane, or seen end-on, solvable.
+        It keeps keypoints in one plane, or seen end-on, solvable. By default the prior is flat from
+        1/5 to 5 and falls off beyond: it bounds what keypoints leave open, and moves nothing else.
     known_axis : {"x", "y", "z"}
         The model's axis whose length is right. One image alone does not tell size from distance.
     focal : {"known", "estimate"}

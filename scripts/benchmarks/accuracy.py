@@ -26,6 +26,7 @@ from benchmarks.section import (
 from cadalign import Alignment, Camera, RansacOptions, Result
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
+from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.metrics.errors import alignment_errors
@@ -190,6 +191,7 @@ def _is_missed(problem: Problem, noise: float, est: Alignment) -> bool:
     rays = problem.camera.normalize(problem.points_2d)
     whitening = whitening_of(noise, rays, problem.camera)
     objective = keypoint_objective(problem.points_3d, rays, whitening)
+    objective = objective._replace(scale_prior=BOUNDING_PRIOR)
     cost, _, _ = refine(objective, 200, problem.alignment.packed)
     return bool(cost < evaluate_cost(objective, est.packed) * (1 - 1e-6) - 1e-9)
 

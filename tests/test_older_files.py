@@ -28,10 +28,10 @@ from cadalign import (
     Symmetry,
     View,
 )
-from cadalign.annotate.history_file import history_path
+from cadalign.annotate.history import history_path
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.worklist_state import worklist_state
+from cadalign.annotate.page_state import worklist_state
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
 
@@ -382,7 +382,7 @@ def test_annotation_is_continued(tmp_path: Path) -> None:
     second = session.objects[0][1].document
     assert second.name == "second crate"
     assert keypoints_of(second.pairs) == [1, 2, 3, 5]
-    assert session.objects[0][0].history.can_undo
+    assert session.objects[0][0].history.before
     assert [each["state"] for each in worklist_state(session)] == ["done", "begun"]
 
 

@@ -1,4 +1,4 @@
-"""Base of the page's actions, and what an action tells the user."""
+"""Base of the page's actions, and the outcome of one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cadalign.annotate.document import Pixel
-from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import ForeignDocument

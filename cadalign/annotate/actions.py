@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 from cadalign.annotate.action import Action, ActionOutcome, inside
-from cadalign.annotate.choosing.switching import ChooseModel
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
 from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS
-from cadalign.annotate.image_corners import nearest_corner
-from cadalign.annotate.objects.actions import OBJECT_ACTIONS, bring_back
-from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.masks import nearest_corner
+from cadalign.annotate.models import SAME_PLACE
+from cadalign.annotate.object_actions import OBJECT_ACTIONS, bring_back
+from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.session import Session
 from cadalign.annotate.worklist import Mark
 from cadalign.errors import InputError, quote
@@ -26,7 +26,6 @@ from cadalign.io.documents import (
 )
 
 _LONGEST_REACH = 200.0  # of a corner of the photo [px]
-_SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
 _MISSED = "That click missed the model."
 MIRRORED = 0.01
 """Largest distance of a point from a mirror image that it counts as [diagonals]."""
@@ -47,7 +46,7 @@ class PlaceUv(_Placing):
     def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         uv = _snapped(self.uv, self.snap, session, state)
         document, pair = state.document.place_uv(uv, self.pair)
-        state.history.record(document)
+        state.record(document)
         return ActionOutcome(pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
@@ -78,7 +77,7 @@ class _Aiming(Action, kw_only=True):
         point = model.pick(origin, self.direction, snap=self.snap)
         if point is None:
             return None
-        known = registry.find(point.xyz, tolerance=_SAME_PLACE * model.diagonal)
+        known = registry.find(point.xyz, tolerance=SAME_PLACE * model.diagonal)
         return registry.add(point) if known is None else known
 
 
@@ -103,7 +102,7 @@ class Repick(_Aiming):
         keypoint = self.target(state)
         if keypoint is None:
             return ActionOutcome(self.pair, _MISSED)
-        state.history.record(state.document.exchange_keypoint(self.pair, keypoint))
+        state.record(state.document.exchange_keypoint(self.pair, keypoint))
         return ActionOutcome(self.pair)
 
 
@@ -151,7 +150,7 @@ class Move(Action):
         uv = _snapped(self.uv, self.snap, session, state)
         moved = state.document.move(self.pair, uv)
         step = None if self.gesture is None else (self.pair, self.gesture)
-        state.history.record(moved, step=step)
+        state.record(moved, step=step)
         return ActionOutcome(self.pair, _no_corner(self.snap, moved=uv != self.uv))
 
 
@@ -161,7 +160,7 @@ class Release(Action):
     pair: Index
 
     def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        state.history.record(state.document.release_keypoint(self.pair))
+        state.record(state.document.release_keypoint(self.pair))
         return ActionOutcome(self.pair)
 
 
@@ -171,7 +170,7 @@ class Delete(Action):
     pair: Index
 
     def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        state.history.record(state.document.delete(self.pair))
+        state.record(state.document.delete(self.pair))
         return ActionOutcome()
 
 
@@ -211,7 +210,7 @@ class Identify(Action):
         point = registry[keypoint]
         own = point.name if point.name != f"point {keypoint}" else f"keypoint {self.label}"
         known = registry.add_as(int(self.label), replace(point, name=own))
-        state.history.record(state.document.exchange_keypoint(self.pair, known))
+        state.record(state.document.exchange_keypoint(self.pair, known))
         return ActionOutcome(self.pair)
 
 
@@ -231,7 +230,7 @@ class Accept(Action):
                 document = document.append(Pair(number, proposal.uv, keypoint))
         if number is None:
             return ActionOutcome(message="Nothing is proposed that is not placed.")
-        state.history.record(document)
+        state.record(document)
         return ActionOutcome(number)
 
 
@@ -284,7 +283,6 @@ ACTIONS: dict[str, type[Action]] = {
     **EVIDENCE_ACTIONS,
     **OBJECT_ACTIONS,
     "accept": Accept,
-    "model": ChooseModel,
     "mark": MarkPhoto,
     "undo": Undo,
     "redo": Redo,
@@ -323,7 +321,7 @@ def perform(
                 where="do",
                 fix=f"known are {', '.join(ACTIONS)}",
             )
-        before = {id(each): each.object_document for each in session.states}
+        before = {id(each): each.history.document for each in session.states}
         outcome: ActionOutcome = convert(action, kind).apply(session, state)
         owners = [each for each in session.states if each.lead is None]
         changed = [each for each in owners if before.get(id(each)) is not each.document]
@@ -352,7 +350,7 @@ def _gone_through(state: PhotoState, before: AnnotationDocument, nothing: str) -
 
 def _place(keypoint: int, pair: int | None, state: PhotoState) -> ActionOutcome:
     document, number = state.document.place_keypoint(keypoint, pair)
-    state.history.record(document)
+    state.record(document)
     return ActionOutcome(number)
 
 

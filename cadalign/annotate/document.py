@@ -1,13 +1,11 @@
 """Annotation document of one object: pairs of a photo point and a keypoint of the model.
 
-The document is that of the object's first photo; those of its further photos are held by it.
-
-Documents are immutable; every edit makes a new one, which the history keeps for undo and redo.
+The document of the object's first photo holds those of its further photos. Documents are immutable;
+every edit makes a new one, which the history keeps for undo and redo.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -16,7 +14,6 @@ from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
 
 Pixel = tuple[float, float]
-_LONGEST = 1000  # of a history
 
 
 @dataclass(frozen=True)
@@ -217,76 +214,3 @@ class AnnotationDocument:
             return self.append(changed)
         pairs = tuple(changed if pair.number == changed.number else pair for pair in self.pairs)
         return replace(self, pairs=pairs)
-
-
-class History:
-    """The current document, those before it, and those that were undone."""
-
-    def __init__(
-        self,
-        document: AnnotationDocument,
-        *,
-        before: Iterable[AnnotationDocument] = (),
-        after: Iterable[AnnotationDocument] = (),
-    ) -> None:
-        self.document = document
-        self.revision = 0  # grows with every change, those by undo and redo included
-        self._before = list(before)
-        self._after = list(after)
-        self._step: object = None
-
-    @property
-    def object_document(self) -> AnnotationDocument:
-        """The document of the object, which the first photo's is."""
-        return self.document
-
-    @property
-    def before(self) -> tuple[AnnotationDocument, ...]:
-        """Documents that undoing leads to, the last one first reached."""
-        return tuple(self._before)
-
-    @property
-    def after(self) -> tuple[AnnotationDocument, ...]:
-        """Documents that redoing leads to, the last one first reached."""
-        return tuple(self._after)
-
-    @property
-    def can_undo(self) -> bool:
-        """True if there is a change to undo."""
-        return bool(self._before)
-
-    @property
-    def can_redo(self) -> bool:
-        """True if there is a change to redo."""
-        return bool(self._after)
-
-    def record(self, document: AnnotationDocument, *, step: object = None) -> None:
-        """Go on to another document.
-
-        Consecutive changes with the same ``step`` are undone together, such as the positions of a
-        point while it is dragged.
-        """
-        if step is None or step != self._step or not self._before:
-            self._before.append(self.document)
-            del self._before[:-_LONGEST]
-        self._after.clear()
-        self.document = document
-        self.revision += 1
-        self._step = step
-
-    def undo(self) -> bool:
-        """Go back by one change; returns False if there is none."""
-        return self._go(self._before, self._after)
-
-    def redo(self) -> bool:
-        """Redo the last undone change; returns False if there is none."""
-        return self._go(self._after, self._before)
-
-    def _go(self, source: list[AnnotationDocument], target: list[AnnotationDocument]) -> bool:
-        self._step = None
-        if not source:
-            return False
-        target.append(self.document)
-        self.document = source.pop()
-        self.revision += 1
-        return True

@@ -1,33 +1,136 @@
-"""Marks in a photo beside pairs: a mask, vertical edges, and known lengths."""
+"""Evidence of a photo beside its pairs: what a file has, and what is marked on the page."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
-from cadalign.annotate.further import FurtherEvidence
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.io.evidence import LENGTHS, Size
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ObservedImage
 
 Point2 = tuple[float, float]
 Segment = tuple[Point2, Point2]
 
+_LABELS = {
+    "mask": "mask",
+    "depth": "depth",
+    "up": "gravity",
+    "camera_height": "camera height",
+    "cam_from_rig": "known camera poses",
+}
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
 _MOST_UP_SIGMA = 20.0  # [degrees]
+
+
+@dataclass(frozen=True, eq=False)
+class FurtherEvidence:
+    """Evidence of an observation beside the keypoints of the photo that is annotated.
+
+    Parameters
+    ----------
+    image : ImageEvidence
+        Of the photo.
+    others : tuple of ObservedImage
+        The observation's other images.
+    place : int
+        The photo's number among all of them.
+    size : Size, optional
+        Known lengths of the object.
+    sigma : float, optional
+        Stored standard deviation of all keypoints in place of their own [px].
+    symmetry : Symmetry, optional
+        The model's; kept, but without effect while pairs are marked.
+    """
+
+    image: ImageEvidence = field(default_factory=ImageEvidence)
+    others: tuple[ObservedImage, ...] = ()
+    place: int = 0
+    size: Size | None = None
+    sigma: float | None = None
+    symmetry: Symmetry | None = None
+
+    @classmethod
+    def of(cls, observation: Observation, photo: Path, *, where: Path) -> FurtherEvidence:
+        """The evidence of a file that shows a photo; raises DataError if none of its views does."""
+        views = observation.views
+        place = _place_of(photo, views, where=where)
+        options = observation.fit_options
+        # Beside a prior on the stretch it is the annotator's own, from the pairs of that time.
+        sigma = None if "scale_prior_sigma" in options else options.get("sigma")
+        return cls(
+            views[place].evidence,
+            views[:place] + views[place + 1 :],
+            place,
+            observation.size,
+            sigma if isinstance(sigma, float) else None,
+            observation.symmetry,
+        )
+
+    def added_to_image(self, photo: ObservedImage) -> ObservedImage:
+        """The photo's keypoints with what else is known of the photo."""
+        evidence = self.image
+        if photo.depths is None and evidence.depth is None and evidence.depth_sigma is not None:
+            evidence = replace(evidence, depth_sigma=None)  # all keypoints with depths are gone
+        return replace(photo, evidence=evidence)
+
+    def added_to(self, photo: ObservedImage, **of_the_object: object) -> Observation:
+        """The observation of the photo's keypoints and of all that is known beside them.
+
+        ``of_the_object`` are the fields of `Observation` beyond those of an image.
+        """
+        photo = self.added_to_image(photo)
+        views = [*self.others[: self.place], photo, *self.others[self.place :]]
+        kept = {"others": tuple(views[1:]), "symmetry": self.symmetry, "size": self.size}
+        return Observation(**{**vars(views[0]), **kept, **of_the_object})
+
+
+def evidence_labels(observation: Observation) -> tuple[str, ...]:
+    """Name what an observation holds beyond one photo's keypoints, for the page."""
+    views = observation.views
+    given = set().union(*(view.evidence.given for view in views))
+    if any(view.depths is not None for view in views):
+        given.add("depth")
+    labels = [label for name, label in _LABELS.items() if name in given]
+    count = len(views) - 1
+    if count:
+        labels.append(f"{count} other view{'s' if count > 1 else ''}")
+    size = observation.size
+    if size is not None:
+        known = [name for name in LENGTHS if getattr(size, name) is not None]
+        labels.append(f"known {' and '.join(known)}")
+    return tuple(labels)
+
+
+def _place_of(photo: Path, views: Sequence[ObservedImage], *, where: Path) -> int:
+    """The number of the view that shows a photo; of a single view its own."""
+    if len(views) == 1:
+        return 0
+    for number, view in enumerate(views):
+        if view.image is not None and view.image.exists() and view.image.samefile(photo):
+            return number
+    raise DataError(
+        f"none of its {len(views)} views has the image {photo.name}",
+        where=str(where),
+        fix="annotate the image of one of them, or give another --observation",
+    )
 
 
 @dataclass(frozen=True)
 class Stroke:
     """A part of a mask: a polygon, a brush stroke of a ``radius`` [px], or ``runs``.
 
-    Those are the numbers of pixels outside and inside in turn, row by row.
+    Runs are the numbers of pixels outside and inside in turn, row by row.
     """
 
     points: tuple[Point2, ...] = ()
@@ -47,7 +150,7 @@ class MaskDrawing:
 
 @dataclass(frozen=True)
 class MarkedLengths:
-    """Known lengths of the object along x, y, z, and relative deviations: of all, or of each."""
+    """Known lengths of the object along x, y, z; relative standard deviations of all or of each."""
 
     width: float | None = None
     height: float | None = None
@@ -56,7 +159,7 @@ class MarkedLengths:
 
     @classmethod
     def of(cls, size: Size | None) -> MarkedLengths | None:
-        """Those of an observation."""
+        """The lengths of an observation."""
         if size is None:
             return None
         sigmas = () if size.sigma is None else tuple(np.atleast_1d(size.sigma).tolist())
@@ -64,17 +167,35 @@ class MarkedLengths:
 
     @property
     def size(self) -> Size:
-        """Those of an observation."""
+        """The lengths as an observation holds them."""
         sigma = list(self.sigmas) if len(self.sigmas) > 1 else next(iter(self.sigmas), None)
         return Size(width=self.width, height=self.height, length=self.length, sigma=sigma)
+
+    def checked(self) -> MarkedLengths | None:
+        """The lengths, None if there are none; raises InputError if one is not positive."""
+        given = {name: getattr(self, name) for name in LENGTHS}
+        if all(value is None for value in given.values()):
+            return None
+        for name, value in given.items():
+            if value is not None and not value > 0:
+                what = f"{value:g} is no length"
+                raise InputError(what, where=name, fix="give a positive number")
+        for value in self.sigmas:
+            if not 0 < value < 1:
+                raise InputError(
+                    f"{100 * value:g} % is no standard deviation of a length",
+                    where="sigma",
+                    fix="give more than 0 and less than 100 %",
+                )
+        return self
 
 
 @dataclass(frozen=True)
 class MarkedEvidence:
-    """Evidence of a photo beside its pairs.
+    """Marks in a photo beside its pairs.
 
-    ``up`` is the model's up axis in the camera with its deviation [degrees], from a file; vertical
-    edges take its place.
+    ``up`` is the model's up axis in the camera, with its standard deviation [degrees], from a file;
+    vertical edges take its place.
     """
 
     mask: MaskDrawing | None = None
@@ -85,7 +206,7 @@ class MarkedEvidence:
 
     @classmethod
     def of(cls, further: FurtherEvidence) -> Self:
-        """That of an observation."""
+        """The marks that stand for an observation's evidence."""
         image = further.image
         x, y, z = (0.0, 0.0, 0.0) if image.up is None else image.up.tolist()
         return cls(
@@ -102,24 +223,25 @@ class MarkedEvidence:
 
         ``drawn`` is the file of a mask with strokes, None if nothing is left of it.
         """
-        image = further.image
-        mask, sigma = (drawn, None)
+        mask, sigma = drawn, None
         if self.mask is not None and not self.mask.strokes:
             mask, sigma = Path(self.mask.base or ""), self.mask.base_sigma
-        image = replace(image, mask=mask, mask_sigma=sigma)
-        gravity = find_up(self.verticals, camera)
-        if gravity is not None:
-            image = replace(image, up=gravity[0], up_sigma_deg=gravity[1])
-        elif self.up is None:
-            image = replace(image, up=None, up_sigma_deg=None)
-        else:
-            image = replace(image, up=np.array(self.up), up_sigma_deg=self.up_sigma_deg)
+        up = None if self.up is None else np.array(self.up)
+        found = find_up(self.verticals, camera)
+        up, up_sigma = (up, self.up_sigma_deg) if found is None else found
+        image = replace(
+            further.image,
+            mask=mask,
+            mask_sigma=sigma,
+            up=up,
+            up_sigma_deg=None if up is None else up_sigma,
+        )
         size = None if self.lengths is None else self.lengths.size
         return replace(further, image=image, size=size)
 
 
 def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray, float] | None:
-    """The direction of vertical edges in the camera, upwards, and its deviation [degrees].
+    """Direction of vertical edges in the camera, upwards, and its standard deviation [degrees].
 
     Each edge and the camera's centre span a plane that holds the direction: it is the least
     singular vector of the planes' normals, weighted by the edges' lengths. None for fewer than two
@@ -149,26 +271,8 @@ def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray,
         return None
     least = values[2] if len(values) > 2 else 0.0
     factor = math.sqrt(max(1.0, least**2 / redundancy)) if redundancy else 1.0
-    deviation = max(_LEAST_UP_SIGMA, math.degrees(factor / values[1]))
-    if deviation > _MOST_UP_SIGMA:
+    up_sigma = max(_LEAST_UP_SIGMA, math.degrees(factor / values[1]))
+    if up_sigma > _MOST_UP_SIGMA:
         return None
     up = directions[2] * (-1.0 if directions[2][1] > 0 else 1.0)
-    return up, float(deviation)
-
-
-def check_lengths(lengths: MarkedLengths) -> MarkedLengths | None:
-    """The lengths, None if there are none; raises InputError if one is not positive."""
-    given = {name: getattr(lengths, name) for name in LENGTHS}
-    if all(value is None for value in given.values()):
-        return None
-    for name, value in given.items():
-        if value is not None and not value > 0:
-            raise InputError(f"{value:g} is no length", where=name, fix="give a positive number")
-    for value in lengths.sigmas:
-        if not 0 < value < 1:
-            raise InputError(
-                f"{100 * value:g} % is no deviation of a length",
-                where="sigma",
-                fix="give more than 0 and less than 100 %",
-            )
-    return lengths
+    return up, float(up_sigma)

@@ -13,11 +13,10 @@ from cadalign.annotate.evidence import (
     MarkedLengths,
     MaskDrawing,
     Stroke,
-    check_lengths,
     find_up,
 )
 from cadalign.annotate.masks import cut_out, decode_runs, encode_runs
-from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.session import Session
 from cadalign.errors import InputError
 from cadalign.io.documents import Count, Finite, Point2, Positive
@@ -43,7 +42,7 @@ class Focal(Action):
                     fix=f"give {low:.0f} to {high:.0f} px",
                 )
         focal = FocalChoice(self.known, self.pixels)
-        state.history.record(replace(state.document, focal=focal))
+        state.record(replace(state.document, focal=focal))
         return ActionOutcome()
 
 
@@ -63,7 +62,7 @@ class ChoosePriors(Action):
             )
         kept = state.document.priors.focal or state.intrinsics.likely_focal
         priors = Priors(self.stretch, kept if self.focal else None)
-        state.history.record(replace(state.document, priors=priors))
+        state.record(replace(state.document, priors=priors))
         return ActionOutcome()
 
 
@@ -155,7 +154,7 @@ class KnownLengths(Action):
 
     def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         sigmas = () if self.sigma is None else (self.sigma,)
-        lengths = check_lengths(MarkedLengths(self.width, self.height, self.length, sigmas))
+        lengths = MarkedLengths(self.width, self.height, self.length, sigmas).checked()
         return _record(replace(state.document.evidence, lengths=lengths), state)
 
 
@@ -181,5 +180,5 @@ def _add(stroke: Stroke, state: PhotoState) -> ActionOutcome:
 
 
 def _record(evidence: MarkedEvidence, state: PhotoState) -> ActionOutcome:
-    state.history.record(replace(state.document, evidence=evidence))
+    state.record(replace(state.document, evidence=evidence))
     return ActionOutcome()

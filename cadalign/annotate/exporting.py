@@ -11,18 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.objects.listing import shown_objects
-from cadalign.annotate.objects.models import OpenedModel
-from cadalign.annotate.session import PhotoState, Session
-from cadalign.annotate.shape_alignment import LiveShape
+from cadalign.annotate.models import OpenedModel
+from cadalign.annotate.objects import PhotoState, shown_objects
+from cadalign.annotate.session import Session
 from cadalign.datasets.detections.coco import CocoObject, coco_document
 from cadalign.errors import InputError
 from cadalign.estimation.exporting import object_of
-from cadalign.estimation.observed import own_ids, shape_ids
 from cadalign.export import AlignedObject, export_object
 from cadalign.export.photo_sets import AnnotatedPhoto, write_photo_set
 from cadalign.io.files import write_text
-from cadalign.io.observation import Observation
 
 _MARKED = 2  # COCO's flag of a keypoint that is labelled and visible
 
@@ -77,13 +74,6 @@ def _coco_object(image: int, state: PhotoState, category: int, numbers: list[int
     return CocoObject(image, category, uv, flags, rectangle)
 
 
-def _ids(session: Session, observation: Observation) -> list[tuple[Hashable, ...]]:
-    learned = None if session.shape is None else session.shape.learned
-    if learned is None:
-        return [tuple(ids) for ids in own_ids(observation.views)]
-    return [tuple(shape_ids(view, learned)) for view in observation.views]
-
-
 def glb_of(session: Session, number: int, *, slot: int | None = None) -> bytes:
     """The aligned, textured model before its photo; raises InputError without an alignment."""
     with session.lock:
@@ -95,7 +85,7 @@ def glb_of(session: Session, number: int, *, slot: int | None = None) -> bytes:
 
 
 def annotated_photos(session: Session) -> list[AnnotatedPhoto]:
-    """The photos with an alignment, but those that are skipped, as data sets have them."""
+    """The photos with an alignment that are not skipped, for data sets."""
     with session.lock:
         choice = session.choice
         found = []
@@ -104,7 +94,7 @@ def annotated_photos(session: Session) -> list[AnnotatedPhoto]:
             if exported is None or session.work_state(state) == "skipped":
                 continue
             key = None if choice is None else choice.key_of(state.files.model)
-            image = session.further(state).image
+            image = session.observer.image(state).evidence
             photo = AnnotatedPhoto(
                 _named(session, state, exported),
                 state.photo.path,
@@ -134,30 +124,19 @@ def zipped_photo_set(session: Session, form: str) -> bytes:
 def _aligned_object(session: Session, state: PhotoState) -> AlignedObject | None:
     """The model as it is aligned in a photo; None without an alignment."""
     live, _ = session.live(state)
-    observation = session.observed(state)
-    if live.shown is None or observation is None:
+    if live.result is None or live.wireframe is None:
         return None
-    name = state.files.model.stem
-    if not isinstance(live, LiveShape):
-        mesh = state.model.cad.scene.mesh
-        return object_of(live.shown, mesh=mesh, image=state.photo.path, name=name)
-    warped = live.warped.wireframe.scene.mesh if live.warped and session.shape else None
-    images = [view.image for view in observation.views]
-    mesh = warped or state.model.cad.scene.mesh
-    return object_of(live.shown, mesh=mesh, images=images, name=name)
+    mesh = state.model.cad.scene.mesh if session.shape is None else live.wireframe.scene.mesh
+    images = [view.image for view in session.observed(state)[0].views]
+    result = replace(live.result, model=None)  # or the mesh, which is warped, would be once more
+    return object_of(result, mesh=mesh, images=images, name=state.files.model.stem)
 
 
 def _named(session: Session, state: PhotoState, exported: AlignedObject) -> AlignedObject:
     """The object in its photo alone, with its keypoints by name."""
     live, _ = session.live(state)
     names: dict[Hashable, Hashable] = {number: point.name for number, point in state.model.registry}
-    place = 0
-    if isinstance(live, LiveShape):
-        place = live.place
-    else:
-        pairs = state.document.complete_pairs
-        names = {row: names[pair.keypoint] for row, pair in enumerate(pairs)}
-    view = exported.views[place]
+    view = exported.views[live.place]
     view = replace(view, ids=tuple(names.get(each, each) for each in view.ids))
     ids = tuple(names.get(each, each) for each in exported.ids)
     return replace(exported, views=(view,), ids=ids)

@@ -1,67 +1,98 @@
-"""Files of the annotator: an observation for each object, and the model's keypoints.
+"""Files of an object: its observation, which holds all that must last, and its alignment.
 
-Beside the observation `photo.json` there may be
-
-- `photo_fit/fit.json`, the alignment as `cadalign fit` finds and writes it,
-- `photo.unfinished.json`, pairs with only one half placed, and those whose keypoint the category's
-  shape lacks, so that `cadalign fit` could not use them; and those of the object's further photos.
+Beside the observation `photo.json` is `photo_fit/fit.json`, the alignment as `cadalign fit` finds
+and writes it. The observation's field ``unfinished`` has what a fit cannot use: pairs with only one
+half placed, those whose keypoint the category's shape lacks, and further photos without any pair.
+Sessions of earlier versions kept these in a file of their own, `photo.unfinished.json`.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Priors
-from cadalign.annotate.further import FurtherEvidence, known_depths
-from cadalign.annotate.keypoint_registry import KeypointRegistry
-from cadalign.annotate.names import unfinished_file
+from cadalign.annotate.evidence import FurtherEvidence
+from cadalign.annotate.keypoints import KeypointRegistry
+from cadalign.annotate.models import SAME_PLACE, OpenedModel, refuse_other_model
+from cadalign.annotate.names import earlier_unfinished_file
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.objects.unfinished import (
-    RENAME,
-    LeftOut,
-    StoredView,
-    read_unfinished,
-    with_halves,
-    with_unfinished,
-    write_unfinished,
-    written_pair,
-)
 from cadalign.arrays import FloatArray
-from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.errors import DataError
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.result import Result
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (
+    Document,
+    Labelled,
+    NotNegative,
+    PathText,
+    Point2,
+    Positive,
+    convert,
     in_file,
     path_from,
     read_json,
+    within,
     written_path,
 )
+from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
 
 logger = logging.getLogger("cadalign")
 
+_RENAME = "rename it: the annotator writes a file of this name"
+_EARLIER_FORMAT = "cadalign unfinished pairs"
 _OF_THE_OBJECT = (
-    "init",
-    "model",
-    "object",
-    "shape",
-    "size",
-    "symmetry",
-    "fit",
+    *("init", "model", "object", "shape", "size", "symmetry", "fit", "unfinished"),
 )  # fields that are not of one image
-SAME_PLACE = 1e-6
-"""Largest distance of two points that count as one [diagonals]."""
+
+
+class _Half(Labelled, kw_only=True):
+    """Pair with only the photo half or the model half, or both of which are of no use to a fit."""
+
+    uv: Point2 | None = None
+    sigma: Positive | None = None
+    confidence: NotNegative | None = None
+    depth: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if self.uv is None and self.semantic_id is None:
+            raise InputError("uv and semantic_id are both missing", fix="give one of them")
+
+
+class _UnfinishedView(Document):
+    """The pairs of a further photo that the observation lacks, or the photo without any."""
+
+    image: PathText
+    camera: Any  # in the form of `Camera.from_dict`
+    pairs: list[_Half] = msgspec.field(default_factory=list)
+
+
+class _Unfinished(Document):
+    pairs: list[_Half] = msgspec.field(default_factory=list)
+    views: list[_UnfinishedView] = msgspec.field(default_factory=list)
+    format: str = ""  # of the file of earlier versions
+
+
+@dataclass(frozen=True, eq=False)
+class StoredView:
+    """A further photo of an earlier session's annotation."""
+
+    image: Path
+    document: AnnotationDocument
+    camera: Camera
+    evidence: ImageEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,192 +128,64 @@ class AnnotationFiles:
     model: Path
 
     @property
-    def unfinished(self) -> Path:
-        """File of the pairs that the observation lacks."""
-        return unfinished_file(self.observation)
-
-    @property
     def fit(self) -> Path:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
-    @property
-    def written(self) -> tuple[Path, ...]:
-        """The files whose writers exclude each other."""
-        return (self.observation, self.unfinished)
-
-    def read(
-        self, registry: KeypointRegistry, diagonal: float, shape: ObjectShape | None = None
-    ) -> Stored:
-        """Read an earlier session's annotation.
-
-        New model points are added to the registry; ``diagonal`` is that of the model's box.
-        """
-        document, camera, further = AnnotationDocument(), None, FurtherEvidence()
-        fit_options: Mapping[str, Any] = {}
-        views: list[StoredView] = []
+    def read(self, model: OpenedModel, shape: ObjectShape | None = None) -> Stored:
+        """Read an earlier session's annotation; new model points are added to the registry."""
+        registry, tolerance = model.registry, SAME_PLACE * model.cad.diagonal
+        stored = Stored(AnnotationDocument(), None, FurtherEvidence(), {})
         if self.observation.exists():
             observation = self._load()
             further = FurtherEvidence.of(observation, self.image, where=self.observation)
             photo = observation.views[further.place]
-            camera, fit_options = photo.camera, observation.fit_options
-            self._warn_of_options(observation, shape)
-            document = _document_of(photo, registry, diagonal)
-            document = replace(document, name=observation.object_name or "")
-            views = _views_of(further, registry, diagonal)
-        if self.unfinished.exists():
-            unfinished = read_unfinished(self.unfinished)
-            document = with_halves(document, unfinished.pairs, registry)
-            views = with_unfinished(views, unfinished.views, self.unfinished, registry)
+            self._warn_of_options(observation, further, shape)
+            document = replace(
+                _document_of(photo, registry, tolerance), name=observation.object_name or ""
+            )
+            views = tuple(
+                StoredView(
+                    view.image, _document_of(view, registry, tolerance), view.camera, view.evidence
+                )
+                for view in further.others
+                if view.image is not None and view.image.exists()
+            )
+            stored = Stored(document, photo.camera, further, observation.fit_options, views)
+            with in_file(self.observation), within("unfinished"):
+                unfinished: _Unfinished = convert(observation.unfinished or {}, _Unfinished)
+            stored = self._with_unfinished(stored, unfinished, registry)
+        earlier = self._earlier_unfinished()
+        if earlier is not None:
+            stored = self._with_unfinished(stored, earlier, registry)
         self._refuse_other_fit()
-        return Stored(document, camera, further, fit_options, tuple(views))
+        return stored
 
-    def image_of(
-        self, pairs: Sequence[Pair], registry: KeypointRegistry, camera: Camera
-    ) -> ObservedImage:
-        """The photo with some complete pairs."""
-        keypoints = [pair.keypoint for pair in pairs if pair.keypoint is not None]
-        return ObservedImage(
-            points_3d=registry.xyz(keypoints),
-            points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
-            camera=camera,
-            sigma=filled(pair.sigma for pair in pairs),
-            semantic_ids=np.array(keypoints, dtype=np.int64),
-            names=tuple(registry[keypoint].name for keypoint in keypoints),
-            confidences=filled(pair.confidence for pair in pairs),
-            image=self.image,
-            depths=known_depths([pair.depth for pair in pairs]),
-        )
+    def write(self, observation: Observation) -> None:
+        """Write the observation as a whole; raises DataError on failure.
 
-    def observation_of(
-        self,
-        pairs: Sequence[Pair],
-        registry: KeypointRegistry,
-        camera: Camera,
-        fit_options: Mapping[str, Any],
-        further: FurtherEvidence,
-        shape: ObjectShape | None = None,
-        name: str = "",
-    ) -> Observation:
-        """The observation of some complete pairs, of the object of that name."""
-        if shape is not None and shape.sigma is not None:
-            fit_options = {**fit_options, "shape_sigma": shape.sigma}
-        return further.added_to(
-            self.image_of(pairs, registry, camera),
-            model=self.model,
-            fit_options=fit_options,
-            size=further.size,
-            shape=None if shape is None else shape.path,
-            object_name=name or None,
-        )
-
-    def write(
-        self,
-        document: AnnotationDocument,
-        registry: KeypointRegistry,
-        camera: Camera,
-        fit_options: Mapping[str, Any],
-        further: FurtherEvidence,
-        shape: ObjectShape | None = None,
-        unfinished_views: Sequence[Mapping[str, Any]] = (),
-        *,
-        unfinished: LeftOut | None = None,
-    ) -> LeftOut:
-        """Write the photo's observation and other pairs; raises DataError on failure.
-
-        A pair that moves from one file to the other is in both meanwhile: killed at any moment,
-        nothing is lost. ``unfinished_views`` are those of `unfinished_view` of the object's further
-        photos, ``unfinished`` is what the other file has; returns what it has then.
+        Killed at any moment, the file has everything of before or of now.
         """
-        used = known_pairs(document, registry, shape)
-        observation = self.observation_of(
-            used, registry, camera, fit_options, further, shape, document.name
-        )
-        others = tuple(pair for pair in document.pairs if pair not in used)
-        now = LeftOut(others, tuple(unfinished_views))
-        before = unfinished or LeftOut()
-        now_used = {pair.number for pair in used}
-        completed = tuple(pair for pair in before.pairs if pair.number in now_used)
-        left = tuple(view for view in before.views if view not in now.views)
-        if now.pairs or now.views:
-            self._write_unfinished(LeftOut(now.pairs + completed, left + now.views))
+        earlier = self._earlier_unfinished()
         observation.save(self.observation)
-        if completed or left or not (now.pairs or now.views):
-            self._write_unfinished(now)
-        return now
-
-    def _write_unfinished(self, unfinished: LeftOut) -> None:
-        if not unfinished.pairs and not unfinished.views:
-            with writing(self.unfinished):
-                self.unfinished.unlink(missing_ok=True)
-            return
-        write_unfinished(self.unfinished, unfinished)
-
-    def unfinished_view(
-        self,
-        document: AnnotationDocument,
-        registry: KeypointRegistry,
-        camera: Camera,
-        shape: ObjectShape | None,
-    ) -> dict[str, Any]:
-        """A further photo with the pairs that the observation lacks, as written beside it."""
-        used = known_pairs(document, registry, shape)
-        return {
-            "image": written_path(self.image, folder=self.observation.parent),
-            "camera": camera.to_dict(pixel_origin="corner"),
-            "pairs": [written_pair(pair) for pair in document.pairs if pair not in used],
-        }
-
-    def remove(self) -> None:
-        """Remove the files of a deleted object; raises DataError on failure."""
-        for path in (self.observation, self.unfinished, self.fit):
-            with writing(path):
-                path.unlink(missing_ok=True)
-        with suppress(OSError):  # something else is in it
-            self.fit.parent.rmdir()
+        if earlier is not None:
+            _remove(earlier_unfinished_file(self.observation))
 
     def write_fit(self, result: Result | None) -> None:
         """Write the alignment, or remove its file; raises DataError on failure."""
+        if result is None:
+            _remove(self.fit)
+            return
         with writing(self.fit):
-            if result is None:
-                self.fit.unlink(missing_ok=True)
-                return
             self.fit.parent.mkdir(exist_ok=True)
         write_json(self.fit, result.to_dict())
 
-    def _warn_of_options(self, observation: Observation, shape: ObjectShape | None) -> None:
-        """Warn of stored options of the fit that the page does not use."""
-        ours = {} if shape is None else {"shape_sigma": shape.sigma}
-        stored = dict(observation.fit_options)
-        stored.pop("focal_prior", None)
-        if shape is None:
-            # With a prior on the stretch the annotator stores sigma, too.
-            prior = stored.pop("scale_prior_sigma", None)
-            if prior is not None or not observation.is_plain or stored.get("sigma") is None:
-                stored.pop("sigma", None)
-        others = [
-            name
-            for name, value in stored.items()
-            if (name != "sigma" or isinstance(value, float)) and value != ours.get(name)
-        ]
-        if observation.shape is not None and (shape is None or shape.path is None):
-            others.append(f"shape {observation.shape}")
-        if others:
-            logger.warning(
-                "%s: the annotator fits without the stored %s, and replaces the stored options "
-                "at the first change; keep a copy of the file if they matter",
-                *(self.observation, ", ".join(others)),
-            )
-
-    def _refuse_other_fit(self) -> None:
-        """Refuse a file in the alignment's place that is something else, before it is replaced."""
-        folder = self.fit.parent
-        if folder.exists() and not folder.is_dir():
-            raise DataError("not a folder", where=str(folder), fix=RENAME)
-        if self.fit.exists():
-            data = read_json(self.fit)
-            if not isinstance(data, dict) or "alignment" not in data:
-                raise DataError("not an alignment of cadalign", where=str(self.fit), fix=RENAME)
+    def remove(self) -> None:
+        """Remove the files of a deleted object; raises DataError on failure."""
+        for path in (self.observation, self.fit):
+            _remove(path)
+        with suppress(OSError):  # something else is in it
+            self.fit.parent.rmdir()
 
     def _load(self) -> Observation:
         data = read_json(self.observation)
@@ -297,24 +200,89 @@ class AnnotationFiles:
         refuse_other_model(observation.model, self.model, where=self.observation)
         return observation
 
-
-def known_pairs(
-    document: AnnotationDocument, registry: KeypointRegistry, shape: ObjectShape | None
-) -> tuple[Pair, ...]:
-    """Complete pairs whose keypoints the shape knows; all of them without a shape."""
-    return tuple(
-        pair
-        for pair in document.complete_pairs
-        if shape is None or shape.id_of(registry[pair.keypoint or 0]) is not None
-    )
-
-
-def filled(values: Iterable[float | None]) -> FloatArray | None:
-    """The values (n,), 1 where one is missing; None if all are missing."""
-    listed = list(values)
-    if all(value is None for value in listed):
+    def _earlier_unfinished(self) -> _Unfinished | None:
+        """What a file of an earlier version has; None if there is none."""
+        path = earlier_unfinished_file(self.observation)
+        if not path.is_file():
+            return None
+        with suppress(DataError):
+            data = read_json(path)
+            if isinstance(data, dict) and data.get("format") == _EARLIER_FORMAT:
+                with in_file(path):
+                    found: _Unfinished = convert(data, _Unfinished)
+                return found
         return None
-    return np.array([1.0 if value is None else value for value in listed])
+
+    def _with_unfinished(
+        self, stored: Stored, unfinished: _Unfinished, registry: KeypointRegistry
+    ) -> Stored:
+        """An annotation with what the keypoints of its observation lack."""
+        document = _with_halves(stored.document, unfinished.pairs, registry)
+        views = {view.image.resolve(): view for view in stored.views}
+        for number, each in enumerate(unfinished.views):
+            image = path_from(each.image, self.observation.parent)
+            if not image.exists():
+                logger.warning(
+                    "%s: the photo %s is gone, with its unfinished pairs", self.observation, image
+                )
+                continue
+            with in_file(self.observation), within(f"unfinished.views[{number}]"):
+                camera = Camera.from_dict(each.camera)
+            new = StoredView(image, AnnotationDocument(), camera, ImageEvidence())
+            view = views.get(image.resolve(), new)
+            own = _with_halves(view.document, each.pairs, registry)
+            views[image.resolve()] = replace(view, document=own)
+        return replace(stored, document=document, views=tuple(views.values()))
+
+    def _warn_of_options(
+        self, observation: Observation, further: FurtherEvidence, shape: ObjectShape | None
+    ) -> None:
+        """Warn of stored options of the fit that the page does not use."""
+        ours = {"sigma": further.sigma, "shape_sigma": None if shape is None else shape.sigma}
+        stored = dict(observation.fit_options)
+        stored.pop("focal_prior", None)
+        if shape is None and stored.pop("scale_prior_sigma", None) is not None:
+            stored.pop("sigma", None)  # the annotator's own
+        others = [
+            name
+            for name, value in stored.items()
+            if value != ours.get(name) and not (name == "sigma" and not isinstance(value, float))
+        ]
+        if observation.shape is not None and (shape is None or shape.path is None):
+            others.append(f"shape {observation.shape}")
+        if others:
+            logger.warning(
+                "%s: the annotator fits without the stored %s, and replaces the stored options "
+                "at the first change; keep a copy of the file if they matter",
+                *(self.observation, ", ".join(others)),
+            )
+
+    def _refuse_other_fit(self) -> None:
+        """Refuse a file in the alignment's place that is something else, before it is replaced."""
+        folder = self.fit.parent
+        if folder.exists() and not folder.is_dir():
+            raise DataError("not a folder", where=str(folder), fix=_RENAME)
+        if self.fit.exists():
+            data = read_json(self.fit)
+            if not isinstance(data, dict) or "alignment" not in data:
+                raise DataError("not an alignment of cadalign", where=str(self.fit), fix=_RENAME)
+
+
+def written_unfinished(
+    pairs: Sequence[Pair], views: Sequence[Mapping[str, Any]]
+) -> dict[str, Any] | None:
+    """The observation's field of pairs, and of further photos by `written_view`; None for none."""
+    parts = {"pairs": [_written_half(pair) for pair in pairs], "views": list(views)}
+    return {name: part for name, part in parts.items() if part} or None
+
+
+def written_view(files: AnnotationFiles, camera: Camera, pairs: Sequence[Pair]) -> dict[str, Any]:
+    """A further photo with the pairs that the observation has no keypoints for."""
+    return {
+        "image": written_path(files.image, folder=files.observation.parent),
+        "camera": camera.to_dict(pixel_origin="corner"),
+        "pairs": [_written_half(pair) for pair in pairs],
+    }
 
 
 def model_named_in(observation: Path, default: Path) -> Path:
@@ -324,30 +292,43 @@ def model_named_in(observation: Path, default: Path) -> Path:
     return path_from(named, observation.parent) if isinstance(named, str) else default
 
 
-def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
-    """Refuse a file that names another model than the annotated one; raises DataError."""
-    if named is None or named.resolve() == model.resolve():
-        return
-    # In some datasets all meshes have the same file name and differ by their folders.
-    same = named.name == model.name
-    other, ours = (named.resolve(), model.resolve()) if same else (named.name, model.name)
-    raise DataError(
-        f"belongs to the model {other}, not {ours}",
-        where=str(where),
-        fix="give another --observation or --out",
-    )
+def _remove(path: Path) -> None:
+    with writing(path):
+        path.unlink(missing_ok=True)
 
 
-def write_keypoints(
-    path: Path, registry: KeypointRegistry, used: frozenset[int], model: Path
-) -> None:
-    """Write the given keypoints and those in use; raises DataError on failure."""
-    kept = tuple(point for number, point in registry if number in registry.given or number in used)
-    ModelKeypoints(kept, model).save(path)
+def _written_half(pair: Pair) -> dict[str, Any]:
+    fields = {
+        "semantic_id": pair.keypoint,
+        "uv": None if pair.uv is None else list(pair.uv),
+        "sigma": pair.sigma,
+        "confidence": pair.confidence,
+        "depth": pair.depth,
+    }
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def _with_halves(
+    document: AnnotationDocument, halves: Sequence[_Half], registry: KeypointRegistry
+) -> AnnotationDocument:
+    """The document with unfinished pairs, of which some are of no use any more."""
+    placed = {pair.uv for pair in document.pairs}
+    for half in halves:
+        keypoint = half.semantic_id
+        if half.uv in placed and (keypoint is None or keypoint in document.keypoints):
+            continue  # a file of an earlier version, not yet without the pair that was completed
+        if keypoint not in registry or keypoint in document.keypoints:
+            keypoint = None  # it was saved in another pair, or the keypoints file was deleted
+        if half.uv is None and keypoint is None:
+            continue
+        number = document.next_number
+        pair = Pair(number, half.uv, keypoint, half.sigma, half.confidence, half.depth)
+        document = document.append(pair)
+    return document
 
 
 def _document_of(
-    observation: ObservedImage, registry: KeypointRegistry, diagonal: float
+    observation: ObservedImage, registry: KeypointRegistry, tolerance: float
 ) -> AnnotationDocument:
     document = AnnotationDocument()
     ids, names = observation.semantic_ids, observation.names
@@ -362,7 +343,7 @@ def _document_of(
         pair = Pair(
             document.next_number,
             uv=tuple(uv),
-            keypoint=_registered(point, registry, SAME_PLACE * diagonal, document.keypoints),
+            keypoint=_registered(point, registry, tolerance, document.keypoints),
             sigma=_entry(observation.sigma, row),
             confidence=_entry(observation.confidences, row),
             depth=_entry(observation.depths, row),
@@ -389,14 +370,3 @@ def _registered(
         return found
     free = wanted is not None and wanted >= 0 and wanted not in registry
     return registry.add(point if free else replace(point, semantic_id=None))
-
-
-def _views_of(
-    further: FurtherEvidence, registry: KeypointRegistry, diagonal: float
-) -> list[StoredView]:
-    """The other images of an observation that are there, so that they can be annotated."""
-    return [
-        StoredView(view.image, _document_of(view, registry, diagonal), view.camera, view.evidence)
-        for view in further.others
-        if view.image is not None and view.image.exists()
-    ]

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.mirror import MirrorPlanes
-from cadalign.annotate.snapping import CREASE, SnapPoints, find_rim
+from cadalign.annotate.snapping import CREASE, MirrorPlanes, SnapPoints, find_rim
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError

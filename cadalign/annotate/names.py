@@ -23,11 +23,9 @@ from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
 
-UNFINISHED = ".unfinished.json"
-"""Ending of the file of unfinished pairs."""
-
 _MOST_BYTES = 255  # of a file's name, in the common file systems
-_AMBIGUOUS = (UNFINISHED.removesuffix(".json"), SUFFIX.removesuffix(".json"), *ENDINGS)
+_EARLIER_UNFINISHED = ".unfinished.json"
+_AMBIGUOUS = (_EARLIER_UNFINISHED.removesuffix(".json"), SUFFIX.removesuffix(".json"), *ENDINGS)
 _OBJECT = re.compile(r"\.object-([1-9][0-9]*)$")  # at the end of a stem
 _OTHER_FOLDER = "give another --observation or --out"
 
@@ -50,9 +48,9 @@ def keypoints_file(model: Path, folder: Path, *, parents: int = 0) -> Path:
     return folder / file_name(".".join([*parts, model.stem]), SUFFIX)
 
 
-def unfinished_file(observation: Path) -> Path:
-    """Path of the unfinished pairs' file beside an observation."""
-    return observation.with_name(file_name(observation.stem, UNFINISHED))
+def earlier_unfinished_file(observation: Path) -> Path:
+    """Path of the file of unfinished pairs that earlier versions wrote beside an observation."""
+    return observation.with_name(file_name(observation.stem, _EARLIER_UNFINISHED))
 
 
 def mask_file(observation: Path, base: str | None) -> Path:

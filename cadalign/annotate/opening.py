@@ -1,4 +1,4 @@
-"""Opening of a session: photos, model, camera and keypoints are read and checked."""
+"""Opening of a session: photos, models, camera and earlier annotations are read and checked."""
 
 from __future__ import annotations
 
@@ -7,32 +7,43 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from cadalign.annotate.choosing.choice import ModelChoice
-from cadalign.annotate.files import AnnotationFiles, model_named_in
-from cadalign.annotate.further import FurtherEvidence
+import numpy as np
+
+from cadalign.annotate.document import AnnotationDocument, FocalChoice, FurtherView, Priors
+from cadalign.annotate.estimate import LIKELY_STRETCH
+from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
+from cadalign.annotate.files import AnnotationFiles, StoredView, model_named_in
+from cadalign.annotate.history import History, history_path, read_history
+from cadalign.annotate.keypoints import read_proposals
+from cadalign.annotate.library import ModelChoice
+from cadalign.annotate.models import SAME_PLACE, Models
 from cadalign.annotate.names import (
     file_name,
     keypoints_file,
     object_files,
     observation_file,
     refuse_collisions,
-    unfinished_file,
 )
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.objects.models import Models
-from cadalign.annotate.objects.opening import ModelOpener, open_object
-from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.photos import PhotoFile, find_photos, read_camera
-from cadalign.annotate.proposals import read_proposals
+from cadalign.annotate.photos import (
+    Intrinsics,
+    PhotoFile,
+    find_photos,
+    intrinsics_of,
+    read_camera,
+)
 from cadalign.annotate.session import Session
 from cadalign.annotate.worklist import WorkList
-from cadalign.errors import DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
 from cadalign.io.observation_file import SizeFields, read_size
 
 logger = logging.getLogger("cadalign")
+
+_SAME_DIRECTION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -46,8 +57,7 @@ class SessionFiles:
     @property
     def written(self) -> tuple[Path, ...]:
         """Files that the session writes."""
-        unfinished = (unfinished_file(path) for path in self.observations)
-        return (self.keypoints, *self.observations, *unfinished)
+        return (self.keypoints, *self.observations)
 
 
 def find_session_files(options: SessionOptions) -> SessionFiles:
@@ -76,25 +86,28 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
     out = options.out or paths[0].parent
     if observation is not None:
         out = observation.parent
-    observations = [
-        observation_file(photo.path, out) for photo in photos[observation is not None :]
-    ]
-    observations[:0] = [observation] if observation is not None else []
-    keypoints = keypoints_file(options.model, observations[0].parent)
-    files = SessionFiles(tuple(photos), tuple(observations), keypoints)
-    given = [options.keypoints] if options.keypoints not in (None, keypoints) else []
+    given = [] if observation is None else [observation]
+    found = (observation_file(photo.path, out) for photo in photos[len(given) :])
+    observations = (*given, *found)
+    keypoints = keypoints_file(options.model, out)
+    files = SessionFiles(tuple(photos), observations, keypoints)
+    refuse_collisions(files.written, _read_files(options, files))
+    return files
+
+
+def _read_files(options: SessionOptions, files: SessionFiles) -> list[Path]:
+    """The files that a session reads and must not write."""
     read = [
         options.model,
         options.camera,
         options.mask,
         options.detections,
         options.library,
-        *given,
+        None if options.keypoints == files.keypoints else options.keypoints,
         *options.models,
-        *(photo.path for photo in photos),
+        *(photo.path for photo in files.photos),
     ]
-    refuse_collisions(files.written, [path for path in read if path is not None])
-    return files
+    return [path for path in read if path is not None]
 
 
 def open_session(
@@ -110,70 +123,113 @@ def open_session(
     prevent it by a CadalignError.
     """
     files = files or find_session_files(options)
+    folder = files.keypoints.parent
+    shape, choice = ObjectShape.open(options), ModelChoice.open(options)
+    models = Models(
+        [options.model, *options.models],
+        folder,
+        keypoints=options.keypoints,
+        shape=shape,
+        choice=choice,
+    )
     first = files.photos[0]
     size = first.width, first.height
     camera = None if options.camera is None else read_camera(options.camera, size)
-    shape, choice = ObjectShape.open(options), ModelChoice.open(options)
-    opener = ModelOpener(files.keypoints.parent, options.keypoints, shape, choice)
-    models = Models([options.model, *options.models], opener.open)
+    opener = _Opener(options, models, shape)
     objects = [
-        _open_objects(photo, file, options, camera, models, shape, is_first=photo is first)
+        opener.open_photo(photo, file, camera, is_first=photo is first)
         for photo, file in zip(files.photos, files.observations, strict=True)
     ]
     if options.detections is not None:
         found = read_proposals(options.detections, files.photos, models[0].registry)
         for states, proposals in zip(objects, found, strict=True):
             states[0].proposals = proposals
-    worklist = WorkList.open(files.keypoints.parent)
     for view in [view for states in objects for state in states for view in state.views]:
         place = next((row for row in objects if row[0].key == view.key), None)
         if place is None:  # a photo that is nothing but a further view
-            file = observation_file(view.photo.path, files.keypoints.parent)
-            place = _open_objects(view.photo, file, options, None, models, shape)
+            file = observation_file(view.photo.path, folder)
+            place = opener.open_photo(view.photo, file, None)
             objects.append(place)
         place.append(view)
+    worklist = WorkList.open(folder)
     return Session(models, objects, before_saving, worklist, shape, choice, reserve=reserve)
 
 
-def _open_objects(
-    photo: PhotoFile,
-    file: Path,
-    options: SessionOptions,
-    camera: Camera | None,
-    models: Models,
-    shape: ObjectShape | None,
-    *,
-    is_first: bool = False,
-) -> list[PhotoState]:
-    """The objects of a photo, the first one first; options give evidence of the first photo."""
+class _Opener:
+    """Opens the objects of photos with a session's options."""
 
-    def with_options(further: FurtherEvidence) -> FurtherEvidence:
-        return _with_options(further, options) if is_first else further
+    def __init__(self, options: SessionOptions, models: Models, shape: ObjectShape | None) -> None:
+        self._options = options
+        self._models = models
+        self._shape = shape
 
-    model = models[0]
-    if options.library is not None and file.exists():  # another one may have been chosen
-        model = models[models.number_of(model_named_in(file, options.model))]
-    own = AnnotationFiles(file, photo.path, model.path)
-    first = open_object(own, photo, model, camera=camera, shape=shape, with_options=with_options)
-    others = []
-    for path in object_files(file, photo.path):
-        model = models[models.number_of(model_named_in(path, options.model))]
-        further = AnnotationFiles(path, photo.path, model.path)
-        others.append(open_object(further, photo, model, camera=camera, shape=shape))
-    return [first, *others]
+    def open_photo(
+        self, photo: PhotoFile, file: Path, camera: Camera | None, *, is_first: bool = False
+    ) -> list[PhotoState]:
+        """The objects of a photo, the first one first; options give evidence of the first photo."""
+        options, model = self._options, self._options.model
+        if options.library is not None and file.exists():  # another one may have been chosen
+            model = model_named_in(file, model)
+        files = AnnotationFiles(file, photo.path, self._models.of(model).path)
+        states = [self._open_object(files, photo, camera, options if is_first else None)]
+        for path in object_files(file, photo.path):
+            model = self._models.of(model_named_in(path, options.model)).path
+            files = AnnotationFiles(path, photo.path, model)
+            states.append(self._open_object(files, photo, camera))
+        return states
+
+    def _open_object(
+        self,
+        files: AnnotationFiles,
+        photo: PhotoFile,
+        camera: Camera | None,
+        options: SessionOptions | None = None,
+    ) -> PhotoState:
+        """An object in its first photo, and in its further ones; options add evidence."""
+        model = self._models.of(files.model)
+        stored = files.read(model, self._shape)
+        intrinsics, focal = _intrinsics(photo, stored.camera, camera)
+        likely = Priors(LIKELY_STRETCH, intrinsics.likely_focal)
+        priors = stored.priors_or(likely, exif=intrinsics.prior)
+        if self._shape is not None:  # which has a prior of its own on the stretch
+            priors = replace(priors, stretch=None)
+        further = stored.further if options is None else _with_options(stored.further, options)
+        evidence = MarkedEvidence.of(further)
+        document = replace(stored.document, focal=focal, priors=priors, evidence=evidence)
+        state = PhotoState(photo, files, intrinsics, History(document), model, further)
+        for each in stored.views:
+            document = _with_view(state, document, each)
+
+        def is_same(drawn: MarkedEvidence, view: str | None) -> bool:
+            return _is_same(drawn, next((each for each in state.views if each.key == view), state))
+
+        # Of several photos the views' documents are compared as the object's holds them.
+        state.history = History(document)
+        for view in state.views:
+            view.history = state.history
+        history = read_history(
+            history_path(files.observation),
+            document,
+            model.registry,
+            tolerance=SAME_PLACE * model.cad.diagonal,
+            same_evidence=is_same,
+        )
+        for each_state in (state, *state.views):
+            each_state.history = history
+        return state
 
 
 def _with_options(further: FurtherEvidence, options: SessionOptions) -> FurtherEvidence:
     """The evidence with the mask and the lengths that the options give."""
-    if options.mask is None and options.size is None:
+    mask, size = options.mask, options.size
+    if mask is None and size is None:
         return further
     if options.image.is_dir():
         raise InputError(
             "is of a single photo, but a folder is given",
-            where="--size" if options.mask is None else "--mask",
+            where="--size" if mask is None else "--mask",
             fix="give one photo",
         )
-    mask, size = options.mask, options.size
     if mask is not None:
         image = replace(further.image, mask=mask.resolve(), mask_sigma=None)
         further = replace(further, image=image)
@@ -194,3 +250,50 @@ def _readable(paths: list[Path]) -> list[PhotoFile]:
     if not photos:
         raise DataError("none of the photos in this folder can be read", where=str(paths[0].parent))
     return photos
+
+
+def _intrinsics(
+    photo: PhotoFile, own: Camera | None, given: Camera | None
+) -> tuple[Intrinsics, FocalChoice]:
+    """The camera of a photo from its observation, or else the given one."""
+    if own is not None and not own.focal_known:
+        # The file leaves it to be estimated; the given camera's is kept for the user to choose.
+        return intrinsics_of(photo, given or own), FocalChoice(known=False)
+    intrinsics = intrinsics_of(photo, own or given)
+    return intrinsics, FocalChoice(known=intrinsics.calibrated)
+
+
+def _with_view(
+    owner: PhotoState, document: AnnotationDocument, stored: StoredView
+) -> AnnotationDocument:
+    """The object's document with a further photo, of which the state is added to the owner's."""
+    try:
+        photo = PhotoFile.open(stored.image)
+        intrinsics, focal = _intrinsics(photo, stored.camera, None)
+    except CadalignError as error:
+        logger.warning("%s: kept, but not opened: %s", owner.files.observation.name, error)
+        return document
+    view = owner.add_view(photo, intrinsics)
+    view.further = FurtherEvidence(stored.evidence)
+    own = replace(
+        stored.document,
+        focal=focal,
+        priors=Priors(document.priors.stretch, intrinsics.likely_focal),
+        evidence=replace(MarkedEvidence.of(view.further), lengths=document.evidence.lengths),
+    )
+    return replace(document, further_views=(*document.further_views, FurtherView(view.key, own)))
+
+
+def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
+    """True if what was drawn is what an observation file has."""
+    further = state.further
+    mask = None if drawn.mask is None else state.mask_file(drawn.mask.base)
+    ours = drawn.added_to(further, state.camera, mask if further.image.mask is not None else None)
+    if (ours.image.mask, ours.image.mask_sigma) != (further.image.mask, further.image.mask_sigma):
+        return False
+    if state.lead is None and MarkedLengths.of(ours.size) != MarkedLengths.of(further.size):
+        return False
+    one, other = ours.image.up, further.image.up
+    if one is None or other is None:
+        return one is other
+    return bool(np.allclose(one, other, rtol=0, atol=_SAME_DIRECTION))

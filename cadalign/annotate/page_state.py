@@ -1,8 +1,9 @@
-"""State of one photo as the page shows it, as plain data for JSON."""
+"""State of the page as plain data for JSON: one object of a photo, and the list of photos."""
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import asdict
 from typing import Any
 
@@ -10,31 +11,30 @@ import numpy as np
 
 from cadalign.annotate.action import ActionOutcome
 from cadalign.annotate.actions import MIRRORED
-from cadalign.annotate.advice import Marked, present, rank
-from cadalign.annotate.alignment import LIKELY_STRETCH, LiveAlignment
-from cadalign.annotate.drawing import drawing_of_fit, drawing_of_shape
+from cadalign.annotate.drawing import box_of, drawing_of
+from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import MarkedLengths, MaskDrawing, find_up
-from cadalign.annotate.files import filled
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.masks import draw_mask
-from cadalign.annotate.objects.page import objects_state, with_photo_names
+from cadalign.annotate.objects import PhotoState, label_of, shown_objects
+from cadalign.annotate.observing import filled
 from cadalign.annotate.result_text import (
     evidence_text,
     facts_of,
-    facts_of_shape,
     how_text,
     left_text,
     next_best_text,
     notes_of,
 )
-from cadalign.annotate.session import Live, PhotoState, Session
-from cadalign.annotate.shape_alignment import LiveShape
-from cadalign.annotate.suggestion import Suggestion
+from cadalign.annotate.session import Session
+from cadalign.annotate.suggestion import Marked, Suggestion, present, rank
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.geometry.alignment import Alignment
-from cadalign.io.documents import Point3
+from cadalign.errors import CadalignError
+from cadalign.io.documents import Point3, read_json
 from cadalign.io.evidence import LENGTHS
 
 _FOCAL = "With a known focal length, a mask, another photo and lengths are ranked here too."
+_VIEW = re.compile(r"views\[(\d+)\]")
 
 
 def page_state(
@@ -71,12 +71,12 @@ def page_state(
             },
             "selected": outcome.selected,
             "message": outcome.message or _moved(state),
-            "can_undo": state.history.can_undo
+            "can_undo": bool(state.history.before)
             or session.deletions.last(number, at_once=True) is not None,
-            "can_redo": state.history.can_redo,
+            "can_redo": bool(state.history.after),
             "focal": {
                 "known": focal.known,
-                "pixels": round(state.intrinsics.with_focal(focal).fx, 2),
+                "pixels": round(state.camera.fx, 2),
                 "typed": focal.pixels,
                 "note": state.intrinsics.note,
             },
@@ -88,7 +88,7 @@ def page_state(
             "shape": _shape(session, state),
             "alignment": _alignment(session, state, live),
             "suggestion": _suggestion(state, suggestion),
-            **objects_state(session, state),
+            **_objects(session, state),
         }
 
 
@@ -107,7 +107,8 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
             pair.keypoint for pair in pairs if pair.keypoint is not None
         )
     answer: dict[str, Any] = {"revision": revision, "note": "", "now": "", "pieces": []}
-    if not isinstance(live, LiveAlignment) or live.cautious is None or live.provisional:
+    result = live.result
+    if result is None or live.provisional or live.also_used or session.shape is not None:
         return answer
     if not document.focal.known:
         return answer | {"note": _FOCAL}
@@ -115,7 +116,7 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
     sigma = live.sigma * (np.ones(len(pairs)) if given is None else given)
     points_2d = np.array([pair.uv for pair in pairs], dtype=float)
     # Without the lock, for which the next click would wait.
-    ranked = rank(state.model.cad, Marked(points_3d, points_2d, sigma), live.cautious, suggestion)
+    ranked = rank(state.model.cad, Marked(points_3d, points_2d, sigma), result, suggestion)
     name = "" if suggestion is None else _name_of(suggestion)
     pieces = [
         {
@@ -127,15 +128,14 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
         }
         for each in ranked
     ]
-    now = present(live.cautious)
+    now = present(result)
     return answer | {"now": "" if now is None else left_text(now), "pieces": pieces}
 
 
 def _evidence(session: Session, state: PhotoState) -> dict[str, Any]:
     """Marks beside the pairs; ``mask`` changes with the mask, None without one."""
     evidence = state.document.evidence
-    camera = state.intrinsics.with_focal(state.document.focal)
-    found = find_up(evidence.verticals, camera)
+    found = find_up(evidence.verticals, state.camera)
     sigma = evidence.up_sigma_deg if found is None else found[1]
     lengths = evidence.lengths or MarkedLengths()
     return {
@@ -184,7 +184,7 @@ def _moved(state: PhotoState) -> str:
     )
 
 
-def _pairs(session: Session, state: PhotoState, live: Live) -> list[dict[str, Any]]:
+def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
     pairs, row = [], 0
     document = state.document
     used = state.model.registry.xyz(document.keypoints)
@@ -206,7 +206,7 @@ def _pairs(session: Session, state: PhotoState, live: Live) -> list[dict[str, An
             "counts": point is None or session.shape is None or session.shape.knows(point),
         }
         if pair.complete:
-            if live.shown is not None:
+            if live.result is not None:
                 residual = live.residuals[row]
                 entry["residual"] = residual.tolist() if np.isfinite(residual).all() else None
                 entry["off"] = live.outliers.get(row)
@@ -228,18 +228,14 @@ def _mirrored(
     return [float(value) for value in state.model.cad.to_display(point.xyz)]
 
 
-def _expected(session: Session, live: Live, xyz: Point3) -> list[float] | None:
+def _expected(session: Session, live: LiveAlignment, xyz: Point3) -> list[float] | None:
     """Pixel at which the alignment of the stretched model puts a point in the photo."""
-    if session.shape is not None or live.shown is None:
+    if session.shape is not None or live.result is None:
         return None
-    if isinstance(live, LiveShape):
-        camera, alignment = live.camera, live.alignment
-    else:
-        camera, alignment = live.shown.camera, live.shown.alignment
-    in_camera = alignment.apply(np.array([xyz]))
-    if camera is None or not in_camera[0, 2] > 0:
+    in_camera = live.alignment.apply(np.array([xyz]))
+    if not in_camera[0, 2] > 0:
         return None
-    ((u, v),) = camera.project(in_camera).tolist()
+    ((u, v),) = live.camera.project(in_camera).tolist()
     return [u, v]
 
 
@@ -278,52 +274,32 @@ def _shape(session: Session, state: PhotoState) -> dict[str, Any] | None:
     }
 
 
-def _alignment(session: Session, state: PhotoState, live: Live) -> dict[str, Any]:
-    result = live.shown
+def _alignment(session: Session, state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
+    result, cad = live.result, state.model.cad
     if result is None:
-        message = with_photo_names(session, state, live.message)
+        message = _with_photo_names(session, state, live.message)
         return {"status": "none" if session.ready else "preparing", "message": message}
-    if isinstance(live, LiveShape):
-        assert live.camera is not None
-        camera, alignment = live.camera, live.alignment
-        facts = facts_of_shape(live, session.shape)
-        texts = notes_of(live, session.shape)
-        notes = [with_photo_names(session, state, text) for text in texts]
-        used = state.document.keypoints
-        drawing = drawing_of_shape(live, session.shape, state.model.registry, used)
-    else:
-        assert live.cautious is not None
-        camera, alignment = live.cautious.camera, live.cautious.alignment
-        facts, notes = facts_of(live), list(notes_of(live))
-        drawing = drawing_of_fit(live.cautious, state.model.wireframe)
+    camera, alignment = live.camera, live.alignment
+    notes = notes_of(live, session.shape)
+    # The rows of the matrix (4, 4) that places the displayed model; a warped one has none.
+    matrix = np.eye(4)
+    linear = alignment.rotation * alignment.scale
+    matrix[:3, :3] = linear * cad.diagonal
+    matrix[:3, 3] = linear @ cad.center + alignment.translation
     return {
         "status": "done",
         "message": "",
-        "facts": [asdict(fact) for fact in facts],
-        "notes": notes,
+        "facts": [asdict(fact) for fact in facts_of(live, session.shape)],
+        "notes": [_with_photo_names(session, state, note) for note in notes],
         "also_used": ", ".join(live.also_used),
         "alignment": alignment.to_dict(),
-        "eye": state.model.cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
+        "eye": cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
         "focal": camera.fx,
         "intrinsics": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
-        "camera_from_page": _camera_from_page(session, state, alignment),
+        "camera_from_page": matrix.ravel().tolist() if session.shape is None else None,
         "rms": result.rms,
-        **drawing,
+        **drawing_of(live, session.shape, state.model.registry, state.document.keypoints),
     }
-
-
-def _camera_from_page(
-    session: Session, state: PhotoState, alignment: Alignment
-) -> list[float] | None:
-    """The rows of the matrix (4, 4) that places the displayed model; None for a warped one."""
-    if session.shape is not None:
-        return None
-    model = state.model.cad
-    matrix = np.eye(4)
-    linear = alignment.rotation * alignment.scale
-    matrix[:3, :3] = linear * model.diagonal
-    matrix[:3, 3] = linear @ model.center + alignment.translation
-    return [float(value) for value in matrix.ravel()]
 
 
 def _suggestion(state: PhotoState, suggestion: Suggestion | None) -> dict[str, Any] | None:
@@ -340,3 +316,100 @@ def _suggestion(state: PhotoState, suggestion: Suggestion | None) -> dict[str, A
 
 def _name_of(suggestion: Suggestion) -> str:
     return suggestion.point.name or "The marked corner"
+
+
+def _objects(session: Session, state: PhotoState) -> dict[str, Any]:
+    """The photo's objects with their boxes, this object's photos, and what could be added."""
+    number, _ = session.place_of(state)
+    deleted = session.deletions.last(number)
+    photos = [_view(session, view) | {"is_current": view is state} for view in state.all_views]
+    used = {photo["number"] for photo in photos}
+    return {
+        "objects": [
+            _object(session, each) | {"is_current": each is state}
+            for each in shown_objects(session.objects[number])
+        ],
+        "views": photos,
+        "further_photos": [
+            {"number": other, "name": states[0].photo.path.name}
+            for other, states in enumerate(session.objects)
+            if other not in used
+        ],
+        "models": list(session.models.labels),
+        "deleted": None if deleted is None else label_of(deleted),
+    }
+
+
+def _with_photo_names(session: Session, state: PhotoState, text: str) -> str:
+    """A text of the estimate with the photos' names for the views' numbers."""
+    if not _VIEW.search(text):
+        return text
+    images = [view.image for view in session.observed(state)[0].views]
+
+    def name(found: re.Match[str]) -> str:
+        image = images[int(found[1])]
+        return f"view {int(found[1]) + 1}" if image is None else image.name
+
+    return _VIEW.sub(name, text)
+
+
+def _object(session: Session, state: PhotoState) -> dict[str, Any]:
+    """One object of the photo; its box as x1, y1, x2, y2, ... [px]."""
+    live, _ = session.live(state)
+    _, slot = session.place_of(state)
+    return {
+        "object": slot,
+        "label": label_of(state),
+        "name": state.document.name,
+        "model": session.models.labels[session.models.number_of(state.model.path)],
+        "pairs": len(state.document.complete_pairs),
+        "box": box_of(live),
+    }
+
+
+def _view(session: Session, state: PhotoState) -> dict[str, Any]:
+    """One photo of the object."""
+    number, slot = session.place_of(state)
+    return {
+        "number": number,
+        "object": slot,
+        "name": state.photo.path.name,
+        "pairs": len(state.document.complete_pairs),
+        "is_first": state.lead is None,
+    }
+
+
+def worklist_state(session: Session) -> list[dict[str, Any]]:
+    """All photos with their state, objects, number of pairs, and residual.
+
+    The residual is the root mean square of the object whose pairs agree worst [px].
+    """
+    with session.lock:
+        return [_photo(session, number) for number in range(len(session.objects))]
+
+
+def _photo(session: Session, number: int) -> dict[str, Any]:
+    objects = shown_objects(session.objects[number])
+    found = [rms for rms in map(_rms, objects) if rms is not None]
+    return {
+        "number": number,
+        "name": objects[0].photo.path.name,
+        "state": session.work_state(objects[0]),
+        "pairs": sum(len(each.document.complete_pairs) for each in objects),
+        "rms": max(found, default=None),
+        "objects": [
+            {"label": label_of(each), "pairs": len(each.document.complete_pairs), "rms": _rms(each)}
+            for each in objects
+        ],
+    }
+
+
+def _rms(state: PhotoState) -> float | None:
+    """Residual of the saved alignment, which is not computed anew for a list of many photos."""
+    if not state.document.complete_pairs or not state.files.fit.exists():
+        return None
+    try:
+        rms = read_json(state.files.fit).get("rms")
+    except CadalignError:
+        return None
+    return rms if isinstance(rms, float) else None

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 from PIL import ImageOps
 
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.worklist import natural_key
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.export.camera_files import read_camera_views
@@ -79,7 +80,7 @@ class PhotoFile:
 
 
 def find_photos(path: Path) -> list[Path]:
-    """List the photos of a folder by name, numbers in order,, or the given photo."""
+    """List the photos of a folder by name, numbers in order, or the given photo."""
     with reading(path):
         in_folder, exists = path.is_dir(), path.exists()
         entries = list(path.iterdir()) if in_folder else []
@@ -105,7 +106,7 @@ def _is_mask(path: Path, stems: Collection[str]) -> bool:
     stem = path.name.removesuffix(MASK).removesuffix(SECOND_MASK)
     if stem == path.name:
         return False
-    # That of a further object or view has more between the photo's name and the ending.
+    # The mask of a further object or view has more between the photo's name and the ending.
     return any(stem == photo or stem.startswith(f"{photo}.") for photo in stems)
 
 
@@ -186,3 +187,18 @@ def intrinsics_of(photo: PhotoFile, camera: Camera | None) -> Intrinsics:
 
 def _default_focal(width: int, height: int) -> float:
     return max(width, height) / 2 / math.tan(math.radians(_DEFAULT_FOV / 2))
+
+
+def natural_key(name: str) -> tuple[tuple[str, int, str], ...]:
+    """Key that sorts numbers in names by their values.
+
+    Examples
+    --------
+    >>> sorted(["10.png", "9.png", "a2.png", "a10.png"], key=natural_key)
+    ['9.png', '10.png', 'a2.png', 'a10.png']
+    """
+    parts = re.findall(r"\d+|\D+", name)
+    key = tuple(
+        ("", int(part), part) if part.isdecimal() else (part.casefold(), 0, part) for part in parts
+    )
+    return cast(tuple[tuple[str, int, str], ...], key)

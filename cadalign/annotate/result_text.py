@@ -1,4 +1,4 @@
-"""Alignment, standard deviations and next-best keypoint as text for the page."""
+"""Result, standard deviations and next-best keypoint as text for the page."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.annotate.alignment import LiveAlignment
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.annotate.suggestion import NextBest, Unmarked
-from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.advice import LENGTH_SIGMA, TURN_DEG, Advice
 
 UNKNOWNS = (
@@ -23,7 +21,7 @@ UNKNOWNS = (
 """Names of the unknowns of a covariance, for a sentence."""
 _ROTATIONS = 3
 _UNCERTAIN = 1.0  # relative standard deviation beyond which a number is not shown
-_LEFT_OPEN = 0.8  # share of a prior's standard deviation beyond which the pairs tell nothing
+_LEFT_OPEN = 0.8  # share of a prior's standard deviation beyond which the pairs say nothing
 _UNCERTAIN_DEG = 60.0
 _UNDETERMINED = "not determined", "these pairs leave it open"
 
@@ -37,50 +35,27 @@ class Fact:
     note: str
 
 
-def facts_of(live: LiveAlignment) -> tuple[Fact, ...]:
-    """Stretch, pose and residuals, with standard deviations scaled to the residuals."""
-    result = live.cautious
+def facts_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[Fact, ...]:
+    """Stretch or lengths, pose and residuals, with standard deviations."""
+    result = live.result
     if result is None:
         return ()
-    facts = [_stretch(result, axis) for axis in result.stretched_axes]
+    in_lengths = shape is not None or "x" in result.stretched_axes
+    axes = "xyz" if in_lengths else result.stretched_axes
+    facts = [_extent(live, axis, shape, in_lengths=in_lengths) for axis in axes]
     if result.std is not None:
         facts.append(_rotation(result.std.rotation_deg))
-    facts += [_distance(result, None), _focal(result)]
-    if 2 * len(result.residuals) > 6 + len(result.stretched_axes):
-        note = "scaled to the residuals" if live.sigma > 1 else "for clicks of 1 px"
-        if result.options is not None and result.options.scale_prior_sigma is not None:
-            note = f"for points off by {short(live.sigma)} px"
-        note = f"rms; the standard deviations above are {note}"
-        facts.append(Fact("Pairs agree to", f"{short(result.rms)} px", note))
-    return tuple(facts)
-
-
-def facts_of_shape(live: LiveShape, shape: ObjectShape | None) -> tuple[Fact, ...]:
-    """Lengths, pose and residuals, with standard deviations."""
-    result, camera = live.shown, live.camera
-    if result is None or camera is None:
-        return ()
-    facts = [_length(result, axis, float(live.prior_lengths[axis]), shape) for axis in range(3)]
-    if result.std is not None:
-        facts.append(_rotation(result.std.rotation_deg))
-    facts.append(_distance(result, shape))
-    if result.focal == "known":
-        note = "assumed" if live.provisional else "as given"
-        facts.append(Fact("Focal length", f"{camera.fx:.0f} px", note))
-    elif camera == result.camera:
-        facts.append(_focal(result))
-    else:  # that of another lens, whose deviation is not in the covariance
-        facts.append(Fact("Focal length", f"{camera.fx:.0f} px", "estimated"))
-    if live.counts.sum() > 3:
+    facts += [_distance(live, shape), _focal(live)]
+    if 2 * live.counts.sum() > 6 + len(result.stretched_axes):
         off = f"points off by {short(live.sigma)} px" if live.sigma > 1 else "clicks of 1 px"
         note = f"rms; the standard deviations above are for {off}"
         facts.append(Fact("Pairs agree to", f"{short(result.rms)} px", note))
     return tuple(facts)
 
 
-def notes_of(live: LiveAlignment | LiveShape, shape: ObjectShape | None = None) -> tuple[str, ...]:
+def notes_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[str, ...]:
     """Assumptions, pairs that do not count, alternative alignments and warnings."""
-    result = live.shown
+    result = live.result
     if result is None:
         return ()
     notes = [live.message] if live.message else []
@@ -103,8 +78,8 @@ def notes_of(live: LiveAlignment | LiveShape, shape: ObjectShape | None = None) 
 def next_best_text(next_best: NextBest | Unmarked, name: str) -> str:
     """Name of the next-best keypoint, and what is gained by it."""
     if isinstance(next_best, Unmarked):
-        deviation = short(next_best.deviation)
-        return f"{name}: so far known to ± {deviation} px; it would tell most about pose and shape"
+        sigma = short(next_best.sigma)
+        return f"{name}: so far known to ± {sigma} px; it would tell most about pose and shape"
     factor, unit = (100, " %") if next_best.unknown >= _ROTATIONS else (math.degrees(1), "°")
     before, after = (short(factor * std) + unit for std in (next_best.before, next_best.after))
     unknown = UNKNOWNS[next_best.unknown]
@@ -112,7 +87,7 @@ def next_best_text(next_best: NextBest | Unmarked, name: str) -> str:
 
 
 def evidence_text(advice: Advice, keypoint: str) -> str:
-    """One piece of evidence; of keypoints the one of that name."""
+    """One piece of evidence; a keypoint by its name."""
     if advice.kind == "keypoint":
         return keypoint
     if advice.kind == "view":
@@ -147,37 +122,48 @@ def left_text(advice: Advice) -> str:
     return f"stretch along {'xyz'[advice.stretch.index(advice.worst)]} to {percent}"
 
 
-def _stretch(result: Result, axis: str) -> Fact:
-    value = float(result.alignment.scale["xyz".index(axis)])
-    label = f"Stretch along {axis}"
-    std = result.std
-    relative = 0.0 if std is None else std.scale["xyz".index(axis)]
-    if relative > _UNCERTAIN:
+def _extent(live: LiveAlignment, axis: str, shape: ObjectShape | None, *, in_lengths: bool) -> Fact:
+    """Length of the object along an axis, or its stretch."""
+    result, row = live.result, "xyz".index(axis)
+    assert result is not None
+    stretch, relative = float(result.stretch[row]), 0.0
+    if result.std is not None:
+        relative = result.std.scale[row]
+    label, value, unit = f"Stretch along {axis}", stretch, ""
+    if in_lengths:
+        label, unit = f"Length along {axis}", _unit(shape)
+        value = float(np.ptp(result.bounds, axis=0)[row] * result.alignment.scale[row])
+    if not value > 0 or relative > _UNCERTAIN:
         return Fact(label, *_UNDETERMINED)
-    prior = None if result.options is None else result.options.scale_prior_sigma
-    if prior is not None and relative > _LEFT_OPEN * prior:
+    average = "the model" if shape is None else shape.average
+    if relative == 0:
+        return Fact(label, f"{value:.3g}{unit}", f"{average}'s, taken as known")
+    text = f"{value:.3g} ± {short(value * relative)}{unit}"
+    prior = float(live.prior_lengths[row])
+    if prior and relative > _LEFT_OPEN * prior:
+        if in_lengths:
+            return Fact(label, text, f"the pairs leave it open: {average}'s and its spread")
         note = f"the pairs leave it open: about 1 by the prior of ± {100 * prior:.0f} %"
         return Fact(label, "not determined", note)
-    percent = 100 * (value - 1)
+    percent = 100 * (stretch - 1)
+    if abs(percent) < 100 * relative:
+        return Fact(label, text, f"{average}'s length lies within the standard deviation")
     if abs(percent) < 0.5:
-        note = "as long as the model"
-    else:
-        note = f"{abs(percent):.0f} % {'longer' if percent > 0 else 'shorter'} than the model"
-    uncertainty = f" ± {short(value * relative)}" if std is not None else ""
-    if relative > 0 and abs(percent) < 100 * relative:
-        note = "the model's length lies within the standard deviation"
-    return Fact(label, f"{value:.3g}{uncertainty}", note)
+        return Fact(label, text, f"as long as {average}")
+    than = "longer" if percent > 0 else "shorter"
+    return Fact(label, text, f"{abs(percent):.0f} % {than} than {average}")
 
 
-def _rotation(deviation: float) -> Fact:
+def _rotation(sigma: float) -> Fact:
     """Standard deviation of the rotation [degrees]."""
-    if deviation > _UNCERTAIN_DEG:
+    if sigma > _UNCERTAIN_DEG:
         return Fact("Rotation", *_UNDETERMINED)
-    return Fact("Rotation", f"known to ± {short(deviation)}°", "")
+    return Fact("Rotation", f"known to ± {short(sigma)}°", "")
 
 
-def _distance(result: Result, shape: ObjectShape | None) -> Fact:
-    translation, covariance = result.alignment.translation, result.covariance
+def _distance(live: LiveAlignment, shape: ObjectShape | None) -> Fact:
+    assert live.result is not None
+    translation, covariance = live.result.alignment.translation, live.result.covariance
     distance = float(np.linalg.norm(translation))
     learned = None if shape is None else shape.learned
     units = {"m": "", "diagonal": "diagonals of the object's box"}
@@ -185,37 +171,21 @@ def _distance(result: Result, shape: ObjectShape | None) -> Fact:
     if covariance is None or not distance > 0:
         return Fact("Distance", f"{distance:.3g} {note}", "")
     along = translation / distance
-    deviation = math.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0))
-    if deviation > _UNCERTAIN * distance:
+    sigma = math.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0))
+    if sigma > _UNCERTAIN * distance:
         return Fact("Distance", *_UNDETERMINED)
-    return Fact("Distance", f"{distance:.3g} ± {short(deviation)}{_unit(shape)}", note)
+    return Fact("Distance", f"{distance:.3g} ± {short(sigma)}{_unit(shape)}", note)
 
 
-def _length(result: Result, axis: int, prior: float, shape: ObjectShape | None) -> Fact:
-    label, std = f"Length along {'xyz'[axis]}", result.std
-    relative = 0.0 if std is None else std.scale[axis]
-    length = float(np.ptp(result.bounds, axis=0)[axis] * result.alignment.scale[axis])
-    if not length > 0 or relative > _UNCERTAIN:
-        return Fact(label, *_UNDETERMINED)
-    average = "the model" if shape is None else shape.average
-    if relative == 0:
-        return Fact(label, f"{length:.3g}{_unit(shape)}", f"{average}'s, taken as known")
-    value = f"{length:.3g} ± {short(length * relative)}{_unit(shape)}"
-    if prior and relative > _LEFT_OPEN * prior:
-        spread = f"{average}'s and its spread"
-        return Fact(label, value, f"the pairs leave it open: {spread}")
-    percent = 100 * (float(result.stretch[axis]) - 1)
-    if abs(percent) < 100 * relative:
-        return Fact(label, value, f"{average}'s lies within the standard deviation")
-    than = "longer" if percent > 0 else "shorter"
-    return Fact(label, value, f"{abs(percent):.0f} % {than} than {average}'s")
-
-
-def _focal(result: Result) -> Fact:
-    focal, std = result.camera.fx, result.std
-    if std is None or result.focal == "known":
-        return Fact("Focal length", f"{focal:.0f} px", "taken as known")
-    relative = std.focal
+def _focal(live: LiveAlignment) -> Fact:
+    result, focal = live.result, live.camera.fx
+    assert result is not None
+    if result.std is None or result.focal == "known":
+        note = "assumed" if "focal length" in live.message else "taken as known"
+        return Fact("Focal length", f"{focal:.0f} px", note)
+    if live.camera != result.camera:  # another lens, which is not in the covariance
+        return Fact("Focal length", f"{focal:.0f} px", "estimated")
+    relative = result.std.focal
     if relative > _UNCERTAIN:
         return Fact("Focal length", *_UNDETERMINED)
     return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", "estimated")

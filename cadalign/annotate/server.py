@@ -20,15 +20,15 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.choosing.ranking import ranking_state, thumbnail_of
 from cadalign.annotate.claims import Claims
 from cadalign.annotate.exporting import coco_of, glb_of, zipped_photo_set
 from cadalign.annotate.guard import Access, Guard
+from cadalign.annotate.library import thumbnail_of
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
-from cadalign.annotate.page_state import advice_state, mask_pixels, page_state
+from cadalign.annotate.page_state import advice_state, mask_pixels, page_state, worklist_state
+from cadalign.annotate.ranking import ranking_state
 from cadalign.annotate.session import Session
-from cadalign.annotate.worklist_state import worklist_state
 from cadalign.errors import CadalignError, InputError
 from cadalign.errors import quote as quoted
 from cadalign.web import asset

@@ -1,11 +1,14 @@
-"""Snapping of clicks on the model to its corners, creases, silhouette and vertices."""
+"""Points of a model that clicks go to: corners, creases, silhouette, vertices, mirror images."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
+from trimesh.triangles import closest_point
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.geometry.edges import mesh_edges
@@ -20,6 +23,13 @@ _WELD = 1e-6  # distance of vertices in one place [diagonals]
 _JUMP = 0.05  # in depth, that makes a silhouette of one part before another [diagonals]
 _RINGS, _SPOKES = 8, 24
 _BISECTIONS = 14
+_MIRROR_AXES = (0, 2)  # left and right, front and back; y is up
+_MIRROR_SAMPLES = 60_000
+_MIRROR_TESTED = 4_000
+_MIRROR_NEAR = 0.015  # of a mirrored point to the surface [diagonals]
+_MIRROR_SHARE = 0.97  # of the surface that must have its mirror image
+_MIRROR_APART = 0.05  # least distance of a point and its mirror image [diagonals]
+_MIRROR_CANDIDATES = 8  # samples near a point, on whose triangles the nearest one is searched for
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,3 +137,65 @@ def _kinds(xyz: FloatArray, faces: IntArray) -> npt.NDArray[np.int8]:
     kind[degree > 0] = CREASE
     kind[(degree == 1) | (degree > 2) | ((degree == 2) & bent)] = CORNER
     return kind
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorPlanes:
+    """Planes across x or z through the middle of a model that take its surface to itself."""
+
+    triangles: FloatArray  # (m, 3, 3)
+    center: FloatArray
+    diagonal: float
+    axes: tuple[int, ...]
+    _tree: cKDTree
+    _sampled: IntArray  # the triangle of each point of the tree
+
+    @classmethod
+    def of_mesh(cls, mesh: Mesh, center: FloatArray, diagonal: float) -> MirrorPlanes:
+        """Compare samples of the surface with their mirror images."""
+        triangles = mesh.triangles
+        a, b, c = triangles.transpose(1, 0, 2)
+        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        rng = np.random.default_rng(0)
+        if not area.sum() > 0:
+            return cls(triangles, center, diagonal, (), cKDTree(a), np.arange(len(a)))
+        number = rng.choice(len(triangles), _MIRROR_SAMPLES, p=area / area.sum())
+        u, v = rng.random((2, _MIRROR_SAMPLES, 1))
+        flip = u + v > 1
+        u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+        points = a[number] + u * (b - a)[number] + v * (c - a)[number]
+        tree = cKDTree(points)
+        axes = []
+        for axis in _MIRROR_AXES:
+            image = _reflect(points[:_MIRROR_TESTED], axis, center)
+            gaps, _ = tree.query(image)
+            if np.mean(gaps <= _MIRROR_NEAR * diagonal) >= _MIRROR_SHARE:
+                axes.append(axis)
+        return cls(triangles, center, diagonal, tuple(axes), tree, number)
+
+    def image(self, point: Iterable[float]) -> tuple[int, FloatArray] | None:
+        """The mirror image of a point: its triangle and place (3,) on the surface.
+
+        None if the model has no such plane, the point lies on it, or the surface is not there.
+        """
+        xyz = np.array(list(point), dtype=float)
+        for axis in self.axes:
+            wanted = _reflect(xyz[None], axis, self.center)
+            if np.linalg.norm(wanted[0] - xyz) < _MIRROR_APART * self.diagonal:
+                continue
+            _, rows = self._tree.query(wanted[0], k=_MIRROR_CANDIDATES)
+            candidates = np.unique(self._sampled[rows])
+            places: FloatArray = closest_point(  # type: ignore[no-untyped-call]
+                self.triangles[candidates], np.repeat(wanted, len(candidates), axis=0)
+            )
+            gaps = np.linalg.norm(places - wanted, axis=1)
+            best = int(np.argmin(gaps))
+            if gaps[best] <= _MIRROR_NEAR * self.diagonal:
+                return int(candidates[best]), places[best]
+        return None
+
+
+def _reflect(points: FloatArray, axis: int, center: FloatArray) -> FloatArray:
+    image = points.copy()
+    image[:, axis] = 2 * center[axis] - image[:, axis]
+    return image

@@ -1,27 +1,35 @@
-"""Suggestion of the next keypoint to mark: the one that reduces the uncertainty most."""
+"""Next-best evidence: the keypoint that reduces the uncertainty most, and what to add beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Hashable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.annotate.alignment import LiveAlignment
-from cadalign.annotate.keypoint_registry import KeypointRegistry
+from cadalign.annotate.keypoints import KeypointRegistry
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.estimation.uncertainty.prediction import predicted_covariances, projection_jacobian
+from cadalign.errors import CadalignError
+from cadalign.estimation.model import Model
+from cadalign.estimation.result import Result
+from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+from cadalign.estimation.uncertainty.misfit import predicted_covariances, projection_jacobian
+from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import projected_covariances
+from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.views.visibility import visible_keypoints
 
 _BENEATH = 0.02  # depth of visible keypoints beneath the warped surface [diagonals]
 _APART = 0.02  # least distance of a corner from marked points [diagonals]
+_SUGGESTED = "suggested"
+# Of the photo's longer side [px]: segmentation sees no more, and its errors grow with the photo.
+_MASKED_AT = 1280
 
 
 @dataclass(frozen=True)
@@ -39,28 +47,10 @@ class NextBest:
 
 @dataclass(frozen=True)
 class Unmarked:
-    """A keypoint that is not marked, and the standard deviation of its place in the photo [px]."""
+    """The candidate of an own shape, and the standard deviation of its place in the photo [px]."""
 
-    deviation: float
-
-
-@dataclass(frozen=True, eq=False)
-class UncertainPose:
-    """An estimate as far as a suggestion follows from it, its covariance as of `Result`."""
-
-    camera: Camera
-    alignment: Alignment
-    covariance: FloatArray
+    row: int
     sigma: float
-
-    @classmethod
-    def of(cls, live: LiveAlignment) -> UncertainPose | None:
-        """That of the pairs; None without one."""
-        result = live.cautious
-        covariance = None if result is None else result.covariance
-        if result is None or covariance is None:
-            return None
-        return cls(result.camera, result.alignment, covariance, live.sigma)
 
 
 @dataclass(frozen=True)
@@ -73,14 +63,24 @@ class Suggestion:
 
 
 def suggest(
+    live: LiveAlignment,
     model: ClickableModel,
     registry: KeypointRegistry,
     used: Collection[int],
-    estimate: UncertainPose,
+    shape: ObjectShape | None,
 ) -> Suggestion | None:
-    """Choose among the visible keypoints that are not used; if none is left, among corners."""
-    camera, alignment = estimate.camera, estimate.alignment
+    """Choose among the visible keypoints that are not used; if none is left, among corners.
+
+    Nothing is predicted in another photo than the first, nor of a size that is estimated, too.
+    """
+    result = live.result
+    if result is None or live.place or result.covariance is None:
+        return None
     own = [point for number, point in registry if number not in used]
+    if shape is not None:
+        return _suggest_of_shape(live, own, shape)
+    if "x" in result.stretched_axes:
+        return None
     gaps = np.linalg.norm(model.sample_points[:, None] - registry.xyz(used), axis=2)
     apart = (gaps > _APART * model.diagonal).all(axis=1)
     corners = [point for point, far in zip(model.samples, apart.tolist(), strict=True) if far]
@@ -88,51 +88,49 @@ def suggest(
         if not candidates:
             continue
         points = np.array([point.xyz for point in candidates])
-        seen = np.flatnonzero(visible_keypoints(model.scene, points, camera, alignment))
+        seen = np.flatnonzero(visible_keypoints(model.scene, points, live.camera, live.alignment))
         next_best = find_next_best(
-            points[seen], camera, alignment, estimate.covariance, estimate.sigma
+            points[seen], live.camera, live.alignment, result.covariance, live.sigma
         )
         if next_best is not None:
-            chosen = seen[next_best.row]
-            ((u, v),) = camera.project(alignment.apply(points[chosen : chosen + 1])).tolist()
-            return Suggestion(candidates[chosen], (u, v), next_best)
+            chosen = int(seen[next_best.row])
+            return _predicted(live, candidates[chosen], points[chosen], next_best)
     return None
 
 
-def suggest_of_shape(
-    live: LiveShape, shape: ObjectShape, registry: KeypointRegistry, used: Collection[int]
+def _suggest_of_shape(
+    live: LiveAlignment, own: Sequence[ModelKeypoint], shape: ObjectShape
 ) -> Suggestion | None:
     """Choose the visible keypoint whose measurement tells most about pose and shape.
 
     That is its mutual information with them, log det(I + C / sigma^2) / 2 for the predicted
     covariance C of its place in the photo.
     """
-    result, camera, warped = live.shown, live.camera, live.warped
-    if result is None or camera is None or warped is None or live.place:
+    result, lines = live.result, live.wireframe
+    if result is None or lines is None or result.points_cam_covariance is None:
         return None
-    of_points = result.points_cam_covariance
-    if of_points is None:
-        return None
-    own = {
-        shape.id_of(point): point
-        for number, point in registry
-        if number not in used and shape.id_of(point) in result.ids
-    }
-    rows = np.array([row for row, label in enumerate(result.ids) if label in own], dtype=np.int64)
-    points = result.points_3d[rows]
-    seen = visible_keypoints(
-        warped.wireframe.scene, points, camera, result.alignment, tolerance=_BENEATH
-    )
+    by_id: dict[Hashable, ModelKeypoint] = {shape.id_of(point): point for point in own}
+    rows = np.array([row for row, each in enumerate(result.ids) if each in by_id], dtype=np.int64)
+    points, pose = result.points_3d[rows], result.alignment
+    seen = visible_keypoints(lines.scene, points, live.camera, pose, tolerance=_BENEATH)
     rows = rows[seen]
     if not len(rows):
         return None
-    in_camera = result.alignment.apply(result.points_3d[rows])
-    covariances = projected_covariances(in_camera, of_points[rows], camera)
+    in_camera = pose.apply(result.points_3d[rows])
+    of_points = result.points_cam_covariance[rows]
+    covariances = projected_covariances(in_camera, of_points, live.camera)
     gain = np.linalg.slogdet(np.eye(2) + covariances / live.sigma**2)[1]
     best = int(np.argmax(np.round(gain, 9)))
-    ((u, v),) = camera.project(in_camera[best : best + 1]).tolist()
-    deviation = float(np.sqrt(np.trace(covariances[best])))
-    return Suggestion(own[result.ids[rows[best]]], (u, v), Unmarked(deviation))
+    unmarked = Unmarked(best, float(np.sqrt(np.trace(covariances[best]))))
+    chosen = int(rows[best])
+    return _predicted(live, by_id[result.ids[chosen]], result.points_3d[chosen], unmarked)
+
+
+def _predicted(
+    live: LiveAlignment, point: ModelKeypoint, xyz: FloatArray, next_best: NextBest | Unmarked
+) -> Suggestion:
+    ((u, v),) = live.camera.project(live.alignment.apply(xyz[None])).tolist()
+    return Suggestion(point, (u, v), next_best)
 
 
 def find_next_best(
@@ -178,3 +176,88 @@ def updated_variances(
     gain = covariance @ jacobian.transpose(0, 2, 1)
     shrunk = np.einsum("nka,nab,nkb->nk", gain, np.linalg.inv(innovation), gain)
     return np.asarray(covariance.diagonal() - shrunk)
+
+
+@dataclass(frozen=True, eq=False)
+class Marked:
+    """The pairs of a photo as they are aligned: (n, 3) model units, (n, 2) and (n,) px."""
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    sigma: FloatArray
+
+
+def rank(
+    model: ClickableModel, marked: Marked, result: Result, suggestion: Suggestion | None
+) -> tuple[Advice, ...]:
+    """Rank the suggested keypoint, a mask, another photo and lengths; empty if nothing is known.
+
+    The pairs count as much as the standard deviations of the result say, which are calibrated for
+    few of them. Masks are predicted for a photo of at most 1280 px.
+    """
+    scene, alignment = model.light_scene, result.alignment
+    times = max(1.0, max(result.camera.width, result.camera.height) / _MASKED_AT)
+    camera = _reduced(result.camera, times)
+    ids = tuple(range(len(marked.points_3d)))
+    suggested = [] if suggestion is None else [suggestion.point.xyz]
+    candidates = (_SUGGESTED,) * len(suggested)
+    exact = Model(
+        points_3d=np.vstack([marked.points_3d, *suggested]),
+        ids=(*ids, *candidates),
+        bounds=model.scene.bounds,
+        mesh=scene.mesh,
+        scale_prior_sigma=None if result.options is None else result.options.scale_prior_sigma,
+    )
+    sigma = _widening(result) * marked.sigma / times
+    view = View(camera, _reduced_pixels(marked.points_2d, times), ids=ids, sigma=sigma)
+    mask = cast_geometry(scene, camera, alignment).mask
+    # No contour is seen of an object beyond the image's borders.
+    for given in (mask, None):
+        try:
+            ranked = rank_evidence(exact, view, alignment, candidates=candidates, mask=given)
+        except CadalignError:
+            continue
+        return tuple(each for each in ranked if np.isfinite(each.worst))
+    return ()
+
+
+def present(result: Result) -> Advice | None:
+    """The standard deviations as they are, without any addition."""
+    std = result.std
+    if std is None:
+        return None
+    distance = float(np.linalg.norm(result.alignment.translation))
+    position = float(np.linalg.norm(std.translation)) / distance
+    return Advice("nothing", "", std.rotation_deg, position, std.scale)
+
+
+def warm_up_advice(points_3d: FloatArray, view: View, alignment: Alignment) -> None:
+    """Compile or load what `rank` calls, by ranking what would help an alignment."""
+    rank_evidence(Model(points_3d=points_3d), view, alignment)
+
+
+def _reduced(camera: Camera, times: float) -> Camera:
+    """The camera of the photo at 1 / times its size."""
+    ((cx, cy),) = _reduced_pixels(np.array([[camera.cx, camera.cy]]), times).tolist()
+    return replace(
+        camera,
+        width=max(1, round(camera.width / times)),
+        height=max(1, round(camera.height / times)),
+        fx=camera.fx / times,
+        fy=camera.fy / times,
+        cx=cx,
+        cy=cy,
+    )
+
+
+def _reduced_pixels(pixels: FloatArray, times: float) -> FloatArray:
+    return np.asarray((pixels + 0.5) / times - 0.5)
+
+
+def _widening(result: Result) -> float:
+    """Mean ratio of the stated standard deviations to those of the linearised problem."""
+    linear, calibrated = result.fisher_covariance, result.covariance
+    if linear is None or calibrated is None:
+        return 1.0
+    known = linear.diagonal() > 0
+    return float(np.sqrt(np.mean(calibrated.diagonal()[known] / linear.diagonal()[known])))

@@ -1,4 +1,4 @@
-"""Wireframe of a stretched or warped model over a photo: creases, borders and silhouette edges."""
+"""Lines of a stretched or warped model over a photo: creases, borders and silhouette edges."""
 
 from __future__ import annotations
 

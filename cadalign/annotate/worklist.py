@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 from cadalign.errors import DataError
 from cadalign.io.documents import Document, read_document
@@ -53,18 +52,3 @@ class WorkList:
             marks[photo] = mark
         write_json(self.path, {"format": _FORMAT, "photos": dict(sorted(marks.items()))})
         return WorkList(self.path, marks)
-
-
-def natural_key(name: str) -> tuple[tuple[str, int, str], ...]:
-    """Key that sorts numbers in names by their values.
-
-    Examples
-    --------
-    >>> sorted(["10.png", "9.png", "a2.png", "a10.png"], key=natural_key)
-    ['9.png', '10.png', 'a2.png', 'a10.png']
-    """
-    parts = re.findall(r"\d+|\D+", name)
-    key = tuple(
-        ("", int(part), part) if part.isdecimal() else (part.casefold(), 0, part) for part in parts
-    )
-    return cast(tuple[tuple[str, int, str], ...], key)

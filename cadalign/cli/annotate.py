@@ -67,7 +67,7 @@ class Annotate(FileOptions):
         for name, given in (("image", self.image), ("model", self.model)):
             path = given if given is not None else (files.pop(0) if files else None)
             if path is None and name == "model" and self.library is not None:
-                from cadalign.annotate.choosing.choice import starting_model
+                from cadalign.annotate.library import starting_model
 
                 path = starting_model(self, found["image"])
             if path is None:

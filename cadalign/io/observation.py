@@ -31,7 +31,8 @@ relative to the file. ``fit`` holds options for `cadalign.fit` where they are no
 the first photo's EXIF data, unless another photo's differ); and ``shape_sigma`` of
 `cadalign.Model`, for a model that is only similar.
 
-``object`` is the object's name, to tell the objects of a photo apart.
+``object`` is the object's name, to tell the objects of a photo apart. ``unfinished`` has what an
+annotator has marked and a fit cannot use, such as a point of the photo without one of the model.
 
 ``symmetry`` says what takes the model to itself, in any form of `cadalign.Symmetry.from_dict`:
 ``"__SYM_ROTATE_UP_4"``, ``{"axis": [0, 1, 0], "fold": null}``, or BOP's lists.
@@ -117,6 +118,8 @@ class Observation(ObservedImage):
         Where to start, as for `cadalign.align`.
     object_name : str, optional
         Name of the object.
+    unfinished : mapping, optional
+        What is marked and cannot be used yet, for the annotator.
     """
 
     model: Path | None = None
@@ -127,6 +130,7 @@ class Observation(ObservedImage):
     symmetry: Symmetry | None = field(default=None, kw_only=True)
     init: Alignment | None = field(default=None, kw_only=True)
     object_name: str | None = field(default=None, kw_only=True)
+    unfinished: Mapping[str, Any] | None = field(default=None, kw_only=True)
 
     @property
     def views(self) -> tuple[ObservedImage, ...]:
@@ -188,6 +192,7 @@ class Observation(ObservedImage):
             symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
             init=read_start(read.init),
             object_name=read.object,
+            unfinished=read.unfinished,
         )
 
     def to_dict(
@@ -212,6 +217,8 @@ class Observation(ObservedImage):
             data["symmetry"] = self.symmetry.to_dict()
         if self.init is not None:
             data["init"] = self.init.to_dict()
+        if self.unfinished:
+            data["unfinished"] = dict(self.unfinished)
         if self.fit_options:
             data["fit"] = dict(self.fit_options)
         return data

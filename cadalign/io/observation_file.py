@@ -113,6 +113,7 @@ class OneView(_ImageFields, kw_only=True):
     size: SizeFields | None = None
     object: Text | None = None
     symmetry: Any = None  # in a form of `Symmetry.from_dict`
+    unfinished: Any = None  # the annotator's
     init: StartFields | None = None
     fit: FitFields = msgspec.field(default_factory=FitFields)
 
@@ -132,6 +133,7 @@ class SeveralViews(Document, kw_only=True):
     size: SizeFields | None = None
     object: Text | None = None
     symmetry: Any = None  # in a form of `Symmetry.from_dict`
+    unfinished: Any = None  # the annotator's
     init: StartFields | None = None
     fit: FitFields = msgspec.field(default_factory=FitFields)
 

@@ -14,12 +14,13 @@ from support.annotating import Case, place_all, served
 
 from cadalign import Camera, Model, View
 from cadalign.annotate.actions import perform
-from cadalign.annotate.advice import Marked, rank
-from cadalign.annotate.alignment import LIKELY_STRETCH, LiveAlignment
+from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.guard import TOKEN_HEADER
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import advice_state, page_state
 from cadalign.annotate.result_text import evidence_text, left_text
 from cadalign.annotate.session import Session
+from cadalign.annotate.suggestion import Marked, rank
 from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
 from cadalign.render import cast_geometry
 
@@ -44,10 +45,10 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
     keypoints, uv = zip(*case.clicks[:6], strict=True)
     live, suggestion = session.live(session.photos[0])
     assert suggestion is not None
-    assert live.shown is not None
-    alignment, camera = live.shown.alignment, case.instance.camera
+    assert live.result is not None
+    alignment, camera = live.result.alignment, case.instance.camera
     # The pairs' deviations as the page shows them, calibrated for few pairs.
-    stated, raw = live.shown.covariance.diagonal(), live.shown.fisher_covariance.diagonal()
+    stated, raw = live.result.covariance.diagonal(), live.result.fisher_covariance.diagonal()
     sigma = live.sigma * np.sqrt((stated[raw > 0] / raw[raw > 0]).mean())
     wanted = rank_evidence(
         Model(
@@ -66,7 +67,7 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
     assert [kind for kind, _ in found] == [each.kind for each in wanted]
     assert [worst for _, worst in found] == pytest.approx([each.worst for each in wanted])
     # What is left is less than what there is.
-    shown = live.shown.std
+    shown = live.result.std
     assert answer["now"] == f"rotation to ± {shown.rotation_deg:.2g}°"
     assert wanted[-1].worst <= 1.01 * np.radians(shown.rotation_deg)
     names = {each["kind"]: each["what"] for each in answer["pieces"]}
@@ -79,7 +80,7 @@ def test_photo_of_any_size_gives_the_same_ranking(case: Case) -> None:
     place_all(session, case, count=6)
     live, suggestion = session.live(session.photos[0])
     assert isinstance(live, LiveAlignment)
-    assert live.cautious is not None
+    assert live.result is not None
     points_3d = session.registry.xyz(keypoint for keypoint, _ in case.clicks[:6])
     found = []
     for times in (2, 6):
@@ -92,10 +93,10 @@ def test_photo_of_any_size_gives_the_same_ranking(case: Case) -> None:
             camera.cx * times + (times - 1) / 2,
             camera.cy * times + (times - 1) / 2,
         )
-        points_2d = large.project(live.cautious.alignment.apply(points_3d))
+        points_2d = large.project(live.result.alignment.apply(points_3d))
         marked = Marked(points_3d, points_2d, np.full(6, float(times)))
-        (view,) = live.cautious.views
-        result = replace(live.cautious, views=(replace(view, camera=large),))
+        (view,) = live.result.views
+        result = replace(live.result, views=(replace(view, camera=large),))
         found.append(rank(session.model, marked, result, suggestion))
     assert [each.kind for each in found[0]] == [each.kind for each in found[1]]
     worst = [[each.worst for each in one] for one in found]

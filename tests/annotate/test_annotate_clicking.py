@@ -12,12 +12,12 @@ from playwright.sync_api import Browser, Page
 from support.annotating import IDLE, Case, opened_page, place, place_all, wait
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.history_file import history_path
-from cadalign.annotate.image_corners import nearest_corner
-from cadalign.annotate.mirror import MirrorPlanes
+from cadalign.annotate.history import history_path
+from cadalign.annotate.masks import nearest_corner
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
+from cadalign.annotate.snapping import MirrorPlanes
 from cadalign.errors import CadalignError
 from cadalign.geometry.mesh import Mesh
 
@@ -210,7 +210,7 @@ def test_undo_and_numbers_survive_a_restart(case: Case) -> None:
     assert [pair.number for pair in again.photos[0].document.pairs] == [1, 2, 3, 4, 5, 6]
     placed = again.registry[again.photos[0].document.pair(6).keypoint or 0]
     assert placed.xyz == session.registry[placed.semantic_id or 0].xyz
-    while again.photos[0].history.can_undo:
+    while again.photos[0].history.before:
         perform(again, 0, {"do": "undo"})
     assert again.photos[0].document.pairs == ()
 

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign.annotate.document import AnnotationDocument, FocalChoice, History, Pair
-from cadalign.annotate.keypoint_registry import KeypointRegistry
+from cadalign.annotate.document import AnnotationDocument, FocalChoice, Pair
+from cadalign.annotate.history import History
+from cadalign.annotate.keypoints import KeypointRegistry
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 
@@ -103,7 +104,7 @@ def test_undo_leads_back_through_every_document_and_redo_forth(
     for expected in documents[-2::-1]:
         assert history.undo()
         assert history.document is expected
-    assert not history.can_undo
+    assert not history.before
     assert not history.undo()
     for expected in documents[1:]:
         assert history.redo()
@@ -127,7 +128,7 @@ def test_an_edit_after_an_undo_forgets_what_was_undone() -> None:
     history.record(EMPTY.place_uv((1.0, 1.0))[0])
     history.undo()
     history.record(EMPTY.place_uv((2.0, 2.0))[0])
-    assert not history.can_redo
+    assert not history.after
 
 
 def test_moves_of_one_gesture_are_undone_together() -> None:
@@ -139,7 +140,7 @@ def test_moves_of_one_gesture_are_undone_together() -> None:
     assert history.document.pair(pair).uv == (2.0, 0.0)
     history.undo()
     assert history.document is placed
-    assert not history.can_undo
+    assert not history.before
 
 
 # --- the model's keypoints -------------------------------------------------------------------

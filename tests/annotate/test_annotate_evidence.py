@@ -12,10 +12,10 @@ from support.annotating import Case, flat, place_all
 
 from cadalign import Size, Symmetry, View, align
 from cadalign.annotate.actions import perform
-from cadalign.annotate.alignment import LIKELY_STRETCH
-from cadalign.annotate.further import FurtherEvidence
+from cadalign.annotate.estimate import LIKELY_STRETCH
+from cadalign.annotate.evidence import FurtherEvidence
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
@@ -105,11 +105,11 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
     assert after == before
 
     live, _ = session.live(state)
-    assert isinstance(live, LiveShape)
-    assert live.shown is not None
+    assert isinstance(live, LiveAlignment)
+    assert live.result is not None
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
     command = json.loads(capsys.readouterr().out)
-    page = live.shown.to_dict()
+    page = live.result.to_dict()
     for name in ("alignment", "covariance", "std", "stretch", "points_3d"):
         np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
     assert page["warnings"] == command["warnings"]
@@ -148,7 +148,7 @@ def test_second_view_is_annotated_in_its_place(case: Case) -> None:
     replace(other, others=(replace(whole, others=()),)).save(case.observation)
     session = case.open(keypoints=None)
     live, _ = session.live(session.photos[0])
-    assert isinstance(live, LiveShape)
+    assert isinstance(live, LiveAlignment)
     assert live.place == 1
     assert np.abs(live.residuals).max() < 10
     perform(session, 0, {"do": "move", "pair": 1, "uv": [200, 200]})
@@ -185,7 +185,7 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
     )
     from cadalign import Model
 
-    assert isinstance(live, LiveShape)
+    assert isinstance(live, LiveAlignment)
     assert stored(case)["fit"]["sigma"] == live.sigma > 1
     model = Model(
         points_3d=points,
@@ -194,8 +194,8 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
         scale_prior_sigma=LIKELY_STRETCH,
     )
     expected = align(model, view, size=Size(**whole.size.given))
-    assert live.shown is not None
-    np.testing.assert_allclose(live.shown.covariance, expected.covariance, rtol=1e-9)
+    assert live.result is not None
+    np.testing.assert_allclose(live.result.covariance, expected.covariance, rtol=1e-9)
 
 
 def test_options_of_a_single_photo_are_refused_for_a_folder(case: Case) -> None:

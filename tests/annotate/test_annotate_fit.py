@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,29 +12,57 @@ from hypothesis import strategies as st
 from support.problems import problem_of
 
 from cadalign import Alignment, Camera, fit
-from cadalign.annotate.alignment import Intrinsics, LiveAlignment, align
 from cadalign.annotate.document import FocalChoice
+from cadalign.annotate.estimate import Estimate, Known
+from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
+from cadalign.annotate.model import ClickableModel
+from cadalign.annotate.photos import Intrinsics
 from cadalign.annotate.result_text import UNKNOWNS, facts_of, next_best_text, notes_of
 from cadalign.annotate.suggestion import NextBest, find_next_best, updated_variances
-from cadalign.errors import InputError
-from cadalign.estimation.uncertainty.prediction import projection_jacobian
+from cadalign.annotate.wireframe import Wireframe
+from cadalign.datasets import ModelKeypoint
+from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.evaluation.simulation.problems import Problem
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.observation import Observation
 
 KNOWN = FocalChoice(known=True)
 UNKNOWN = FocalChoice(known=False)
+BOX = Mesh(
+    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]],
+)
 LENS_CAMERA = Camera(640, 480, 300.0, 310.0, 310.0, 250.0, (-0.2, 0.05, 0.003, -0.002))
 
 
 def live_of(
-    problem: Problem, *, choice: FocalChoice = KNOWN, points_2d: np.ndarray | None = None
+    problem: Problem,
+    *,
+    choice: FocalChoice = KNOWN,
+    points_2d: np.ndarray | None = None,
+    intrinsics: Intrinsics | None = None,
+    stretch: float | None = None,
 ) -> LiveAlignment:
-    return align(
+    """The live alignment of a problem's pairs, as a session makes it."""
+    intrinsics = intrinsics or Intrinsics(problem.camera, calibrated=True)
+    count = len(problem.points_3d)
+    observation = Observation(
         problem.points_3d,
         problem.points_2d if points_2d is None else points_2d,
-        None,
-        Intrinsics(problem.camera, calibrated=True),
-        choice,
+        intrinsics.with_focal(choice),
+        semantic_ids=np.arange(count),
     )
+    known = Known(
+        None, BOX, stretch=stretch, estimates_focal=not choice.known, focal_prior=intrinsics.prior
+    )
+    points = [
+        ModelKeypoint(f"point {row}", xyz, row)
+        for row, xyz in enumerate(map(tuple, problem.points_3d.tolist()))
+    ]
+    estimate = Estimate.of(known, observation)
+    lines = Wireframe.of_model(ClickableModel(BOX))
+    return live_alignment(estimate, known, lines, observation, 0, points, observation.points_2d)
 
 
 # --- the alignment ---------------------------------------------------------------------------
@@ -57,27 +86,21 @@ def test_is_what_fit_finds() -> None:
     ],
 )
 def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
-    problem = problem_of(0, points=6, noise_px=1.0)
-    few = Problem(
-        problem.points_3d[:points],
-        problem.points_2d[:points],
-        problem.camera,
-        problem.alignment,
-        None,
-    )
-    live = live_of(few)
-    assert live.result is None
-    assert live.message == message
+    counts = np.ones(points, dtype=bool)
+    assert missing_text(counts, None, is_plain=True, has_others=False) == message
+    assert missing_text(np.ones(4, dtype=bool), None, is_plain=True, has_others=False) == ""
+    beside = missing_text(np.ones(2, dtype=bool), None, is_plain=False, has_others=True)
+    assert beside == "1 more pair to the first alignment of this photo"
 
 
 def test_standard_deviations_scale_with_the_residuals() -> None:
     problem = problem_of(3, points=12, noise_px=8.0)
     live = live_of(problem)
     assert live.result is not None
-    assert live.cautious is not None
     assert 4 < live.sigma < 14
-    wider = live.result.fisher_covariance * live.sigma**2
-    np.testing.assert_allclose(live.cautious.fisher_covariance, wider)
+    at_one = fit(problem.points_3d, problem.points_2d, problem.camera)
+    wider = at_one.fisher_covariance * live.sigma**2
+    np.testing.assert_allclose(live.result.fisher_covariance, wider)
     similar = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=None)
     assert similar.sigma == pytest.approx(live.sigma, rel=1e-6)
     assert live_of(problem_of(3, points=12, noise_px=0.01)).sigma == 1.0
@@ -87,7 +110,7 @@ def test_pairs_in_one_plane_give_a_provisional_alignment_that_says_so() -> None:
     problem = problem_of(1, points=6, noise_px=1.0)
     flat = problem.points_3d * [1, 1, 0]
     points_2d = problem.camera.project(problem.alignment.apply(flat))
-    live = align(flat, points_2d, None, Intrinsics(problem.camera, calibrated=True), KNOWN)
+    live = live_of(replace(problem, points_3d=flat, points_2d=points_2d))
     assert live.provisional
     assert live.result is not None
     assert live.message.startswith("The stretch shown is assumed: the scale s_z is not determined")
@@ -95,22 +118,16 @@ def test_pairs_in_one_plane_give_a_provisional_alignment_that_says_so() -> None:
 
 
 def test_coinciding_pairs_give_no_alignment() -> None:
-    live = align(
-        np.zeros((5, 3)),
-        np.full((5, 2), 100.0),
-        None,
-        Intrinsics(problem_of(0, points=4, noise_px=1.0).camera, calibrated=True),
-        KNOWN,
-    )
-    assert live.result is None
-    assert live.message.startswith("No alignment")
+    problem = problem_of(0, points=5, noise_px=1.0)
+    same = replace(problem, points_3d=np.zeros((5, 3)), points_2d=np.full((5, 2), 100.0))
+    with pytest.raises(DegenerateError):
+        live_of(same)
 
 
 def test_unknown_focal_length_is_estimated_from_the_fifth_pair_on() -> None:
     problem = problem_of(5, points=12, noise_px=0.3)
     intrinsics = Intrinsics(problem.camera.with_focal(500.0), calibrated=False)
-    live = align(problem.points_3d, problem.points_2d, None, intrinsics, UNKNOWN)
-    assert live.result is not None
+    live = live_of(problem, choice=UNKNOWN, intrinsics=intrinsics)
     assert live.result is not None
     expected = fit(
         problem.points_3d, problem.points_2d, Camera.without_focal(640, 480), focal="estimate"
@@ -119,11 +136,12 @@ def test_unknown_focal_length_is_estimated_from_the_fifth_pair_on() -> None:
     assert live.result.camera == expected.camera
     assert live.result.camera.fx == pytest.approx(150, rel=5 * expected.std.focal)
     assert not live.provisional
-    four = align(problem.points_3d[:4], problem.points_2d[:4], None, intrinsics, UNKNOWN)
+    few = replace(problem, points_3d=problem.points_3d[:4], points_2d=problem.points_2d[:4])
+    four = live_of(few, choice=UNKNOWN, intrinsics=intrinsics)
     assert four.provisional
     assert four.result.camera == intrinsics.camera
     assert four.message == (
-        "With 4 pairs the focal length is assumed; it is estimated from 5 pairs on."
+        "The focal length is assumed: add a pair elsewhere to have it estimated."
     )
 
 
@@ -315,7 +333,7 @@ def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> Non
     assert facts["Focal length"].value == "150 px"
     assert facts["Rotation"].value.startswith("known to ± ")
     assert facts["Pairs agree to"].value.endswith(" px")
-    assert facts_of(LiveAlignment.missing("")) == ()
+    assert facts_of(LiveAlignment()) == ()
 
 
 def test_estimated_focal_length_has_a_standard_deviation() -> None:
@@ -333,7 +351,7 @@ def test_notes_name_alternatives_and_weak_stretches() -> None:
     assert any("one more pair tells them apart" in note for note in notes)
     weak = problem_of(7, points=12, noise_px=15.0)
     assert any("is known only to ± " in note for note in notes_of(live_of(weak)))
-    assert notes_of(LiveAlignment.missing("wait")) == ()
+    assert notes_of(LiveAlignment(message="wait")) == ()
 
 
 def test_text_names_point_and_gain() -> None:

@@ -11,8 +11,6 @@ from support.annotating import Case, place_all
 from support.killing import content, kill_at_random
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.document import Pair
-from cadalign.annotate.objects.unfinished import LeftOut
 from cadalign.annotate.page_state import page_state
 from cadalign.io import files
 
@@ -79,11 +77,17 @@ def test_stopped_before_any_write_an_action_is_done_or_not(
     pytest.fail("it never came to an end")
 
 
-def test_a_pair_that_is_in_both_files_is_one(case: Case) -> None:
+def test_unfinished_pairs_of_an_earlier_version_are_taken_over(case: Case) -> None:
+    """They had a file of their own, which may still have a pair that was completed."""
     session = case.open(prepared=False)
     place_all(session, case, count=3)
-    state = session.photos[0]
-    half = Pair(9, uv=state.document.pairs[1].uv)
-    state.files._write_unfinished(LeftOut((half, Pair(10, uv=(1.0, 2.0)))))
-    pairs = case.open(prepared=False).photos[0].document.pairs
+    earlier = case.folder / "photo.unfinished.json"
+    halves = [{"uv": case.clicks[1][1]}, {"uv": [1, 2]}]
+    earlier.write_text(json.dumps({"format": "cadalign unfinished pairs", "pairs": halves}))
+    again = case.open(prepared=False)
+    pairs = again.photos[0].document.pairs
     assert [pair.uv for pair in pairs[3:]] == [(1.0, 2.0)]
+    perform(again, 0, {"do": "place_uv", "uv": [3, 4]})
+    assert not earlier.exists()
+    pairs = case.open(prepared=False).photos[0].document.pairs
+    assert [pair.uv for pair in pairs[3:]] == [(1.0, 2.0), (3.0, 4.0)]

@@ -143,9 +143,9 @@ def test_deleted_folder_loses_nothing(case: Case) -> None:
     assert trouble.startswith(f"Not saved: {out}: the folder is gone")
     match = re.fullmatch(r"Saved in (\S+) instead", place)
     assert match
-    rescued = json.loads(Path(match[1], "photo.unfinished.json").read_text())
-    assert rescued["pairs"] == [{"uv": [10, 20]}, {"uv": [30, 40]}]
-    assert json.loads(Path(match[1], "photo.json").read_text())["image"].endswith("photo.png")
+    rescued = json.loads(Path(match[1], "photo.json").read_text())
+    assert rescued["unfinished"]["pairs"] == [{"uv": [10, 20]}, {"uv": [30, 40]}]
+    assert rescued["image"].endswith("photo.png")
     shutil.rmtree(match[1])
 
 
@@ -176,12 +176,6 @@ def test_other_photos_and_other_models_are_free(case: Case) -> None:
     assert message.startswith(f"{files.keypoints}: another annotator has it open: http://127.0.0.1")
     with locks:
         pass
-
-
-def test_observation_in_the_place_of_derived_files_is_locked_with_them(case: Case) -> None:
-    taken = locks_of(case, observation=case.folder / "photo.unfinished.json")
-    with locks_of(case):
-        assert "another annotator has it open" in refusal_text(taken.__enter__)
 
 
 def test_removed_locks_are_taken_again_unless_another_was_faster(case: Case) -> None:

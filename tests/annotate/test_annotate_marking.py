@@ -52,9 +52,9 @@ def agree_with_fit(
 ) -> dict[str, Any]:
     """The page's alignment, which `cadalign fit` must find in the saved file."""
     live, _ = session.live(session.photos[0])
-    assert live.shown is not None, live.message
+    assert live.result is not None, live.message
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
-    command, page = json.loads(capsys.readouterr().out), live.shown.to_dict()
+    command, page = json.loads(capsys.readouterr().out), live.result.to_dict()
     for name in ("alignment", "covariance", "std", "stretch"):
         np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
     return dict(page_state(session, 0)["alignment"])

@@ -154,13 +154,6 @@ def test_earlier_observation_in_the_keypoints_place_is_kept(case: Case) -> None:
 
 
 def test_other_files_in_the_place_of_derived_ones_are_kept(case: Case) -> None:
-    unfinished = case.folder / "photo.unfinished.json"
-    write_observation(unfinished, case, None)
-    assert refusal_text(case.open) == (
-        f"{unfinished}: not a file of cadalign unfinished pairs; "
-        "rename it: the annotator writes a file of this name"
-    )
-    unfinished.unlink()
     fit = case.folder / "photo_fit"
     fit.write_text("")
     assert refusal_text(case.open).startswith(f"{fit}: not a folder; rename it")
@@ -171,7 +164,7 @@ def test_other_files_in_the_place_of_derived_ones_are_kept(case: Case) -> None:
 
 
 @pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo])
-@pytest.mark.parametrize("name", ["photo.json", "photo.unfinished.json"])
+@pytest.mark.parametrize("name", ["photo.json", "sample_chair_000.keypoints.json"])
 def test_folders_and_pipes_in_a_files_place_are_refused(
     case: Case, name: str, make: Callable[[Path], None]
 ) -> None:
@@ -190,4 +183,4 @@ def test_files_are_compared_by_place(tmp_path: Path) -> None:
 def test_written_files_are_named_before_anything_is_read(case: Case) -> None:
     options = SessionOptions(image=case.photo, model=case.folder / "nowhere.obj")
     names = {path.name for path in find_session_files(options).written}
-    assert names == {"nowhere.keypoints.json", "photo.json", "photo.unfinished.json"}
+    assert names == {"nowhere.keypoints.json", "photo.json"}

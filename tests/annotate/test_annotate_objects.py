@@ -14,13 +14,12 @@ from support.annotating import Case, fitted, flat
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.exporting import coco_of, glb_of
-from cadalign.annotate.history_file import history_path
+from cadalign.annotate.history import history_path
 from cadalign.annotate.locks import WriterLocks
 from cadalign.annotate.opening import find_session_files, open_session
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.page_state import page_state
+from cadalign.annotate.page_state import page_state, worklist_state
 from cadalign.annotate.session import Session
-from cadalign.annotate.worklist_state import worklist_state
 from cadalign.cli.annotate import Annotate
 from cadalign.errors import CadalignError
 from cadalign.io.observation import Observation
@@ -54,7 +53,7 @@ def test_each_object_is_a_file_of_which_fit_finds_the_pages_numbers(
 ) -> None:
     assert labels(two) == ["object 1", "left chair"]
     for slot, name in enumerate(("photo.json", "photo.object-2.json")):
-        page = two.live(two.objects[0][slot])[0].shown
+        page = two.live(two.objects[0][slot])[0].result
         assert page is not None
         command = fitted(case, capsys, name)
         saved = json.loads((case.folder / f"{name[:-5]}_fit" / "fit.json").read_text())
@@ -82,8 +81,8 @@ def test_objects_are_found_again_with_their_undo(two: Session, case: Case) -> No
     again = case.open()
     assert labels(again) == ["desk", "left chair"]
     assert [len(state.document.pairs) for state in again.objects[0]] == [6, 7]
-    before = two.live(two.objects[0][1])[0].shown
-    after = again.live(again.objects[0][1])[0].shown
+    before = two.live(two.objects[0][1])[0].result
+    after = again.live(again.objects[0][1])[0].result
     assert before is not None
     assert after is not None
     np.testing.assert_array_equal(before.covariance, after.covariance)
@@ -171,7 +170,7 @@ def test_objects_have_models_of_their_own(
         perform(session, 0, {"do": "place_keypoint", "keypoint": number}, slot=2)
     assert model.keypoints_path != session.keypoints_path
     assert model.keypoints_path.exists()
-    page = session.live(session.objects[0][2])[0].shown
+    page = session.live(session.objects[0][2])[0].result
     assert page is not None
     command = fitted(case, capsys, "photo.object-3.json")
     np.testing.assert_allclose(

@@ -12,7 +12,7 @@ import pytest
 
 from cadalign import Alignment, Box, Camera
 from cadalign.annotate.actions import perform
-from cadalign.annotate.alignment import LiveAlignment
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.session import Session
@@ -190,8 +190,8 @@ def test_twenty_annotations_are_sane_from_the_fourth_pair(
                 continue
             live, _ = session.live(state)
             assert isinstance(live, LiveAlignment)
-            assert live.cautious is not None, (case.name, count, live.message)
-            scale = live.cautious.alignment.scale
+            assert live.result is not None, (case.name, count, live.message)
+            scale = live.result.alignment.scale
             ratio = np.abs(np.log(scale / case.scale))
             if np.exp(ratio.max()) > FACTOR:
                 beyond.append((case.name, count, scale.round(2), case.scale.round(2)))
@@ -199,7 +199,7 @@ def test_twenty_annotations_are_sane_from_the_fourth_pair(
                 errors[count].extend(np.abs(scale / case.scale - 1)[1:].tolist())
             if count == 6:
                 own = session.model.scene.bounds
-                estimate = Box.from_model(own, live.cautious.alignment)
+                estimate = Box.from_model(own, live.result.alignment)
                 overlapping += box_iou(est=estimate, gt=case.box) > 0
         check_fit_agrees(session, case, capsys)
     medians = {count: 100 * float(np.median(each)) for count, each in errors.items()}
@@ -222,8 +222,8 @@ def test_unknown_focal_length_is_saved_with_its_prior(
             perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint})
         live, _ = session.live(session.photos[0])
         assert isinstance(live, LiveAlignment)
-        assert live.cautious is not None
-        scale = live.cautious.alignment.scale
+        assert live.result is not None
+        scale = live.result.alignment.scale
         assert np.abs(np.log(scale / case.scale)).max() < np.log(FACTOR)
         check_fit_agrees(session, case, capsys)
 
@@ -231,7 +231,7 @@ def test_unknown_focal_length_is_saved_with_its_prior(
 def check_fit_agrees(session: Session, case: Scripted, capsys: pytest.CaptureFixture[str]) -> None:
     """`cadalign fit` of what was saved gives the page's numbers."""
     live, _ = session.live(session.photos[0])
-    page = live.shown
+    page = live.result
     assert page is not None
     path = session.photos[0].files.observation
     assert main(["fit", str(path), "--json", "--out", str(path.parent / "x")]) == 0

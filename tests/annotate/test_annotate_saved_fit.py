@@ -59,7 +59,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
         perform(session, 0, {"do": "focal", "known": False})
     perform(session, 0, {"do": "delete", "pair": 2})
     live, _ = session.live(session.photos[0])
-    page = live.cautious
+    page = live.result
     assert page is not None
     assert (live.sigma > 1) == (noise > 1)
 

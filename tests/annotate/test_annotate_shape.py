@@ -14,9 +14,9 @@ from support.annotating import Case, place, place_all
 
 from cadalign import CadalignError, Result, ShapeModel
 from cadalign.annotate.actions import perform
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoints
 from cadalign.io.observation import Observation
@@ -57,9 +57,9 @@ def numbers(value: Any) -> list[float]:
     return [] if isinstance(value, str) else [value]
 
 
-def live_shape(session: Session) -> LiveShape:
+def live_shape(session: Session) -> LiveAlignment:
     live, _ = session.live(session.photos[0])
-    assert isinstance(live, LiveShape)
+    assert isinstance(live, LiveAlignment)
     return live
 
 
@@ -91,7 +91,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     given.save(case.observation)
     session = case.open(**options_of(kind, shape_file))
     perform(session, 0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
-    page = live_shape(session).shown
+    page = live_shape(session).result
     assert page is not None
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
     command = Result.from_dict(json.loads(capsys.readouterr().out))
@@ -209,8 +209,8 @@ def test_shape_of_named_keypoints(case: Case, tmp_path: Path) -> None:
     assert page.counts.all()
     assert main(["fit", str(case.observation), "--out", str(tmp_path / "x")]) == 0
     fitted = Result.from_dict(json.loads((tmp_path / "x/fit.json").read_text()))
-    assert page.shown is not None
-    np.testing.assert_allclose(fitted.covariance, page.shown.covariance, rtol=1e-9, atol=1e-15)
+    assert page.result is not None
+    np.testing.assert_allclose(fitted.covariance, page.result.covariance, rtol=1e-9, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", ["learned", "similar"])
@@ -220,7 +220,7 @@ def test_unknown_focal_length_is_estimated_with_the_shape(
     session = case.open(**options_of(kind, shape_file), camera=None)
     shown = place_all(session, case)["alignment"]
     (fact,) = (fact for fact in shown["facts"] if fact["label"] == "Focal length")
-    found = live_shape(session).shown
+    found = live_shape(session).result
     assert found is not None
     assert found.std is not None
     assert found.focal == "estimate"
@@ -240,7 +240,7 @@ def test_unknown_focal_length_is_estimated_with_the_shape(
     np.testing.assert_allclose(fitted.covariance, found.covariance, rtol=1e-6, atol=1e-12)
     perform(session, 0, {"do": "focal", "known": True})
     assert Observation.load(case.observation).camera.focal_known
-    known = live_shape(session).shown
+    known = live_shape(session).result
     assert known is not None
     assert known.focal == "known"
 
@@ -256,7 +256,7 @@ def test_three_pairs_leave_an_unknown_focal_length_to_its_prior(
     for semantic_id, uv in case.clicks[LACKING : LACKING + 3]:
         place(session, numbers[semantic_id], uv)
     live = live_shape(session)
-    assert live.shown is not None
+    assert live.result is not None
     assert live.provisional != prior
     assert (case.folder / "photo_fit/fit.json").exists() == prior
     if not prior:

@@ -12,11 +12,10 @@ import pytest
 from support.annotating import Case, fitted, flat
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.alignment import LiveAlignment
 from cadalign.annotate.claims import Claims
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.annotate.shape_alignment import LiveShape
 from cadalign.cli import main
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.result import Result
@@ -80,10 +79,10 @@ def both(case: Case) -> Session:
     return session
 
 
-def live(session: Session, photo: int, slot: int) -> LiveShape:
+def live(session: Session, photo: int, slot: int) -> LiveAlignment:
     found, _ = session.live(session.objects[photo][slot])
-    assert isinstance(found, LiveShape)
-    assert found.shown is not None
+    assert isinstance(found, LiveAlignment)
+    assert found.result is not None
     return found
 
 
@@ -91,9 +90,9 @@ def test_page_file_and_fit_agree_in_both_photos(
     both: Session, case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second = live(both, 0, 0), live(both, 1, 1)
-    assert first.shown is second.shown
+    assert first.result is second.result
     assert (first.place, second.place) == (0, 1)
-    page = first.shown
+    page = first.result
     assert page is not None
     saved = json.loads((case.folder / "photo_fit" / "fit.json").read_text())
     for found in (fitted(case, capsys), saved):
@@ -123,9 +122,9 @@ def test_objects_photos_are_found_again(both: Session, case: Case) -> None:
     for again in (opened(case), case.open(image=case.folder), case.open()):
         assert [state.photo.path.name for state in again.photos] == ["photo.png", "right.png"]
         found = live(again, 1, 1)
-        assert found.shown is not None
-        assert expected.shown is not None
-        np.testing.assert_array_equal(found.shown.covariance, expected.shown.covariance)
+        assert found.result is not None
+        assert expected.result is not None
+        np.testing.assert_array_equal(found.result.covariance, expected.result.covariance)
         np.testing.assert_array_equal(found.residuals, expected.residuals)
     before = again.objects[1][1].document.pairs
     perform(again, 1, {"do": "undo"}, slot=1)
@@ -155,7 +154,7 @@ def test_a_photo_with_few_pairs_does_not_count_yet(case: Case) -> None:
     assert any(note.startswith("right.png is left out: its 2 keypoints") for note in notes)
     message = page_state(session, 1, slot=1)["alignment"]["message"]
     assert message == "1 more pair to the first alignment of this photo"
-    assert alone.shown is not None
+    assert alone.result is not None
 
 
 def test_what_is_the_objects_is_shared(both: Session, case: Case) -> None:
@@ -187,7 +186,7 @@ def test_a_mask_of_a_further_photo_is_its_own(
     assert (case.folder / "photo.right.mask.png").exists()
     views = Observation.load(case.observation).views
     assert [view.evidence.mask is not None for view in views] == [False, True]
-    page = live(both, 0, 0).shown
+    page = live(both, 0, 0).result
     assert page is not None
     command = fitted(case, capsys)
     np.testing.assert_allclose(
@@ -319,9 +318,9 @@ def test_pairs_of_a_similar_model_are_taken_for_as_far_off_as_they_are(case: Cas
         put(session, case, 7, photo=photo, slot=photo, off=off)
     found = live(session, 0, 0)
     assert off / 2 < found.sigma < 2 * off
-    assert found.shown is not None
-    errors = np.log(found.shown.alignment.scale / case.instance.cam_from_model.scale)[1:]
-    assert np.abs(errors).max() < 3 * max(found.shown.std.scale[1:])
+    assert found.result is not None
+    errors = np.log(found.result.alignment.scale / case.instance.cam_from_model.scale)[1:]
+    assert np.abs(errors).max() < 3 * max(found.result.std.scale[1:])
     # What the file says of pairs that are gone does not hold for others.
     again = opened(case)
     for pair in again.objects[1][1].document.pairs[:4]:

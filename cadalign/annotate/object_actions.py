@@ -1,22 +1,22 @@
-"""Actions of the page on the objects of a photo, and on the photos of an object."""
+"""Actions of the page on the objects of a photo, their models, and the photos of an object."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from cadalign.annotate.action import Action, ActionOutcome
-from cadalign.annotate.alignment import LIKELY_STRETCH
-from cadalign.annotate.document import AnnotationDocument, History, Priors
+from cadalign.annotate.document import AnnotationDocument, Priors
+from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import MarkedEvidence
 from cadalign.annotate.files import AnnotationFiles
+from cadalign.annotate.history import History
+from cadalign.annotate.models import OpenedModel
 from cadalign.annotate.names import object_file, object_number
-from cadalign.annotate.objects.listing import label_of, shown_objects
-from cadalign.annotate.objects.models import OpenedModel
-from cadalign.annotate.objects.opening import new_view
-from cadalign.annotate.objects.state import PhotoState
+from cadalign.annotate.objects import PhotoState, label_of, shown_objects
+from cadalign.annotate.ranking import switch_model
 from cadalign.annotate.session import Session
 from cadalign.errors import InputError, quote
-from cadalign.io.documents import Index
+from cadalign.io.documents import Index, Text
 
 _LONGEST_NAME = 60
 
@@ -42,7 +42,7 @@ class RenameObject(Action):
     def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
         photo, _ = session.place_of(state)
         name = _free_name(self.name, session.objects[photo], state)
-        state.history.record(replace(state.document, name=name))
+        state.record(replace(state.document, name=name))
         return ActionOutcome()
 
 
@@ -55,7 +55,7 @@ class DeleteObject(Action):
         empty = AnnotationDocument(
             focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True
         )
-        owner.history.record(empty)
+        owner.record(empty)
         for view in (owner, *owner.views):
             view.drawn = None
         for each in (owner, *owner.views):
@@ -111,6 +111,22 @@ class RemoveView(Action):
         )
 
 
+class ChooseModel(Action):
+    """Go on with another model of the library, in all photos of the object."""
+
+    category: Text
+    model: Text
+
+    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
+        before = sum(pair.keypoint is not None for pair in state.document.pairs)
+        switch_model(session, state, (self.category, self.model))
+        lost = before - sum(pair.keypoint is not None for pair in state.document.pairs)
+        if not lost:
+            return ActionOutcome()
+        pairs = "1 pair has" if lost == 1 else f"{lost} pairs have"
+        return ActionOutcome(message=f"{pairs} no keypoint on this model: click on it.")
+
+
 OBJECT_ACTIONS: dict[str, type[Action]] = {
     "add_object": AddObject,
     "rename_object": RenameObject,
@@ -118,6 +134,7 @@ OBJECT_ACTIONS: dict[str, type[Action]] = {
     "restore_object": RestoreObject,
     "add_view": AddView,
     "remove_view": RemoveView,
+    "model": ChooseModel,
 }
 """Actions by the name that the page sends as ``do``."""
 
@@ -177,10 +194,10 @@ def _add_view(session: Session, owner: PhotoState, photo: int) -> PhotoState:
     like = session.objects[photo][0]
     view = next((each for each in owner.views if each.key == like.key), None)
     if view is None:
-        view = new_view(owner, like.photo, like.intrinsics)
+        view = owner.add_view(like.photo, like.intrinsics)
         session.objects[photo].append(view)
     shared = owner.document
-    view.history.record(
+    view.record(
         AnnotationDocument(
             focal=like.document.focal,
             priors=Priors(shared.priors.stretch, like.intrinsics.likely_focal),

@@ -1,31 +1,27 @@
-"""Ranking of a library's models by a photo's pairs, as plain data for the page; thumbnails."""
+"""Models of a library: their ranking by an object's pairs, and going on with another one."""
 
 from __future__ import annotations
 
-import io
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
-from cadalign.annotate.choosing.choice import ModelChoice
-from cadalign.annotate.files import filled
-from cadalign.annotate.session import PhotoState, Session
+from cadalign.annotate.document import AnnotationDocument, FurtherView, Pair
+from cadalign.annotate.keypoints import KeypointRegistry
+from cadalign.annotate.library import ModelChoice
+from cadalign.annotate.objects import PhotoState
+from cadalign.annotate.observing import filled
+from cadalign.annotate.session import Session
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError
+from cadalign.errors import CadalignError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.render import RaycastRenderer, Scene
-from cadalign.render.views.viewpoints import frame_object, look_at
 from cadalign.retrieval.match import Match
+from cadalign.retrieval.models import ModelKey
 from cadalign.retrieval.page import score_text
 
-LEAST_PAIRS = 4
-_THUMBNAIL = (180, 135)  # [px]
-_GREY = (185, 189, 196)
-_FILL = 0.92
-# ShapeNet's models face -z, with y up: seen from the front, the left and above.
-_AZIMUTH, _ELEVATION = 150.0, 20.0
+_LEAST_PAIRS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +48,7 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
             return answer | {"note": "The session has no library: start it with --library."}
         marked = _marked(state, choice)
         others = len(state.document.complete_pairs) - len(marked.semantic_ids)
-        missing = LEAST_PAIRS - len(marked.semantic_ids)
+        missing = _LEAST_PAIRS - len(marked.semantic_ids)
         if missing > 0:
             return answer | {"note": _too_few(missing, others)}
         camera = _camera(session, state)
@@ -82,21 +78,6 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
     }
 
 
-def thumbnail_of(choice: ModelChoice, number: int) -> bytes:
-    """Draw the model of a number among `ModelChoice.keys`, as a small JPEG."""
-    if not 0 <= number < len(choice.keys):
-        number = 0
-    scene = Scene(choice.model(choice.keys[number]).load_mesh())
-    camera = Camera.from_fov(*_THUMBNAIL, fov_x=30.0)
-    turned = look_at(azimuth=_AZIMUTH, elevation=_ELEVATION, distance=1.0)
-    pose = frame_object(scene.bounds, camera, rotation=turned.rotation, fill=_FILL)
-    frame = RaycastRenderer().render(scene, camera, pose)
-    background = np.full((camera.height, camera.width, 3), _GREY, dtype=np.uint8)
-    data = io.BytesIO()
-    Image.fromarray(frame.composite(background)).save(data, "JPEG", quality=85)
-    return data.getvalue()
-
-
 def _marked(state: PhotoState, choice: ModelChoice) -> _Marked:
     known = choice.ids_on(state.files.model)
     pairs = [pair for pair in state.document.complete_pairs if pair.keypoint in known]
@@ -111,10 +92,9 @@ def _marked(state: PhotoState, choice: ModelChoice) -> _Marked:
 def _camera(session: Session, state: PhotoState) -> Camera:
     """The calibrated camera, else that of the alignment, else a likely one."""
     if state.document.focal.known:
-        return state.intrinsics.with_focal(state.document.focal)
+        return state.camera
     live, _ = session.live(state)
-    found = None if live.shown is None else getattr(live.shown, "camera", None)
-    return found or state.intrinsics.with_focal(state.document.focal)
+    return state.camera if live.result is None else live.camera
 
 
 def _too_few(missing: int, others: int) -> str:
@@ -140,3 +120,63 @@ def _entry(match: Match, choice: ModelChoice, current: tuple[str, str] | None) -
         "has_mesh": match.mesh_path is not None,
         "current": key == current,
     }
+
+
+def switch_model(session: Session, state: PhotoState, key: ModelKey) -> None:
+    """Exchange an object's model, and the pairs' halves on it."""
+    choice = session.choice
+    if choice is None:
+        raise InputError("the session has no library", where="model", fix="start with --library")
+    mesh = choice.model(key).mesh_path
+    assert mesh is not None
+    session.before_saving()  # where nothing may be written, nothing is changed either
+    owner = state.owner
+    old, new = owner.model, session.models.of(mesh)
+    if new is old:
+        return
+    if session.ready:
+        new.prepare(has_shape=session.shape is not None)
+    carried = carry_keypoints(old.registry, new.registry, choice.ids_on(old.path))
+    history = owner.history.changed(lambda document: _carried(document, carried))
+    for each in (owner, *owner.views):
+        each.model = new
+        each.files = replace(each.files, model=new.path)
+        each.history = history
+        each.live = each.estimate = None
+        each.proposals = tuple(
+            replace(proposal, keypoint=carried[proposal.keypoint])
+            for proposal in each.proposals
+            if proposal.keypoint in carried
+        )
+
+
+def carry_keypoints(
+    old: KeypointRegistry, new: KeypointRegistry, known: Collection[int]
+) -> dict[int, int]:
+    """Ids of the old model's keypoints on the new one: of the same semantic id, else name.
+
+    Semantic ids tell of those that are ``known``. A keypoint that was renamed keeps its name.
+    """
+    carried = {number: number for number, _ in old if number in known and number in new}
+    for number in carried:
+        if old[number].name != new[number].name:
+            new.rename(number, old[number].name)
+    free = {point.name: number for number, point in new if number not in carried}
+    return carried | {
+        number: free[point.name]
+        for number, point in old
+        if number not in carried and point.name in free
+    }
+
+
+def _carried(document: AnnotationDocument, carried: Mapping[int, int]) -> AnnotationDocument:
+    """The document with its pairs' keypoints on the new model; halves without any are left out."""
+    moved: list[Pair] = []
+    for pair in document.pairs:
+        keypoint = None if pair.keypoint is None else carried.get(pair.keypoint)
+        if keypoint is not None or pair.uv is not None:
+            moved.append(replace(pair, keypoint=keypoint))
+    views = tuple(
+        FurtherView(view.photo, _carried(view.document, carried)) for view in document.further_views
+    )
+    return replace(document, pairs=tuple(moved), further_views=views)

@@ -1,11 +1,15 @@
-"""`ModelChoice`: the library that a session's model is chosen from."""
+"""Library of models that a session's models are chosen from."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+
+import numpy as np
+from PIL import Image
 
 from cadalign.annotate.names import named_model, observation_file
 from cadalign.annotate.options import FileOptions
@@ -13,8 +17,17 @@ from cadalign.annotate.photos import find_photos
 from cadalign.datasets.models.categories import require_category
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
+from cadalign.geometry.camera import Camera
+from cadalign.render import RaycastRenderer, Scene
+from cadalign.render.views.viewpoints import frame_object, look_at
 from cadalign.retrieval import Library, LibraryModel
 from cadalign.retrieval.models import ModelKey
+
+_THUMBNAIL = (180, 135)  # [px]
+_GREY = (185, 189, 196)
+_FILL = 0.92
+# ShapeNet's models face -z, with y up: seen from the front, the left and above.
+_AZIMUTH, _ELEVATION = 150.0, 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,3 +145,18 @@ def starting_model(options: FileOptions, image: Path) -> Path:
         return choice.first_model([options.observation])
     out = options.out or photos[0].parent
     return choice.first_model(observation_file(photo, out) for photo in photos)
+
+
+def thumbnail_of(choice: ModelChoice, number: int) -> bytes:
+    """Draw the model of a number among `ModelChoice.keys`, as a small JPEG."""
+    if not 0 <= number < len(choice.keys):
+        number = 0
+    scene = Scene(choice.model(choice.keys[number]).load_mesh())
+    camera = Camera.from_fov(*_THUMBNAIL, fov_x=30.0)
+    turned = look_at(azimuth=_AZIMUTH, elevation=_ELEVATION, distance=1.0)
+    pose = frame_object(scene.bounds, camera, rotation=turned.rotation, fill=_FILL)
+    frame = RaycastRenderer().render(scene, camera, pose)
+    background = np.full((camera.height, camera.width, 3), _GREY, dtype=np.uint8)
+    data = io.BytesIO()
+    Image.fromarray(frame.composite(background)).save(data, "JPEG", quality=85)
+    return data.getvalue()

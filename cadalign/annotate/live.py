@@ -1,0 +1,187 @@
+"""Live alignment: the estimate from all photos of an object, as one of them shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cadalign.annotate.estimate import LEAST_SIGMA, Estimate, Known
+from cadalign.annotate.evidence import evidence_labels
+from cadalign.annotate.object_shape import ObjectShape
+from cadalign.annotate.wireframe import Wireframe
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.estimation.model import Model
+from cadalign.estimation.result import Result
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.io.observation import Observation
+from cadalign.shapes.model import ShapeModel
+
+_LEAST_PAIRS, _LEAST_JOINT_PAIRS = 4, 3  # without and with evidence beside them
+
+
+@dataclass(frozen=True, eq=False)
+class LiveAlignment:
+    """Alignment of what is marked so far, as one photo of the object shows it.
+
+    Parameters
+    ----------
+    result : Result, optional
+        The estimate from all photos, as it is shown and saved.
+    message : str
+        Reason for a missing result, or an assumption that was made.
+    provisional : bool
+        True if the marks alone did not suffice, so that nothing is saved.
+    place : int
+        The photo's number among the views.
+    sigma : float
+        Standard deviation of the pairs [px], larger if the residuals are.
+    fit_options : mapping
+        With which, and the priors, `cadalign fit` finds the result.
+    counts : (n,) bool
+        The complete pairs whose keypoints the shape knows.
+    residuals : (n, 2) float
+        Projected minus placed points of all complete pairs [px].
+    outliers : mapping
+        Distances [px] of the pairs that contradict the others, by their rows.
+    wireframe : Wireframe, optional
+        Lines of the model, warped to an own shape, in its frame before the stretch.
+    prior_lengths : (3,) float
+        Standard deviations of the logarithms of the lengths before any pair.
+    also_used : tuple of str
+        Evidence beyond the photo's pairs.
+    """
+
+    result: Result | None = None
+    message: str = ""
+    provisional: bool = False
+    place: int = 0
+    sigma: float = LEAST_SIGMA
+    fit_options: Mapping[str, Any] = field(default_factory=dict)
+    counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    residuals: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    outliers: Mapping[int, float] = field(default_factory=dict)
+    wireframe: Wireframe | None = None
+    prior_lengths: FloatArray = field(default_factory=lambda: np.zeros(3))
+    also_used: tuple[str, ...] = ()
+
+    @property
+    def camera(self) -> Camera:
+        """The photo's camera."""
+        assert self.result is not None
+        return self.result.cameras[self.place]
+
+    @property
+    def alignment(self) -> Alignment:
+        """The alignment in the photo's camera."""
+        assert self.result is not None
+        return self.result.poses[self.place]
+
+
+def live_alignment(
+    estimate: Estimate,
+    known: Known,
+    wireframe: Wireframe,
+    observation: Observation,
+    place: int,
+    points: Sequence[ModelKeypoint],
+    uv: FloatArray,
+) -> LiveAlignment:
+    """An estimate as the photo of a number shows it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    known : Known
+    wireframe : Wireframe
+        Of the model.
+    observation : Observation
+        What the estimate was computed from.
+    place : int
+    points, uv
+        Model points and photo points (n, 2) [px] of all complete pairs of the photo.
+    """
+    result, problem, shape = estimate.result, estimate.problem, known.shape
+    counts = known_points(shape, points)
+    free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
+    lines, carried = _warped(wireframe, result, problem.model, known, free)
+    camera = result.cameras[place]
+    residuals = np.empty((len(points), 2))
+    residuals[counts] = result.views[place].residuals
+    residuals[~counts] = camera.project(result.poses[place].apply(carried)) - uv[~counts]
+    rows = np.flatnonzero(counts)
+    if not problem.exact:
+        problem = problem.at_focal(result.cameras)
+    outliers = {int(rows[row]): off for row, off in problem.contradicting(place).items()}
+    message = _assumed_text(known.assumed_focal, camera) or estimate.assumed
+    prior = known.stretch or np.inf
+    lengths = np.array([0.0, prior, prior])
+    return LiveAlignment(
+        result,
+        message,
+        provisional=bool(message),
+        place=place,
+        sigma=estimate.sigma,
+        fit_options={} if message else estimate.fit_options,
+        counts=counts,
+        residuals=residuals,
+        outliers=outliers,
+        wireframe=lines,
+        prior_lengths=lengths if shape is None else shape.length_sigmas(problem.model),
+        also_used=evidence_labels(observation),
+    )
+
+
+def known_points(shape: ObjectShape | None, points: Sequence[ModelKeypoint]) -> BoolArray:
+    """The points (n,) of which pairs count."""
+    return np.array([shape is None or shape.knows(point) for point in points], dtype=bool)
+
+
+def missing_text(
+    counts: BoolArray, shape: ObjectShape | None, *, is_plain: bool, has_others: bool
+) -> str:
+    """Say how many more pairs the first alignment needs; empty if none.
+
+    ``counts`` (n,) are the complete pairs that count, ``is_plain`` says that nothing else is used.
+    """
+    missing = (_LEAST_PAIRS if is_plain else _LEAST_JOINT_PAIRS) - int(counts.sum())
+    if missing <= 0:
+        return ""
+    text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
+    if not counts.all() and shape is not None and shape.learned is not None:
+        text += f": keypoints that {shape.learned.category} has, marked by rings on the model"
+    return f"{text} of this photo" if has_others else text
+
+
+def _assumed_text(photos: tuple[str, ...], camera: Camera) -> str:
+    """Say whose focal length is assumed; empty if none is."""
+    if not photos:
+        return ""
+    fix = "accept or correct it; until then the alignment is not saved."
+    if "" in photos:
+        return f"The focal length is assumed, {camera.fx:.0f} px. Choose 'known' to {fix}"
+    names = " and ".join(photos)
+    return f"The focal length of {names} is assumed. Choose 'known' in that photo to {fix}"
+
+
+def _warped(
+    wireframe: Wireframe,
+    result: Result,
+    model: Model | ShapeModel,
+    known: Known,
+    free: FloatArray,
+) -> tuple[Wireframe, FloatArray]:
+    """The model warped such that its known keypoints come to the estimated ones, with points."""
+    if known.shape is None:
+        return wireframe, free
+    if isinstance(model, Model):
+        source, target = np.asarray(model.points_3d), result.points_3d
+    else:
+        rows = [row for row, label in enumerate(result.ids) if label in known.anchors]
+        source = np.array([known.anchors[result.ids[row]].xyz for row in rows])
+        target = result.points_3d[rows]
+    return wireframe.warped(source, target, result.bounds, carried=free)

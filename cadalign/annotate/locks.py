@@ -1,7 +1,8 @@
-"""One writer per file: locks on an annotator's files, which end with its process, also if killed.
+"""One writer at a time: locks of processes on files, claims of browsers on photos.
 
-An annotator of one photo holds a lock for each file that it writes, an annotator of a folder the
-folder's own. Both pass through the folder's lock, so that neither overlooks the other.
+Locks end with their process, also if it is killed. An annotator of one photo holds a lock for each
+file that it writes, an annotator of a folder the folder's own. Both pass through the folder's lock,
+so that neither overlooks the other.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ import errno
 import logging
 import os
 import platform
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -19,11 +22,13 @@ from typing import Self
 from filelock import FileLock, Timeout
 
 from cadalign.annotate.names import file_name
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError
 from cadalign.io.files import read_text
 
 logger = logging.getLogger("cadalign")
 
+LEASE = 60.0
+"""How long a photo stays with the person who changed it last [s]."""
 _ENDING = "annotate-lock"
 _PATIENCE = 0.2  # for a lock that is just being removed [s]
 _QUEUE = 2.0  # for others that are passing through the folder's lock [s]
@@ -54,7 +59,7 @@ class WriterLocks:
 
     def __enter__(self) -> Self:
         """Lock the files; raises DataError if another annotator has one of them."""
-        self._acquire()
+        self._take(self._files)
         return self
 
     def __exit__(
@@ -73,7 +78,7 @@ class WriterLocks:
         """
         if not self._locks or not all(lock.intact for lock in self._locks):
             self._release()
-            self._acquire()
+            self._take(self._files)
 
     def reserve(self, files: Sequence[Path]) -> None:
         """Lock further files of the folder that the session writes.
@@ -81,32 +86,25 @@ class WriterLocks:
         Raises DataError if another annotator has one of them.
         """
         new = {_lock_path(file): file for file in files if _lock_path(file) not in self._files}
-        if self._whole_folder or not new:
-            return
-        with ExitStack() as passing, ExitStack() as held:
-            gate = _Lock(self._folder / f".{_ENDING}", self._folder, self._note)
-            passing.enter_context(gate.hold(_QUEUE))
-            locks = [_Lock(path, file, self._note) for path, file in new.items()]
-            for lock in locks:
-                held.enter_context(lock.hold(_PATIENCE))
-            self._held.enter_context(held.pop_all())
-        self._locks += locks
-        self._files |= new
+        if new and not self._whole_folder:
+            self._take(new)
+            self._files |= new
 
-    def _acquire(self) -> None:
+    def _take(self, files: Mapping[Path, Path]) -> None:
+        """Hold the locks of files by their lock files, all or none."""
         with ExitStack() as passing, ExitStack() as held:
-            gate_holder = held if self._whole_folder else passing
             gate = _Lock(self._folder / f".{_ENDING}", self._folder, self._note)
-            gate_holder.enter_context(gate.hold(_QUEUE))
-            locks = [gate] if self._whole_folder else []
-            for path, file in self._files.items():
+            (held if self._whole_folder else passing).enter_context(gate.hold(_QUEUE))
+            taken = [gate] if self._whole_folder else []
+            for path, file in files.items():
                 lock = _Lock(path, file, self._note)
                 if not self._whole_folder:
                     held.enter_context(lock.hold(_PATIENCE))
-                    locks.append(lock)
+                    taken.append(lock)
                 elif path.exists():
                     passing.enter_context(lock.hold(_PATIENCE))
-            self._locks, self._held = locks, held.pop_all()
+            self._locks += taken
+            self._held.enter_context(held.pop_all())
 
     def _release(self) -> None:
         self._locks = []
@@ -191,3 +189,53 @@ def _identity(path: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_dev, status.st_ino
+
+
+@dataclass(frozen=True)
+class _Claim:
+    browser: str
+    person: str
+    since: float
+
+
+class Claims:
+    """Claims of browsers on the photos that they change.
+
+    Another browser of the same person takes a claim over at once, another person after `LEASE`.
+
+    Parameters
+    ----------
+    clock : callable
+        Seconds since any moment.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._claims: dict[int, _Claim] = {}
+
+    def take(self, photos: Collection[int], browser: str, person: str) -> None:
+        """Claim photos for a browser, all or none, or renew its claims.
+
+        Raises
+        ------
+        InputError
+            If another person has changed one of them within the last `LEASE` seconds.
+        """
+        now = self._clock()
+        for claim in (self._claims[photo] for photo in photos if photo in self._claims):
+            left = claim.since + LEASE - now
+            if claim.person != person and left > 0:
+                raise InputError(
+                    "someone else is annotating this photo, so that your change is not made",
+                    where="photo",
+                    fix=f"take another one, or try again {left:.0f} s after their last change",
+                )
+        for photo in photos:
+            self._claims[photo] = _Claim(browser, person, now)
+
+    def is_elsewhere(self, photo: int, browser: str) -> bool:
+        """True while a photo belongs to another browser."""
+        claim = self._claims.get(photo)
+        if claim is None or claim.browser == browser:
+            return False
+        return self._clock() < claim.since + LEASE

@@ -20,10 +20,10 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.claims import Claims
 from cadalign.annotate.exporting import coco_of, glb_of, zipped_photo_set
 from cadalign.annotate.guard import Access, Guard
 from cadalign.annotate.library import thumbnail_of
+from cadalign.annotate.locks import Claims
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
 from cadalign.annotate.page_state import advice_state, mask_pixels, page_state, worklist_state
@@ -58,6 +58,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
             Route("/export/{form:str}.zip", routes.photo_set),
             Route("/mask/{number:int}", routes.mask),
             Route("/state/{number:int}", routes.state),
+            Route("/claim/{number:int}", routes.claim),
             Route("/advice/{number:int}", routes.advice),
             Route("/act/{number:int}", routes.act, methods=["POST"]),
             Route("/models/{number:int}", routes.models),
@@ -187,6 +188,13 @@ class _Routes:
     async def state(self, request: Request) -> Response:
         return await self._answer(request, None)
 
+    async def claim(self, request: Request) -> Response:
+        """The revision of an object, and whether its photo was changed in another browser."""
+        number, slot = _place(request)
+        state = self._session.photo_state(number, slot)
+        elsewhere = self._claims.is_elsewhere(number, request.cookies.get(_BROWSER, ""))
+        return JSONResponse({"revision": state.history.revision, "elsewhere": elsewhere})
+
     async def advice(self, request: Request) -> Response:
         number, slot = _place(request)
 
@@ -227,6 +235,7 @@ class _Routes:
         session = self._session
         number, slot = _place(request)
         browser = request.cookies.get(_BROWSER, "")
+        person = "" if request.client is None else request.client.host
 
         def work() -> bytes:
             with session.lock:
@@ -234,7 +243,7 @@ class _Routes:
                 if action is not None:
                     views = session.photo_state(number, slot).all_views
                     photos = {number, *(session.place_of(view)[0] for view in views)}
-                    self._claims.take_all(photos, browser)
+                    self._claims.take(photos, browser, person)
                     outcome = perform(session, number, action, slot=slot)
                 state = page_state(session, number, outcome, slot=slot)
             return json.dumps(state, separators=(",", ":"), allow_nan=False).encode()

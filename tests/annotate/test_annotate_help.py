@@ -8,11 +8,11 @@ from pathlib import Path
 import httpx
 import pytest
 from playwright.sync_api import Browser, expect
-from support.annotating import IDLE, Case, served, wait
+from support.annotating import IDLE, Case, opened_page, served, wait
 
 import cadalign.web
-from cadalign.annotate.claims import LEASE, Claims
 from cadalign.annotate.guard import Access
+from cadalign.annotate.locks import LEASE, Claims
 from cadalign.annotate.server import listen
 from cadalign.errors import CadalignError
 
@@ -52,6 +52,28 @@ def test_tour_has_three_steps_and_comes_once(
         context.close()
 
 
+@pytest.mark.parametrize(("width", "height"), [(1366, 768), (390, 844)])
+def test_help_opens_at_its_beginning_and_covers_no_photo(
+    browser: Browser, case: Case, width: int, height: int
+) -> None:
+    with opened_page(browser, case.open(), width=width, height=height) as page:
+        page.keyboard.press("?")
+        title = page.get_by_role("heading", name="Keys and mouse")
+        expect(title).to_be_focused()
+        assert page.locator("dialog.help").evaluate("d => d.scrollTop") == 0
+        help_box = page.locator("dialog.help").bounding_box()
+        photo = page.locator("section[aria-label=Photo]").bounding_box()
+        assert help_box is not None
+        assert photo is not None
+        beside = help_box["x"] >= photo["x"] + photo["width"]
+        assert beside or help_box["y"] >= photo["y"] + photo["height"]
+        page.locator("dialog.help").evaluate("d => d.scrollTo(0, 1e6)")
+        page.keyboard.press("Escape")
+        expect(title).to_be_hidden()
+        page.keyboard.press("?")
+        assert page.locator("dialog.help").evaluate("d => d.scrollTop") == 0
+
+
 def test_every_key_is_listed_and_controls_have_tooltips_or_texts(
     browser: Browser, case: Case
 ) -> None:
@@ -77,25 +99,39 @@ def test_every_key_is_listed_and_controls_have_tooltips_or_texts(
 # --- a team ------------------------------------------------------------------------------------
 
 
-def test_photo_is_free_a_while_after_its_last_change() -> None:
+def test_photo_is_free_a_while_after_its_last_change_by_another_person() -> None:
     now = [0.0]
     claims = Claims(clock=lambda: now[0])
-    claims.take(0, "one")
-    claims.take(1, "two")
+    claims.take({0}, "one", "ann")
+    claims.take({1}, "two", "bob")
     now[0] = LEASE - 1
     with pytest.raises(CadalignError, match="someone else is annotating this photo"):
-        claims.take(0, "two")
-    claims.take(0, "one")
+        claims.take({0, 2}, "two", "bob")
+    assert not claims.is_elsewhere(2, "one")
+    claims.take({0}, "one", "ann")
     now[0] = LEASE + 1
     with pytest.raises(CadalignError, match="someone else"):
-        claims.take(0, "two")
+        claims.take({0}, "two", "bob")
     now[0] = 2 * LEASE
-    claims.take(0, "two")
+    claims.take({0}, "two", "bob")
     with pytest.raises(CadalignError, match="someone else"):
-        claims.take(0, "one")
+        claims.take({0}, "one", "ann")
 
 
-def test_second_browser_is_told_that_the_photo_is_taken(browser: Browser, case: Case) -> None:
+def test_another_browser_of_a_person_takes_a_photo_over_at_once() -> None:
+    now = [0.0]
+    claims = Claims(clock=lambda: now[0])
+    claims.take({0}, "one", "ann")
+    claims.take({0}, "two", "ann")
+    assert claims.is_elsewhere(0, "one")
+    assert not claims.is_elsewhere(0, "two")
+    now[0] = LEASE
+    assert not claims.is_elsewhere(0, "one")
+
+
+def test_reopened_in_another_browser_goes_on_and_the_first_page_is_told(
+    browser: Browser, case: Case
+) -> None:
     session = case.open()
     with served(session) as access:
         pages = []
@@ -105,12 +141,17 @@ def test_second_browser_is_told_that_the_photo_is_taken(browser: Browser, case: 
             wait(page, IDLE)
             pages.append(page)
         first, second = pages
+        told = "document.querySelector('[role=alert]').textContent.includes('in another browser')"
         first.evaluate("annotator.act({ do: 'place_uv', uv: [100, 100] })")
         wait(first, "annotator.api.idle && annotator.state.pairs.length === 1")
         second.evaluate("annotator.act({ do: 'place_uv', uv: [200, 100] })")
-        told = "document.querySelector('[role=alert]').textContent.includes('someone else is')"
-        wait(second, told)
-        assert len(session.photos[0].document.pairs) == 1
+        wait(second, "annotator.api.idle && annotator.state.pairs.length === 2")
+        wait(first, "annotator.state.pairs.length === 2")
+        wait(first, told)
+        first.evaluate("annotator.act({ do: 'delete', pair: 1 })")
+        wait(first, f"annotator.state.pairs.length === 1 && !({told})")
+        wait(second, f"annotator.state.pairs.length === 1 && {told}")
+        assert [pair.uv for pair in session.photos[0].document.pairs] == [(200, 100)]
         for page in pages:
             page.context.close()
 

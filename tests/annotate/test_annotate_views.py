@@ -12,8 +12,8 @@ import pytest
 from support.annotating import Case, fitted, flat
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.claims import Claims
 from cadalign.annotate.live import LiveAlignment
+from cadalign.annotate.locks import Claims
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main
@@ -304,10 +304,10 @@ def test_a_missing_further_photo_is_named(case: Case) -> None:
 
 def test_one_writer_has_all_photos_of_an_object() -> None:
     claims = Claims(clock=lambda: 0.0)
-    claims.take(1, "one")
+    claims.take({1}, "one", "ann")
     with pytest.raises(InputError, match="someone else is annotating this photo"):
-        claims.take_all({0, 1}, "two")
-    claims.take(0, "three")  # it was not taken with the other
+        claims.take({0, 1}, "two", "bob")
+    claims.take({0}, "three", "cleo")  # it was not taken with the other
 
 
 def test_pairs_of_a_similar_model_are_taken_for_as_far_off_as_they_are(case: Case) -> None:

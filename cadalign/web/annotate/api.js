@@ -44,6 +44,16 @@ export class Api {
     }
   }
 
+  /** The revision of what is shown, and whether another browser has changed it; null without one. */
+  async claim() {
+    try {
+      const response = await fetch(addressOf("claim", this.place));
+      return response.ok ? await response.json() : null;
+    } catch {
+      return null; // the next action tells that the server is gone
+    }
+  }
+
   /** A library's models, ranked by an object's pairs; null if the server does not answer. */
   async models() {
     try {

@@ -13,7 +13,7 @@ const HELD = { h: (app, held) => app.hide(held), s: (app, held) => app.snap({ he
 /** @param {object} app - what the keys do; see main.js */
 export function listen(app) {
   document.addEventListener("keydown", (event) => {
-    if (event.defaultPrevented || document.querySelector("dialog[open]")) return;
+    if (event.defaultPrevented || document.querySelector("dialog[open]:not(.help)")) return;
     if (event.target.closest("input:not([type=checkbox]), select, textarea")) return;
     const held = !event.ctrlKey && !event.metaKey && !event.altKey && HELD[event.key.toLowerCase()];
     const done = held ? held(app, true) : event.ctrlKey || event.metaKey ? withControl(app, event) : plain(app, event);

@@ -81,7 +81,7 @@ export class Layout {
           this.loupe,
           this.undo,
           this.redo,
-          button("Help", () => this.help.showModal(), { title: "?", "aria-haspopup": "dialog" }),
+          button("Help", () => this.showHelp(), { title: "?", "aria-haspopup": "dialog" }),
         ),
       ),
       this.message,
@@ -95,8 +95,8 @@ export class Layout {
         view("Model", this.model, handlers.model, { below: [this.models, this.shown, this.result, this.asPhoto] }),
         panel,
       ),
-      this.help,
     );
+    this.model.before(this.help); // beside the photo, which stays in sight
   }
 
   show(state) {
@@ -118,6 +118,13 @@ export class Layout {
     this.saved.classList.toggle("trouble", Boolean(saved.trouble));
     this.saved.textContent = savedText(saved);
     if (state.message) this.tell(state.message);
+  }
+
+  /** Open the help at its beginning, or close it. */
+  showHelp() {
+    if (this.help.open) this.help.close();
+    else this.help.show();
+    this.help.scrollTop = 0;
   }
 
   showTool(tool) {
@@ -217,9 +224,14 @@ function view(name, host, { zoom, fit }, { above = null, below }) {
 
 function helpDialog(onTour) {
   const rows = KEYS.map(([key, text]) => h("div", {}, h("dt", {}, key), h("dd", {}, text)));
-  const dialog = h("dialog", { "aria-labelledby": "help-title" });
+  const dialog = h("dialog", { class: "help", "aria-labelledby": "help-title" });
+  dialog.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape") return;
+    event.stopPropagation();
+    dialog.close();
+  });
   dialog.append(
-    h("h2", { id: "help-title" }, "Keys and mouse"),
+    h("h2", { id: "help-title", tabindex: "-1", autofocus: true }, "Keys and mouse"),
     h("dl", {}, rows),
     h(
       "p",

@@ -16,6 +16,8 @@ import { WorkList } from "./worklist.js";
 import { PhotoView } from "./photo_view.js";
 
 const POLL = 400; // while the solvers are being prepared [ms]
+const FOLLOW = 2000; // between looks for changes in other pages [ms]
+const ELSEWHERE = "This photo was changed in another browser: this page follows. A change made here takes it back.";
 // ShapeNet's models face -z, with y up; none is looked at straight along y, where left is undefined.
 const SIDES = {
   front: [0, 0, -1], back: [0, 0, 1], left: [1, 0, 0], right: [-1, 0, 0],
@@ -93,6 +95,7 @@ class App {
     listen(this);
     window.addEventListener("hashchange", () => this.open());
     window.addEventListener("focus", () => this.api.idle && this.state && this.api.refresh());
+    setInterval(() => this.follow(), FOLLOW);
   }
 
   async start() {
@@ -180,6 +183,17 @@ class App {
     const { image, revision } = this.state;
     const isOfThis = ranked?.number === image.number && ranked.object === image.object;
     return isOfThis && ranked.revision === revision;
+  }
+
+  /** Show what was changed in another page, and say so if it is another browser's. */
+  async follow() {
+    if (document.hidden || !this.api.idle || !this.state) return;
+    const { api, state } = this;
+    const found = await api.claim();
+    if (!found || !api.idle || state !== this.state) return;
+    if (found.revision !== state.revision) await api.refresh();
+    if (found.elsewhere !== Boolean(this.elsewhere)) this.layout.tell(found.elsewhere ? ELSEWHERE : "");
+    this.elsewhere = found.elsewhere;
   }
 
   /** Do an action; the time until its result is drawn is kept in `redrawn` [ms]. */
@@ -342,7 +356,7 @@ class App {
   }
 
   showHelp() {
-    this.layout.help.showModal();
+    this.layout.showHelp();
     return true;
   }
 

@@ -15,8 +15,7 @@ import numpy as np
 import tyro
 from common import Picture, write_row
 
-from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.wireframe import Wireframe
+from cadalign.annotate.model import ClickableModel, Wireframe
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.estimation.fit import fit
 from cadalign.geometry.alignment import Alignment

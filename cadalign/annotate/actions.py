@@ -1,299 +1,30 @@
-"""Actions of the page on one photo, as declared JSON documents."""
+"""Actions of the page: a function each, of which the keyword arguments are the JSON document."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from functools import cache
+from typing import Any, get_type_hints
 
-from cadalign.annotate.action import Action, ActionOutcome, inside
+import msgspec
+
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
 from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS
 from cadalign.annotate.masks import nearest_corner
 from cadalign.annotate.models import SAME_PLACE
 from cadalign.annotate.object_actions import OBJECT_ACTIONS, bring_back
 from cadalign.annotate.objects import PhotoState
-from cadalign.annotate.session import Session
-from cadalign.annotate.worklist import Mark
+from cadalign.annotate.photos import Mark
+from cadalign.annotate.session import ActionOutcome, Session
 from cadalign.errors import InputError, quote
-from cadalign.io.documents import (
-    Index,
-    NotNegative,
-    Point2,
-    Point3,
-    Text,
-    convert,
-)
+from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert
 
 _LONGEST_REACH = 200.0  # of a corner of the photo [px]
 _MISSED = "That click missed the model."
 MIRRORED = 0.01
 """Largest distance of a point from a mirror image that it counts as [diagonals]."""
-
-
-class _Placing(Action, kw_only=True):
-    """Place a half, by preference of the given pair."""
-
-    pair: Index | None = None
-
-
-class PlaceUv(_Placing):
-    """Place a photo half."""
-
-    uv: Point2
-    snap: NotNegative = 0.0  # farthest corner of the photo that it goes to [px]
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        uv = _snapped(self.uv, self.snap, session, state)
-        document, pair = state.document.place_uv(uv, self.pair)
-        state.record(document)
-        return ActionOutcome(pair, _no_corner(self.snap, moved=uv != self.uv))
-
-
-class PlaceKeypoint(_Placing):
-    """Place a model half: a keypoint of the registry."""
-
-    keypoint: Index
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        state.model.registry[self.keypoint]  # refuses an unknown one
-        return _place(self.keypoint, self.pair, state)
-
-
-class _Aiming(Action, kw_only=True):
-    """Point at the model by a ray, or at the keypoint ``near`` it if that is visible."""
-
-    origin: Point3
-    direction: Point3
-    near: Index | None = None
-    snap: NotNegative = 0.0  # see `CadModel.pick`
-
-    def target(self, state: PhotoState) -> int | None:
-        """The keypoint pointed at, registered; None if the ray misses the model."""
-        model, registry = state.model.cad, state.model.registry
-        origin = model.from_display(self.origin)
-        if self.near is not None and model.is_seen(origin, registry[self.near].xyz):
-            return self.near
-        point = model.pick(origin, self.direction, snap=self.snap)
-        if point is None:
-            return None
-        known = registry.find(point.xyz, tolerance=SAME_PLACE * model.diagonal)
-        return registry.add(point) if known is None else known
-
-
-class Pick(_Aiming):
-    """Place a model half."""
-
-    pair: Index | None = None
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        keypoint = self.target(state)
-        if keypoint is None:
-            return ActionOutcome(message=_MISSED)
-        return _place(keypoint, self.pair, state)
-
-
-class Repick(_Aiming):
-    """Move the model half of a pair."""
-
-    pair: Index
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        keypoint = self.target(state)
-        if keypoint is None:
-            return ActionOutcome(self.pair, _MISSED)
-        state.record(state.document.exchange_keypoint(self.pair, keypoint))
-        return ActionOutcome(self.pair)
-
-
-class PlaceMirrored(Action):
-    """Begin a pair at the mirror image of another's model point."""
-
-    pair: Index
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        keypoint = state.document.pair(self.pair).keypoint
-        registry, model = state.model.registry, state.model.cad
-        point = None if keypoint is None else model.mirrored(registry[keypoint].xyz)
-        if point is None:
-            raise InputError(
-                "its model point has no mirror image", where="pair", fix="choose another pair"
-            )
-        known = registry.find(point.xyz, tolerance=MIRRORED * model.diagonal)
-        return _place(registry.add(point) if known is None else known, None, state)
-
-
-class PlaceSuggested(_Placing):
-    """Place the suggested keypoint."""
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        _, suggestion = session.live(state)
-        if suggestion is None:
-            raise InputError(
-                "there is no suggested keypoint yet", where="suggestion", fix="place more pairs"
-            )
-        keypoint = suggestion.point.semantic_id
-        if keypoint is None:
-            keypoint = state.model.registry.add(suggestion.point)
-        return _place(keypoint, self.pair, state)
-
-
-class Move(Action):
-    """Move a photo half; moves of one gesture are undone together."""
-
-    pair: Index
-    uv: Point2
-    gesture: Index | None = None
-    snap: NotNegative = 0.0  # as of `PlaceUv`
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        uv = _snapped(self.uv, self.snap, session, state)
-        moved = state.document.move(self.pair, uv)
-        step = None if self.gesture is None else (self.pair, self.gesture)
-        state.record(moved, step=step)
-        return ActionOutcome(self.pair, _no_corner(self.snap, moved=uv != self.uv))
-
-
-class Release(Action):
-    """Remove the model half of a pair."""
-
-    pair: Index
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        state.record(state.document.release_keypoint(self.pair))
-        return ActionOutcome(self.pair)
-
-
-class Delete(Action):
-    """Delete a pair."""
-
-    pair: Index
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        state.record(state.document.delete(self.pair))
-        return ActionOutcome()
-
-
-class Rename(Action):
-    """Rename the keypoint of a pair."""
-
-    pair: Index
-    name: Text
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        keypoint = state.document.pair(self.pair).keypoint
-        if keypoint is None:
-            raise InputError(
-                "this pair has no model point yet", where="pair", fix="click on the model first"
-            )
-        state.model.registry.rename(keypoint, self.name)
-        return ActionOutcome(self.pair)
-
-
-class Identify(Action):
-    """Say which keypoint of the category's shape the model point of a pair is."""
-
-    pair: Index
-    label: Index | Text
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        keypoint = state.document.pair(self.pair).keypoint
-        shape = session.shape
-        if keypoint is None or shape is None or self.label not in shape.ids:
-            raise InputError(
-                f"{quote(self.label)} is no keypoint of the shape", where="label", fix="choose one"
-            )
-        registry = state.model.registry
-        if shape.is_named:
-            registry.rename(keypoint, str(self.label))
-            return ActionOutcome(self.pair)
-        point = registry[keypoint]
-        own = point.name if point.name != f"point {keypoint}" else f"keypoint {self.label}"
-        known = registry.add_as(int(self.label), replace(point, name=own))
-        state.record(state.document.exchange_keypoint(self.pair, known))
-        return ActionOutcome(self.pair)
-
-
-class Accept(Action):
-    """Place pairs as a detector proposes: those of some keypoints, or all that are left."""
-
-    keypoints: list[Index] | None = None
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        document, number = state.document, None
-        for proposal in state.proposals:
-            keypoint = proposal.keypoint
-            if self.keypoints is not None and keypoint not in self.keypoints:
-                continue
-            if keypoint not in document.keypoints:
-                number = document.next_number
-                document = document.append(Pair(number, proposal.uv, keypoint))
-        if number is None:
-            return ActionOutcome(message="Nothing is proposed that is not placed.")
-        state.record(document)
-        return ActionOutcome(number)
-
-
-class MarkPhoto(Action):
-    """Say that a photo is done or skipped, or neither."""
-
-    mark: Mark | None = None
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        session.before_saving()
-        session.worklist = session.worklist.marked(state.photo.path.name, self.mark)
-        return ActionOutcome()
-
-
-class Undo(Action):
-    """Undo the last change."""
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        deleted = session.deletions.last(session.place_of(state)[0], at_once=True)
-        if deleted is not None:
-            return bring_back(deleted)
-        before = state.marked
-        is_done = state.history.undo()
-        return _gone_through(state, before, "" if is_done else "There is nothing to undo.")
-
-
-class Redo(Action):
-    """Redo the last undone change."""
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        before = state.marked
-        is_done = state.history.redo()
-        if state.owner.document.is_gone:
-            session.deletions.add(session.place_of(state)[0], state.owner)
-        return _gone_through(state, before, "" if is_done else "There is nothing to redo.")
-
-
-ACTIONS: dict[str, type[Action]] = {
-    "place_uv": PlaceUv,
-    "place_keypoint": PlaceKeypoint,
-    "pick": Pick,
-    "repick": Repick,
-    "mirrored": PlaceMirrored,
-    "suggested": PlaceSuggested,
-    "move": Move,
-    "release": Release,
-    "delete": Delete,
-    "rename": Rename,
-    "identify": Identify,
-    **EVIDENCE_ACTIONS,
-    **OBJECT_ACTIONS,
-    "accept": Accept,
-    "mark": MarkPhoto,
-    "undo": Undo,
-    "redo": Redo,
-}
-"""Actions by the name that the page sends as ``do``."""
-
-DELETING = ("delete_object", "undo", "redo")
-"""Those after which undoing brings back what was deleted."""
-
-RENAMING = ("rename", "identify")
-"""Those that may change the names of keypoints instead of the document."""
 
 
 def perform(
@@ -314,27 +45,245 @@ def perform(
                 fix="reload the page",
             )
         name = action.get("do")
-        kind = ACTIONS.get(name) if isinstance(name, str) else None
-        if kind is None:
+        function = ACTIONS.get(name) if isinstance(name, str) else None
+        if function is None:
             raise InputError(
                 f"{quote(name)} is not an action",
                 where="do",
                 fix=f"known are {', '.join(ACTIONS)}",
             )
         before = {id(each): each.history.document for each in session.states}
-        outcome: ActionOutcome = convert(action, kind).apply(session, state)
+        arguments = convert(action, _arguments_of(function))
+        outcome = function(session, state, **msgspec.structs.asdict(arguments))
         owners = [each for each in session.states if each.lead is None]
         changed = [each for each in owners if before.get(id(each)) is not each.document]
         for each in changed:
             session.save(each)
-        if changed and name not in DELETING:
+        if changed and name not in _DELETING:
             session.deletions.note_change(number)
-        if name in RENAMING:
+        if name in _RENAMING:
             session.save(state)
         return outcome
 
 
-def _gone_through(state: PhotoState, before: AnnotationDocument, nothing: str) -> ActionOutcome:
+@cache
+def _arguments_of(function: Callable[..., ActionOutcome]) -> type[msgspec.Struct]:
+    """The document of a function's keyword arguments."""
+    hints = get_type_hints(function, include_extras=True)
+    fields = [
+        (name, hints[name], msgspec.NODEFAULT if each.default is each.empty else each.default)
+        for name, each in inspect.signature(function).parameters.items()
+        if each.kind is each.KEYWORD_ONLY
+    ]
+    return msgspec.defstruct(function.__name__, fields, bases=(ForeignDocument,), kw_only=True)
+
+
+def place_uv(
+    session: Session,
+    state: PhotoState,
+    *,
+    uv: Point2,
+    pair: Index | None = None,
+    snap: NotNegative = 0.0,
+) -> ActionOutcome:
+    """Place a photo half, by preference of the given pair; see `move` for ``snap``."""
+    place = _snapped(uv, snap, session, state)
+    document, number = state.document.place_uv(place, pair)
+    state.record(document)
+    return ActionOutcome(number, _no_corner(snap, moved=place != uv))
+
+
+def place_keypoint(
+    session: Session, state: PhotoState, *, keypoint: Index, pair: Index | None = None
+) -> ActionOutcome:
+    """Place a model half, a keypoint of the registry, by preference of the given pair."""
+    state.model.registry[keypoint]  # refuses an unknown one
+    document, number = state.document.place_keypoint(keypoint, pair)
+    state.record(document)
+    return ActionOutcome(number)
+
+
+def pick(
+    session: Session,
+    state: PhotoState,
+    *,
+    origin: Point3,
+    direction: Point3,
+    near: Index | None = None,
+    snap: NotNegative = 0.0,
+    pair: Index | None = None,
+) -> ActionOutcome:
+    """Place a model half by a ray; see `_aimed_at`."""
+    keypoint = _aimed_at(state, origin, direction, near, snap)
+    if keypoint is None:
+        return ActionOutcome(message=_MISSED)
+    return place_keypoint(session, state, keypoint=keypoint, pair=pair)
+
+
+def repick(
+    session: Session,
+    state: PhotoState,
+    *,
+    pair: Index,
+    origin: Point3,
+    direction: Point3,
+    near: Index | None = None,
+    snap: NotNegative = 0.0,
+) -> ActionOutcome:
+    """Move the model half of a pair by a ray; see `_aimed_at`."""
+    keypoint = _aimed_at(state, origin, direction, near, snap)
+    if keypoint is None:
+        return ActionOutcome(pair, _MISSED)
+    state.record(state.document.exchange_keypoint(pair, keypoint))
+    return ActionOutcome(pair)
+
+
+def mirrored(session: Session, state: PhotoState, *, pair: Index) -> ActionOutcome:
+    """Begin a pair at the mirror image of another's model point."""
+    keypoint = state.document.pair(pair).keypoint
+    registry, model = state.model.registry, state.model.cad
+    point = None if keypoint is None else model.mirrored(registry[keypoint].xyz)
+    if point is None:
+        raise InputError(
+            "its model point has no mirror image", where="pair", fix="choose another pair"
+        )
+    known = registry.find(point.xyz, tolerance=MIRRORED * model.diagonal)
+    image = registry.add(point) if known is None else known
+    return place_keypoint(session, state, keypoint=image)
+
+
+def suggested(session: Session, state: PhotoState, *, pair: Index | None = None) -> ActionOutcome:
+    """Place the suggested keypoint, by preference of the given pair."""
+    _, suggestion = session.live(state)
+    if suggestion is None:
+        raise InputError(
+            "there is no suggested keypoint yet", where="suggestion", fix="place more pairs"
+        )
+    keypoint = suggestion.point.semantic_id
+    if keypoint is None:
+        keypoint = state.model.registry.add(suggestion.point)
+    return place_keypoint(session, state, keypoint=keypoint, pair=pair)
+
+
+def move(
+    session: Session,
+    state: PhotoState,
+    *,
+    pair: Index,
+    uv: Point2,
+    gesture: Index | None = None,
+    snap: NotNegative = 0.0,
+) -> ActionOutcome:
+    """Move a photo half; moves of one gesture are undone together.
+
+    It goes to a corner of the photo at most ``snap`` px away.
+    """
+    place = _snapped(uv, snap, session, state)
+    step = None if gesture is None else (pair, gesture)
+    state.record(state.document.move(pair, place), step=step)
+    return ActionOutcome(pair, _no_corner(snap, moved=place != uv))
+
+
+def release(session: Session, state: PhotoState, *, pair: Index) -> ActionOutcome:
+    """Remove the model half of a pair."""
+    state.record(state.document.release_keypoint(pair))
+    return ActionOutcome(pair)
+
+
+def delete(session: Session, state: PhotoState, *, pair: Index) -> ActionOutcome:
+    """Delete a pair."""
+    state.record(state.document.delete(pair))
+    return ActionOutcome()
+
+
+def rename(session: Session, state: PhotoState, *, pair: Index, name: Text) -> ActionOutcome:
+    """Rename the keypoint of a pair."""
+    keypoint = state.document.pair(pair).keypoint
+    if keypoint is None:
+        raise InputError(
+            "this pair has no model point yet", where="pair", fix="click on the model first"
+        )
+    state.model.registry.rename(keypoint, name)
+    return ActionOutcome(pair)
+
+
+def identify(
+    session: Session, state: PhotoState, *, pair: Index, label: Index | Text
+) -> ActionOutcome:
+    """Say which keypoint of the category's shape the model point of a pair is."""
+    keypoint, shape = state.document.pair(pair).keypoint, session.shape
+    if keypoint is None or shape is None or label not in shape.ids:
+        raise InputError(
+            f"{quote(label)} is no keypoint of the shape", where="label", fix="choose one"
+        )
+    registry = state.model.registry
+    if shape.is_named:
+        registry.rename(keypoint, str(label))
+        return ActionOutcome(pair)
+    point = registry[keypoint]
+    own = point.name if point.name != f"point {keypoint}" else f"keypoint {label}"
+    known = registry.add_as(int(label), replace(point, name=own))
+    state.record(state.document.exchange_keypoint(pair, known))
+    return ActionOutcome(pair)
+
+
+def accept(
+    session: Session, state: PhotoState, *, keypoints: list[Index] | None = None
+) -> ActionOutcome:
+    """Place pairs at a detector's proposals for some keypoints, or for all that are left."""
+    document, number = state.document, None
+    for proposal in state.proposals:
+        keypoint = proposal.keypoint
+        if (keypoints is None or keypoint in keypoints) and keypoint not in document.keypoints:
+            number = document.next_number
+            document = document.append(Pair(number, proposal.uv, keypoint))
+    if number is None:
+        return ActionOutcome(message="Nothing is proposed that is not placed.")
+    state.record(document)
+    return ActionOutcome(number)
+
+
+def mark(session: Session, state: PhotoState, *, mark: Mark | None = None) -> ActionOutcome:
+    """Say that a photo is done or skipped, or neither."""
+    session.before_saving()
+    session.worklist = session.worklist.marked(state.photo.path.name, mark)
+    return ActionOutcome()
+
+
+def undo(session: Session, state: PhotoState) -> ActionOutcome:
+    """Undo the last change."""
+    deleted = session.deletions.last(session.place_of(state)[0], at_once=True)
+    if deleted is not None:
+        return bring_back(deleted)
+    before = state.marked
+    return _gone(state, before, "" if state.history.undo() else "There is nothing to undo.")
+
+
+def redo(session: Session, state: PhotoState) -> ActionOutcome:
+    """Redo the last undone change."""
+    before = state.marked
+    is_done = state.history.redo()
+    if state.owner.document.is_gone:
+        session.deletions.add(session.place_of(state)[0], state.owner)
+    return _gone(state, before, "" if is_done else "There is nothing to redo.")
+
+
+ACTIONS: dict[str, Callable[..., ActionOutcome]] = {
+    function.__name__: function
+    for function in (
+        *(place_uv, place_keypoint, pick, repick, mirrored, suggested, move, release, delete),
+        *(rename, identify, *EVIDENCE_ACTIONS, *OBJECT_ACTIONS, accept, mark, undo, redo),
+    )
+}
+"""Actions by the name that the page sends as ``do``."""
+
+# Those after which undoing brings back what was deleted, and those that may change the names of
+# keypoints instead of the document.
+_DELETING = ("delete_object", "undo", "redo")
+_RENAMING = ("rename", "identify")
+
+
+def _gone(state: PhotoState, before: AnnotationDocument, nothing: str) -> ActionOutcome:
     """The outcome of undoing or redoing, which may concern another photo of the object.
 
     ``nothing`` says that nothing was done, if so; ``before`` is what was marked in the photo.
@@ -348,15 +297,27 @@ def _gone_through(state: PhotoState, before: AnnotationDocument, nothing: str) -
     return ActionOutcome()
 
 
-def _place(keypoint: int, pair: int | None, state: PhotoState) -> ActionOutcome:
-    document, number = state.document.place_keypoint(keypoint, pair)
-    state.record(document)
-    return ActionOutcome(number)
+def _aimed_at(
+    state: PhotoState, origin: Point3, direction: Point3, near: int | None, snap: float
+) -> int | None:
+    """The keypoint that a ray points at, registered; None if it misses the model.
+
+    It is the keypoint ``near`` it if that is visible. For ``snap`` see `ClickableModel.pick`.
+    """
+    model, registry = state.model.cad, state.model.registry
+    start = model.from_display(origin)
+    if near is not None and model.is_seen(start, registry[near].xyz):
+        return near
+    point = model.pick(start, direction, snap=snap)
+    if point is None:
+        return None
+    known = registry.find(point.xyz, tolerance=SAME_PLACE * model.diagonal)
+    return registry.add(point) if known is None else known
 
 
 def _snapped(uv: Pixel, reach: float, session: Session, state: PhotoState) -> Pixel:
     """The nearest corner of the photo within reach [px], or the place itself."""
-    uv = inside(uv, state)
+    state.require_inside(uv)
     if not reach > 0:
         return uv
     corner = nearest_corner(session.pixels(state), uv, reach=min(reach, _LONGEST_REACH))

@@ -20,8 +20,7 @@ import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Priors
 from cadalign.annotate.evidence import FurtherEvidence
-from cadalign.annotate.keypoints import KeypointRegistry
-from cadalign.annotate.models import SAME_PLACE, OpenedModel, refuse_other_model
+from cadalign.annotate.models import SAME_PLACE, KeypointRegistry, OpenedModel, refuse_other_model
 from cadalign.annotate.names import earlier_unfinished_file
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.arrays import FloatArray

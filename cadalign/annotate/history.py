@@ -18,7 +18,7 @@ from platformdirs import user_state_path
 
 from cadalign.annotate.document import AnnotationDocument, FurtherView, Pair
 from cadalign.annotate.evidence import MarkedEvidence
-from cadalign.annotate.keypoints import KeypointRegistry
+from cadalign.annotate.models import KeypointRegistry
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.io.documents import Document, read_document

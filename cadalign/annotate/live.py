@@ -1,24 +1,27 @@
-"""Live alignment: the estimate from all photos of an object, as one of them shows it."""
+"""Live alignment: the estimate from all photos of an object, as one of them shows it, drawn."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from cadalign.annotate.estimate import LEAST_SIGMA, Estimate, Known
 from cadalign.annotate.evidence import evidence_labels
+from cadalign.annotate.model import Wireframe, box_lines
+from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.wireframe import Wireframe
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import projected_covariances
 from cadalign.io.observation import Observation
+from cadalign.render.drawing.keypoint_layer import confidence_regions
 from cadalign.shapes.model import ShapeModel
 
 _LEAST_PAIRS, _LEAST_JOINT_PAIRS = 4, 3  # without and with evidence beside them
@@ -185,3 +188,55 @@ def _warped(
         source = np.array([known.anchors[result.ids[row]].xyz for row in rows])
         target = result.points_3d[rows]
     return wireframe.warped(source, target, result.bounds, carried=free)
+
+
+def drawing_of(
+    live: LiveAlignment, shape: ObjectShape | None, registry: KeypointRegistry, used: frozenset[int]
+) -> dict[str, Any]:
+    """Box and edges of the model and, for an own shape, its keypoints with regions that hold them.
+
+    Regions of keypoints that the model lacks are the faint ones. There are none in another view
+    than the first.
+    """
+    result, lines = live.result, live.wireframe
+    assert result is not None
+    assert lines is not None
+    drawing: dict[str, Any] = {
+        "box": box_of(live),
+        "lines": _flat(lines.seen_in(live.camera, live.alignment)),
+        "keypoints": [],
+        "regions": [],
+        "faint_regions": [],
+    }
+    if shape is None or live.place:
+        return drawing
+    in_camera = result.alignment.apply(result.points_3d)
+    names = {shape.id_of(point): (point.name, number in used) for number, point in registry}
+    ahead = in_camera[:, 2] > 0
+    pixels = live.camera.project(in_camera[ahead])
+    of_points = cast(FloatArray, result.points_cam_covariance)
+    covariances = projected_covariances(in_camera[ahead], of_points[ahead], live.camera)
+    for row, uv in zip(np.flatnonzero(ahead), pixels.tolist(), strict=True):
+        label = result.ids[row]
+        fallback = label if isinstance(label, str) else f"keypoint {label}"
+        name, is_used = names.get(label, (fallback, False))  # type: ignore[call-overload]
+        state = "marked" if is_used else "unmarked" if label in names else "unknown"
+        drawing["keypoints"].append({"uv": np.round(uv, 1).tolist(), "name": name, "state": state})
+    on_model = np.array([label in names for label in result.ids])[ahead]
+    for key, rows in (("regions", on_model), ("faint_regions", ~on_model)):
+        regions = confidence_regions(pixels[rows], covariances[rows])
+        drawing[key] = [np.round(region, 1).ravel().tolist() for region in regions]
+    return drawing
+
+
+def box_of(live: LiveAlignment) -> list[float]:
+    """The box of an estimate alone, as x1, y1, x2, y2, ...; empty without an estimate."""
+    if live.result is None:
+        return []
+    return _flat(box_lines(live.result.bounds, live.camera, live.alignment))
+
+
+def _flat(lines: FloatArray) -> list[float]:
+    """Lines (k, 2, 2) as x1, y1, x2, y2, ... to a tenth of a pixel."""
+    inside = lines[(np.abs(lines) < 1e6).all(axis=(1, 2))]
+    return np.round(inside, 1).ravel().tolist()

@@ -1,24 +1,30 @@
-"""CAD model in the annotator: exact points on its full mesh, and its simplified display."""
+"""CAD model in the annotator: exact points on its full mesh, its display, and its lines."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.snapping import CREASE, MirrorPlanes, SnapPoints, find_rim
-from cadalign.arrays import BoolArray, FloatArray, as_floats
+from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.edges import mesh_edges
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray
-from cadalign.geometry.simplify import simplify
+from cadalign.geometry.simplify import cluster, simplify
 from cadalign.render.drawing.color import bytes_from_linear
 from cadalign.render.raycast.coincident import coincident_faces
 from cadalign.render.scene import Scene
+from cadalign.render.views.visibility import visible_keypoints
+from cadalign.shapes.warp import warp_mesh
 
 MOST_FACES = 150_000  # that are displayed
 _SAMPLES = 96
@@ -29,6 +35,12 @@ _NEAREST_SAMPLES = 2e-3  # in diagonals
 _BENEATH = 0.02
 _EXACT = 1e-6
 _MOST_TRIED = 40  # vertices near a click, of which the first visible one is taken
+_MOST_LINE_FACES = 30_000
+_MOST_CREASES = 1500
+_MOST_LINES = 3000
+_CREASE_DEG = 30.0
+_LONGEST = 1 / 24  # of a line [diagonals]: each is drawn or hidden as a whole
+_BOX_PIECES = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,3 +244,128 @@ def detail_bytes(model: ClickableModel, creases: FloatArray) -> bytes:
             model.displayed.is_doubled.astype(np.uint8).tobytes(),
         ]
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Smooth edges, which show only on the silhouette, and creases, which always show.
+
+    As numbers of vertices: of their ends (k, 2), and of the third corners (k, 2) of the triangles
+    beside smooth ones.
+    """
+
+    smooth: IntArray
+    beside: IntArray
+    creases: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Wireframe:
+    """Lines of a model, prepared once; ``scene`` is the surface that hides them."""
+
+    scene: Scene
+    _mesh: Mesh  # simplified, each vertex once
+    _edges: _Edges
+    _piece: float  # length of a line [model units]
+
+    @classmethod
+    def of_model(cls, model: ClickableModel) -> Wireframe:
+        """The lines of a model as it is."""
+        small = simplify(model.scene.mesh, max_faces=_MOST_LINE_FACES)
+        # Faces of real models seldom share vertices: weld those in one place.
+        welded = cluster(Mesh(small.vertices, small.faces), cells=1e6)
+        # A face that is written twice would make a crease of each of its sides.
+        alike, opposite = coincident_faces(welded.vertices, welded.faces)
+        single = np.minimum(alike, opposite) == np.arange(len(alike))
+        mesh = Mesh(welded.vertices, welded.faces[single])
+        return cls(model.scene, mesh, _find_edges(mesh), _LONGEST * model.diagonal)
+
+    @property
+    def creases(self) -> FloatArray:
+        """The lines that always show, (k, 2, 3) float [model units]."""
+        return self._mesh.vertices[self._edges.creases]
+
+    def warped(
+        self, source: FloatArray, target: FloatArray, bounds: FloatArray, *, carried: FloatArray
+    ) -> tuple[Wireframe, FloatArray]:
+        """Warp the lines, and points on the surface (k, 3); see `cadalign.shapes.warp.warp_mesh`.
+
+        The simplified mesh hides the lines.
+        """
+        mesh = self._mesh
+        together = Mesh(np.concatenate([mesh.vertices, carried]), mesh.faces)
+        moved = warp_mesh(together, source, target, bounds=bounds).vertices
+        vertices, points = np.split(moved, [len(mesh.vertices)])
+        warped = Mesh(vertices, mesh.faces)
+        return replace(self, scene=Scene(warped), _mesh=warped), points
+
+    def seen_in(self, camera: Camera, alignment: Alignment) -> FloatArray:
+        """Project the lines of the stretched model that a camera sees, (k, 2, 2) float [px]."""
+        vertices, edges = self._mesh.vertices, self._edges
+        eye = alignment.inverse(np.zeros((1, 3)))[0]
+        ends = vertices[edges.smooth]
+        outline = ends[_is_outline(ends, vertices[edges.beside], eye)]
+        lines = np.concatenate([vertices[edges.creases], outline])
+        lines = _cut(lines, self._piece)[:_MOST_LINES]
+        if not len(lines):
+            return np.empty((0, 2, 2))
+        seen = visible_keypoints(self.scene, lines.mean(axis=1), camera, alignment)
+        return _project_lines(lines[seen], camera, alignment)
+
+
+def box_lines(bounds: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
+    """Project the edges of the stretched model's box, in pieces, (k, 2, 2) float [px]."""
+    corners = Box.from_model(bounds, alignment).corners
+    ends = corners[np.array(BOX_EDGES)]
+    share = np.linspace(0, 1, _BOX_PIECES + 1)[:, None, None]
+    points = (ends[:, 0] * (1 - share) + ends[:, 1] * share).transpose(1, 0, 2)
+    lines = np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
+    return _project_lines(lines, camera, Alignment.identity())
+
+
+def _project_lines(lines: FloatArray, camera: Camera, alignment: Alignment) -> FloatArray:
+    """Project lines (k, 2, 3) to (k, 2, 2) [px]; drop those with an end behind the camera."""
+    ends = alignment.apply(lines.reshape(-1, 3)).reshape(-1, 2, 3)
+    near = 1e-6 * np.abs(alignment.translation).max(initial=1.0)
+    ends = ends[(ends[:, :, 2] > near).all(axis=1)]
+    if not len(ends):
+        return np.empty((0, 2, 2))
+    return camera.project(ends.reshape(-1, 3)).reshape(-1, 2, 2)
+
+
+def _is_outline(ends: FloatArray, beside: FloatArray, eye: FloatArray) -> BoolArray:
+    """Find the silhouette edges: both triangles on one side, seen from the eye, (e,) bool.
+
+    ``ends`` (e, 2, 3) and the third corners ``beside`` (e, 2, 3) are compared, not the normals:
+    triangles of real models face either way. Stretching does not change sides, so model coordinates
+    suffice.
+    """
+    start = ends[:, 0]
+    sight = np.cross(start - eye, ends[:, 1] - eye)
+    sides = np.einsum("eck,ek->ec", beside - start[:, None], sight)
+    return np.asarray(sides[:, 0] * sides[:, 1] > 0)
+
+
+def _find_edges(mesh: Mesh) -> _Edges:
+    edges = mesh_edges(mesh.vertices, mesh.faces, crease_angle=_CREASE_DEG)
+    creases = edges.ends[edges.creased]
+    length = np.linalg.norm(mesh.vertices[creases[:, 1]] - mesh.vertices[creases[:, 0]], axis=1)
+    longest = np.argsort(-length, kind="stable")
+    smooth = ~edges.creased
+    return _Edges(
+        edges.ends[smooth], edges.opposite[smooth], creases[np.sort(longest[:_MOST_CREASES])]
+    )
+
+
+def _cut(lines: FloatArray, piece: float) -> FloatArray:
+    """Cut lines (k, 2, 3) into pieces of at most that length."""
+    if not len(lines):
+        return lines
+    length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
+    parts = np.maximum(1, np.ceil(length / piece)).astype(np.int64)
+    line = np.repeat(np.arange(len(lines)), parts)
+    part = np.arange(len(line)) - np.repeat(np.cumsum(parts) - parts, parts)
+    low = (part / parts[line])[:, None]
+    high = ((part + 1) / parts[line])[:, None]
+    start, along = lines[line, 0], lines[line, 1] - lines[line, 0]
+    return np.stack([start + low * along, start + high * along], axis=1)

@@ -2,147 +2,171 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
-from cadalign.annotate.action import Action, ActionOutcome
-from cadalign.annotate.document import AnnotationDocument, Priors
+from cadalign.annotate.document import AnnotationDocument, FurtherView, Pair, Priors
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import MarkedEvidence
 from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.history import History
-from cadalign.annotate.models import OpenedModel
+from cadalign.annotate.models import KeypointRegistry, OpenedModel
 from cadalign.annotate.names import object_file, object_number
 from cadalign.annotate.objects import PhotoState, label_of, shown_objects
-from cadalign.annotate.ranking import switch_model
-from cadalign.annotate.session import Session
+from cadalign.annotate.session import ActionOutcome, Session
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Index, Text
 
 _LONGEST_NAME = 60
 
 
-class AddObject(Action):
+def add_object(
+    session: Session, state: PhotoState, *, name: str = "", model: Index | None = None
+) -> ActionOutcome:
     """Add an object to the photo, with the model of a number; by default that of this object."""
-
-    name: str = ""
-    model: Index | None = None
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        photo, _ = session.place_of(state)
-        name = _free_name(self.name, session.objects[photo], None)
-        model = state.model if self.model is None else session.models[self.model]
-        return ActionOutcome(shown=_add_object(session, photo, model, name))
+    photo, _ = session.place_of(state)
+    free = _free_name(name, session.objects[photo], None)
+    chosen = state.model if model is None else session.models[model]
+    return ActionOutcome(shown=_add_object(session, photo, chosen, free))
 
 
-class RenameObject(Action):
+def rename_object(session: Session, state: PhotoState, *, name: str) -> ActionOutcome:
     """Rename the object; an empty name gives it its number again."""
-
-    name: str
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        photo, _ = session.place_of(state)
-        name = _free_name(self.name, session.objects[photo], state)
-        state.record(replace(state.document, name=name))
-        return ActionOutcome()
+    photo, _ = session.place_of(state)
+    free = _free_name(name, session.objects[photo], state)
+    state.record(replace(state.document, name=free))
+    return ActionOutcome()
 
 
-class DeleteObject(Action):
+def delete_object(session: Session, state: PhotoState) -> ActionOutcome:
     """Delete the object with its files; it can be brought back while the program runs."""
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        label, owner = label_of(state), state.owner
-        kept = owner.document
-        empty = AnnotationDocument(
-            focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True
-        )
-        owner.record(empty)
-        for view in (owner, *owner.views):
-            view.drawn = None
-        for each in (owner, *owner.views):
-            session.deletions.add(session.place_of(each)[0], owner)
-        return ActionOutcome(message=f"Deleted: {label}. Ctrl+Z brings it back.")
+    label, owner = label_of(state), state.owner
+    kept = owner.document
+    owner.record(
+        AnnotationDocument(focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True)
+    )
+    for view in (owner, *owner.views):
+        view.drawn = None
+        session.deletions.add(session.place_of(view)[0], owner)
+    return ActionOutcome(message=f"Deleted: {label}. Ctrl+Z brings it back.")
 
 
-class RestoreObject(Action):
+def restore_object(session: Session, state: PhotoState) -> ActionOutcome:
     """Bring back the object of the photo that was deleted last."""
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        deleted = session.deletions.last(session.place_of(state)[0])
-        if deleted is None:
-            raise InputError("no deleted object is left", where="restore", fix="add one")
-        return bring_back(deleted)
+    deleted = session.deletions.last(session.place_of(state)[0])
+    if deleted is None:
+        raise InputError("no deleted object is left", where="restore", fix="add one")
+    return bring_back(deleted)
 
 
-class AddView(Action):
+def add_view(session: Session, state: PhotoState, *, photo: Index) -> ActionOutcome:
     """Add another photo as a further view of the object."""
-
-    photo: Index
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        target = session.photo_state(self.photo)
-        if any(view.key == target.key for view in state.all_views):
-            raise InputError(
-                f"{target.photo.path.name} is a photo of this object already",
-                where="photo",
-                fix="choose another one",
-            )
-        if state.owner.is_rigid:
-            raise InputError(
-                "the cameras of this object's photos are known, the new one's is not",
-                where="photo",
-                fix="write its camera pose into the observation",
-            )
-        return ActionOutcome(shown=_add_view(session, state.owner, self.photo))
-
-
-class RemoveView(Action):
-    """Take the photo from the object, with its pairs; undo brings it back."""
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        if state.lead is None:
-            raise InputError(
-                "the object's first photo cannot be taken from it",
-                where="photo",
-                fix="delete the object, or take its other photos from it",
-            )
-        state.remove_view()
-        return ActionOutcome(
-            shown=state.owner, message=f"{state.photo.path.name} is no longer used."
+    target = session.photo_state(photo)
+    if any(view.key == target.key for view in state.all_views):
+        raise InputError(
+            f"{target.photo.path.name} is a photo of this object already",
+            where="photo",
+            fix="choose another one",
         )
+    if state.owner.is_rigid:
+        raise InputError(
+            "the cameras of this object's photos are known, the new one's is not",
+            where="photo",
+            fix="write its camera pose into the observation",
+        )
+    return ActionOutcome(shown=_add_view(session, state.owner, photo))
 
 
-class ChooseModel(Action):
-    """Go on with another model of the library, in all photos of the object."""
-
-    category: Text
-    model: Text
-
-    def apply(self, session: Session, state: PhotoState) -> ActionOutcome:
-        before = sum(pair.keypoint is not None for pair in state.document.pairs)
-        switch_model(session, state, (self.category, self.model))
-        lost = before - sum(pair.keypoint is not None for pair in state.document.pairs)
-        if not lost:
-            return ActionOutcome()
-        pairs = "1 pair has" if lost == 1 else f"{lost} pairs have"
-        return ActionOutcome(message=f"{pairs} no keypoint on this model: click on it.")
+def remove_view(session: Session, state: PhotoState) -> ActionOutcome:
+    """Take the photo from the object, with its pairs; undo brings it back."""
+    if state.lead is None:
+        raise InputError(
+            "the object's first photo cannot be taken from it",
+            where="photo",
+            fix="delete the object, or take its other photos from it",
+        )
+    state.history.record(state.history.document.without_view(state.key))
+    return ActionOutcome(shown=state.owner, message=f"{state.photo.path.name} is no longer used.")
 
 
-OBJECT_ACTIONS: dict[str, type[Action]] = {
-    "add_object": AddObject,
-    "rename_object": RenameObject,
-    "delete_object": DeleteObject,
-    "restore_object": RestoreObject,
-    "add_view": AddView,
-    "remove_view": RemoveView,
-    "model": ChooseModel,
-}
-"""Actions by the name that the page sends as ``do``."""
+def model(session: Session, state: PhotoState, *, category: Text, model: Text) -> ActionOutcome:
+    """Go on with another model of the library, in all photos of the object.
+
+    Pairs keep their keypoints by semantic id or name.
+    """
+    choice = session.choice
+    if choice is None:
+        raise InputError("the session has no library", where="model", fix="start with --library")
+    mesh = choice.model((category, model)).mesh_path
+    assert mesh is not None
+    session.before_saving()  # where nothing may be written, nothing is changed either
+    owner = state.owner
+    old, new = owner.model, session.models.of(mesh)
+    if new is old:
+        return ActionOutcome()
+    if session.ready:
+        new.prepare(has_shape=session.shape is not None)
+    carried = carry_keypoints(old.registry, new.registry, choice.ids_on(old.path))
+    before = sum(pair.keypoint is not None for pair in state.document.pairs)
+    history = owner.history.changed(lambda document: _carried(document, carried))
+    for each in (owner, *owner.views):
+        each.model, each.history = new, history
+        each.files = replace(each.files, model=new.path)
+        each.live = each.estimate = None
+        each.proposals = tuple(
+            replace(proposal, keypoint=carried[proposal.keypoint])
+            for proposal in each.proposals
+            if proposal.keypoint in carried
+        )
+    lost = before - sum(pair.keypoint is not None for pair in state.document.pairs)
+    if not lost:
+        return ActionOutcome()
+    pairs = "1 pair has" if lost == 1 else f"{lost} pairs have"
+    return ActionOutcome(message=f"{pairs} no keypoint on this model: click on it.")
+
+
+OBJECT_ACTIONS = (
+    *(add_object, rename_object, delete_object, restore_object, add_view, remove_view, model),
+)
 
 
 def bring_back(deleted: PhotoState) -> ActionOutcome:
     """Undo the deletion of an object."""
     deleted.history.undo()
     return ActionOutcome(shown=deleted, message=f"Brought back: {label_of(deleted)}.")
+
+
+def carry_keypoints(
+    old: KeypointRegistry, new: KeypointRegistry, known: Collection[int]
+) -> dict[int, int]:
+    """Ids of the old model's keypoints on the new one, by the same semantic id, else name.
+
+    Only semantic ids that are ``known`` mean the same on both. A keypoint that was renamed keeps
+    its name.
+    """
+    carried = {number: number for number, _ in old if number in known and number in new}
+    for number in carried:
+        if old[number].name != new[number].name:
+            new.rename(number, old[number].name)
+    free = {point.name: number for number, point in new if number not in carried}
+    return carried | {
+        number: free[point.name]
+        for number, point in old
+        if number not in carried and point.name in free
+    }
+
+
+def _carried(document: AnnotationDocument, carried: Mapping[int, int]) -> AnnotationDocument:
+    """The document with its pairs' keypoints on the new model; halves without any are left out."""
+    moved: list[Pair] = []
+    for pair in document.pairs:
+        keypoint = None if pair.keypoint is None else carried.get(pair.keypoint)
+        if keypoint is not None or pair.uv is not None:
+            moved.append(replace(pair, keypoint=keypoint))
+    views = tuple(
+        FurtherView(view.photo, _carried(view.document, carried)) for view in document.further_views
+    )
+    return replace(document, pairs=tuple(moved), further_views=views)
 
 
 def _free_name(name: str, states: list[PhotoState], own: PhotoState | None) -> str:

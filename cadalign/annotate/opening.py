@@ -14,9 +14,8 @@ from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
 from cadalign.annotate.files import AnnotationFiles, StoredView, model_named_in
 from cadalign.annotate.history import History, history_path, read_history
-from cadalign.annotate.keypoints import read_proposals
 from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.models import SAME_PLACE, Models
+from cadalign.annotate.models import SAME_PLACE, Models, read_proposals
 from cadalign.annotate.names import (
     file_name,
     keypoints_file,
@@ -30,12 +29,12 @@ from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.photos import (
     Intrinsics,
     PhotoFile,
+    WorkList,
     find_photos,
     intrinsics_of,
     read_camera,
 )
 from cadalign.annotate.session import Session
-from cadalign.annotate.worklist import WorkList
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert

@@ -9,31 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.action import ActionOutcome
 from cadalign.annotate.actions import MIRRORED
-from cadalign.annotate.drawing import box_of, drawing_of
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import MarkedLengths, MaskDrawing, find_up
-from cadalign.annotate.live import LiveAlignment
+from cadalign.annotate.live import LiveAlignment, box_of, drawing_of
 from cadalign.annotate.masks import draw_mask
 from cadalign.annotate.objects import PhotoState, label_of, shown_objects
-from cadalign.annotate.observing import filled
-from cadalign.annotate.result_text import (
-    evidence_text,
-    facts_of,
-    how_text,
-    left_text,
-    next_best_text,
-    notes_of,
-)
-from cadalign.annotate.session import Session
-from cadalign.annotate.suggestion import Marked, Suggestion, present, rank
+from cadalign.annotate.result_text import facts_of, name_of, next_best_text, notes_of
+from cadalign.annotate.session import ActionOutcome, Session
+from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError
 from cadalign.io.documents import Point3, read_json
 from cadalign.io.evidence import LENGTHS
 
-_FOCAL = "With a known focal length, a mask, another photo and lengths are ranked here too."
 _VIEW = re.compile(r"views\[(\d+)\]")
 
 
@@ -90,46 +79,6 @@ def page_state(
             "suggestion": _suggestion(state, suggestion),
             **_objects(session, state),
         }
-
-
-def advice_state(session: Session, number: int, *, slot: int | None = None) -> dict[str, Any]:
-    """Rank what could be added to an object's pairs, of the annotation of that ``revision``.
-
-    Nothing is ranked without an alignment by the pairs alone, for an object's own shape, and where
-    the focal length is estimated.
-    """
-    with session.lock:
-        state = session.photo_state(number, slot)
-        live, suggestion = session.live(state)
-        document, revision = state.document, state.history.revision
-        pairs = document.complete_pairs
-        points_3d = state.model.registry.xyz(
-            pair.keypoint for pair in pairs if pair.keypoint is not None
-        )
-    answer: dict[str, Any] = {"revision": revision, "note": "", "now": "", "pieces": []}
-    result = live.result
-    if result is None or live.provisional or live.also_used or session.shape is not None:
-        return answer
-    if not document.focal.known:
-        return answer | {"note": _FOCAL}
-    given = filled(pair.sigma for pair in pairs)
-    sigma = live.sigma * (np.ones(len(pairs)) if given is None else given)
-    points_2d = np.array([pair.uv for pair in pairs], dtype=float)
-    # Without the lock, for which the next click would wait.
-    ranked = rank(state.model.cad, Marked(points_3d, points_2d, sigma), result, suggestion)
-    name = "" if suggestion is None else _name_of(suggestion)
-    pieces = [
-        {
-            "kind": each.kind,
-            "what": evidence_text(each, name),
-            "left": left_text(each),
-            "how": how_text(each, state.files.observation.name),
-            "worst": each.worst,
-        }
-        for each in ranked
-    ]
-    now = present(result)
-    return answer | {"now": "" if now is None else left_text(now), "pieces": pieces}
 
 
 def _evidence(session: Session, state: PhotoState) -> dict[str, Any]:
@@ -310,12 +259,8 @@ def _suggestion(state: PhotoState, suggestion: Suggestion | None) -> dict[str, A
         "keypoint": point.semantic_id,
         "xyz": state.model.cad.to_display(point.xyz).tolist(),
         "uv": suggestion.uv,
-        "text": next_best_text(suggestion.next_best, _name_of(suggestion)),
+        "text": next_best_text(suggestion.next_best, name_of(suggestion)),
     }
-
-
-def _name_of(suggestion: Suggestion) -> str:
-    return suggestion.point.name or "The marked corner"
 
 
 def _objects(session: Session, state: PhotoState) -> dict[str, Any]:

@@ -1,14 +1,14 @@
-"""Photos to annotate, upright by their EXIF orientation, and their cameras' intrinsics."""
+"""Photos to annotate: upright pixels, cameras' intrinsics, and which of them are done."""
 
 from __future__ import annotations
 
 import io
 import math
 import re
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Literal, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +20,15 @@ from cadalign.estimation.focal import FocalPrior
 from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
-from cadalign.io.files import read_bytes, reading
+from cadalign.io.documents import Document, read_document
+from cadalign.io.files import read_bytes, reading, write_json
 from cadalign.io.images import open_photo, photo_size, read_photo
 
+Mark = Literal["done", "skipped"]
+State = Literal["to do", "begun", "done", "skipped"]
+STATES: tuple[State, ...] = ("to do", "begun", "done", "skipped")
+FILE = "cadalign.worklist.json"
+_FORMAT = "cadalign work list"
 ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 MASK, SECOND_MASK = ".mask.png", ".mask-2.png"
 """Endings of the files of masks; the second is for one that is painted over the first."""
@@ -202,3 +208,39 @@ def natural_key(name: str) -> tuple[tuple[str, int, str], ...]:
         ("", int(part), part) if part.isdecimal() else (part.casefold(), 0, part) for part in parts
     )
     return cast(tuple[tuple[str, int, str], ...], key)
+
+
+class _File(Document):
+    format: str
+    photos: dict[str, Mark]
+
+
+@dataclass(frozen=True)
+class WorkList:
+    """Photos that are marked as done or skipped, by their file names, and the file of the list."""
+
+    path: Path
+    marks: Mapping[str, Mark] = field(default_factory=dict)
+
+    @classmethod
+    def open(cls, folder: Path) -> WorkList:
+        """Read the list of a folder; an empty one if there is none."""
+        path = folder / FILE
+        if not path.exists():
+            return cls(path)
+        read = read_document(path, _File)
+        if read.format != _FORMAT:
+            raise DataError(f"not a {_FORMAT}", where=str(path), fix="rename it")
+        return cls(path, read.photos)
+
+    def state(self, photo: str, *, pairs: int) -> State:
+        """The state of a photo of so many pairs."""
+        return self.marks.get(photo) or ("begun" if pairs else "to do")
+
+    def marked(self, photo: str, mark: Mark | None) -> WorkList:
+        """The list with a photo marked, or without its mark; its file is written."""
+        marks = {name: kept for name, kept in self.marks.items() if name != photo}
+        if mark is not None:
+            marks[photo] = mark
+        write_json(self.path, {"format": _FORMAT, "photos": dict(sorted(marks.items()))})
+        return WorkList(self.path, marks)

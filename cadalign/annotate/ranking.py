@@ -1,31 +1,69 @@
-"""Models of a library: their ranking by an object's pairs, and going on with another one."""
+"""Rankings for the page: evidence to add to an object's pairs, and a library's models by them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.document import AnnotationDocument, FurtherView, Pair
-from cadalign.annotate.keypoints import KeypointRegistry
 from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.objects import PhotoState
-from cadalign.annotate.observing import filled
+from cadalign.annotate.objects import PhotoState, filled
+from cadalign.annotate.result_text import evidence_text, how_text, left_text, name_of
 from cadalign.annotate.session import Session
+from cadalign.annotate.suggestion import Marked, present, rank
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import ModelKey
 from cadalign.retrieval.page import score_text
 
 _LEAST_PAIRS = 4
+_FOCAL = "With a known focal length, a mask, another photo and lengths are ranked here too."
+
+
+def advice_state(session: Session, number: int, *, slot: int | None = None) -> dict[str, Any]:
+    """Rank what could be added to an object's pairs, of the annotation of that ``revision``.
+
+    Nothing is ranked without an alignment by the pairs alone, for an object's own shape, and where
+    the focal length is estimated.
+    """
+    with session.lock:
+        state = session.photo_state(number, slot)
+        live, suggestion = session.live(state)
+        document, revision = state.document, state.history.revision
+        pairs = document.complete_pairs
+        points_3d = state.model.registry.xyz(
+            pair.keypoint for pair in pairs if pair.keypoint is not None
+        )
+    answer: dict[str, Any] = {"revision": revision, "note": "", "now": "", "pieces": []}
+    result = live.result
+    if result is None or live.provisional or live.also_used or session.shape is not None:
+        return answer
+    if not document.focal.known:
+        return answer | {"note": _FOCAL}
+    given = filled(pair.sigma for pair in pairs)
+    sigma = live.sigma * (np.ones(len(pairs)) if given is None else given)
+    points_2d = np.array([pair.uv for pair in pairs], dtype=float)
+    # Without the lock, for which the next click would wait.
+    ranked = rank(state.model.cad, Marked(points_3d, points_2d, sigma), result, suggestion)
+    name = "" if suggestion is None else name_of(suggestion)
+    pieces = [
+        {
+            "kind": each.kind,
+            "what": evidence_text(each, name),
+            "left": left_text(each),
+            "how": how_text(each, state.files.observation.name),
+            "worst": each.worst,
+        }
+        for each in ranked
+    ]
+    now = present(result)
+    return answer | {"now": "" if now is None else left_text(now), "pieces": pieces}
 
 
 @dataclass(frozen=True, eq=False)
-class _Marked:
+class _Known:
     """The pairs that the library knows: (n, 2) [px], n semantic ids, (n,) [px]."""
 
     points_2d: FloatArray
@@ -78,11 +116,11 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
     }
 
 
-def _marked(state: PhotoState, choice: ModelChoice) -> _Marked:
+def _marked(state: PhotoState, choice: ModelChoice) -> _Known:
     known = choice.ids_on(state.files.model)
     pairs = [pair for pair in state.document.complete_pairs if pair.keypoint in known]
     sigma = filled(pair.sigma for pair in pairs)
-    return _Marked(
+    return _Known(
         np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
         [pair.keypoint for pair in pairs if pair.keypoint is not None],
         1.0 if sigma is None else sigma,
@@ -120,63 +158,3 @@ def _entry(match: Match, choice: ModelChoice, current: tuple[str, str] | None) -
         "has_mesh": match.mesh_path is not None,
         "current": key == current,
     }
-
-
-def switch_model(session: Session, state: PhotoState, key: ModelKey) -> None:
-    """Exchange an object's model, and the pairs' halves on it."""
-    choice = session.choice
-    if choice is None:
-        raise InputError("the session has no library", where="model", fix="start with --library")
-    mesh = choice.model(key).mesh_path
-    assert mesh is not None
-    session.before_saving()  # where nothing may be written, nothing is changed either
-    owner = state.owner
-    old, new = owner.model, session.models.of(mesh)
-    if new is old:
-        return
-    if session.ready:
-        new.prepare(has_shape=session.shape is not None)
-    carried = carry_keypoints(old.registry, new.registry, choice.ids_on(old.path))
-    history = owner.history.changed(lambda document: _carried(document, carried))
-    for each in (owner, *owner.views):
-        each.model = new
-        each.files = replace(each.files, model=new.path)
-        each.history = history
-        each.live = each.estimate = None
-        each.proposals = tuple(
-            replace(proposal, keypoint=carried[proposal.keypoint])
-            for proposal in each.proposals
-            if proposal.keypoint in carried
-        )
-
-
-def carry_keypoints(
-    old: KeypointRegistry, new: KeypointRegistry, known: Collection[int]
-) -> dict[int, int]:
-    """Ids of the old model's keypoints on the new one: of the same semantic id, else name.
-
-    Semantic ids tell of those that are ``known``. A keypoint that was renamed keeps its name.
-    """
-    carried = {number: number for number, _ in old if number in known and number in new}
-    for number in carried:
-        if old[number].name != new[number].name:
-            new.rename(number, old[number].name)
-    free = {point.name: number for number, point in new if number not in carried}
-    return carried | {
-        number: free[point.name]
-        for number, point in old
-        if number not in carried and point.name in free
-    }
-
-
-def _carried(document: AnnotationDocument, carried: Mapping[int, int]) -> AnnotationDocument:
-    """The document with its pairs' keypoints on the new model; halves without any are left out."""
-    moved: list[Pair] = []
-    for pair in document.pairs:
-        keypoint = None if pair.keypoint is None else carried.get(pair.keypoint)
-        if keypoint is not None or pair.uv is not None:
-            moved.append(replace(pair, keypoint=keypoint))
-    views = tuple(
-        FurtherView(view.photo, _carried(view.document, carried)) for view in document.further_views
-    )
-    return replace(document, pairs=tuple(moved), further_views=views)

@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.suggestion import NextBest, Unmarked
+from cadalign.annotate.suggestion import NextBest, Suggestion, Unmarked
 from cadalign.estimation.uncertainty.advice import LENGTH_SIGMA, TURN_DEG, Advice
 
 UNKNOWNS = (
@@ -84,6 +84,11 @@ def next_best_text(next_best: NextBest | Unmarked, name: str) -> str:
     before, after = (short(factor * std) + unit for std in (next_best.before, next_best.after))
     unknown = UNKNOWNS[next_best.unknown]
     return f"{name}: it would determine {unknown} to ± {after} instead of {before}"
+
+
+def name_of(suggestion: Suggestion) -> str:
+    """Name of a suggested point."""
+    return suggestion.point.name or "The marked corner"
 
 
 def evidence_text(advice: Advice, keypoint: str) -> str:

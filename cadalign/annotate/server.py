@@ -7,10 +7,11 @@ import json
 import secrets
 import socket
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import uvicorn
 from PIL import Image
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -21,22 +22,20 @@ from starlette.types import ASGIApp
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.exporting import coco_of, glb_of, zipped_photo_set
-from cadalign.annotate.guard import Access, Guard
+from cadalign.annotate.guard import Access, BoundedProtocol, Guard
 from cadalign.annotate.library import thumbnail_of
 from cadalign.annotate.locks import Claims
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
-from cadalign.annotate.page_state import advice_state, mask_pixels, page_state, worklist_state
-from cadalign.annotate.ranking import ranking_state
+from cadalign.annotate.page_state import mask_pixels, page_state, worklist_state
+from cadalign.annotate.ranking import advice_state, ranking_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, InputError
 from cadalign.errors import quote as quoted
 from cadalign.web import asset
 
-if TYPE_CHECKING:
-    import uvicorn
-
 _LONGEST_NUMBER = 9  # digits
+_BYTES = "application/octet-stream"
 _BROWSER = "cadalign-browser"  # cookie that tells browsers apart, not the tabs of one
 
 
@@ -95,10 +94,6 @@ def listen(port: int, host: str = LOOPBACK) -> socket.socket:
 
 def make_server(app: ASGIApp) -> uvicorn.Server:
     """Make the server of an application, which `serve` runs."""
-    import uvicorn
-
-    from cadalign.annotate.connections import BoundedProtocol
-
     config = uvicorn.Config(
         app,
         http=BoundedProtocol,
@@ -116,7 +111,7 @@ def serve(app: ASGIApp, listener: socket.socket) -> None:
 
 
 class _Routes:
-    """Handlers of the addresses. Long work runs in threads."""
+    """Handlers of the addresses; those that are not asynchronous run in threads."""
 
     def __init__(self, session: Session, access: Access) -> None:
         self._session = session
@@ -124,7 +119,7 @@ class _Routes:
         self._models: dict[int, bytes] = {}
         self._claims = Claims()
 
-    async def page(self, request: Request) -> Response:
+    def page(self, request: Request) -> Response:
         response = Response(asset("annotate.html"), media_type="text/html")
         response.set_cookie(
             self._access.cookie, self._access.token, httponly=True, samesite="strict"
@@ -134,89 +129,73 @@ class _Routes:
             response.set_cookie(_BROWSER, browser, httponly=True, samesite="strict")
         return response
 
-    async def model(self, request: Request) -> Response:
-        data = await run_in_threadpool(self._display, _number(request, "number") or 0)
-        return Response(data, media_type="application/octet-stream")
+    def model(self, request: Request) -> Response:
+        number = _number(request, "number") or 0
+        with self._session.lock:
+            if number not in self._models:
+                self._models[number] = display_bytes(self._session.models[number].cad)
+        return Response(self._models[number], media_type=_BYTES)
 
-    async def details(self, request: Request) -> Response:
-        model = self._session.models[_number(request, "number") or 0]
-        data = await run_in_threadpool(detail_bytes, model.cad, model.wireframe.creases)
-        return Response(data, media_type="application/octet-stream")
+    def details(self, request: Request) -> Response:
+        opened = self._session.models[_number(request, "number") or 0]
+        return Response(detail_bytes(opened.cad, opened.wireframe.creases), media_type=_BYTES)
 
-    async def photo(self, request: Request) -> Response:
-        photo = self._session.photo_state(request.path_params["number"]).photo
-        kind, data = await run_in_threadpool(photo.encoded)
+    def photo(self, request: Request) -> Response:
+        kind, data = self._session.photo_state(request.path_params["number"]).photo.encoded()
         return Response(data, media_type=kind)
 
-    async def worklist(self, request: Request) -> Response:
-        return JSONResponse(await run_in_threadpool(worklist_state, self._session))
+    def worklist(self, request: Request) -> Response:
+        return JSONResponse(worklist_state(self._session))
 
-    async def thumbnail(self, request: Request) -> Response:
-        photo = self._session.photo_state(request.path_params["number"]).photo
-        data = await run_in_threadpool(photo.thumbnail)
-        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
+    def thumbnail(self, request: Request) -> Response:
+        return _kept(self._session.photo_state(request.path_params["number"]).photo.thumbnail())
 
-    async def coco(self, request: Request) -> Response:
-        data = await run_in_threadpool(coco_of, self._session)
-        return JSONResponse(data, headers=_as_file("keypoints.coco.json"))
+    def library(self, request: Request) -> Response:
+        choice = self._session.choice
+        if choice is None:
+            raise InputError("the session has no library", where="library")
+        return _kept(thumbnail_of(choice, request.path_params["number"]))
 
-    async def glb(self, request: Request) -> Response:
+    def coco(self, request: Request) -> Response:
+        return JSONResponse(coco_of(self._session), headers=_as_file("keypoints.coco.json"))
+
+    def glb(self, request: Request) -> Response:
         number, slot = _place(request)
-        data = await run_in_threadpool(glb_of, self._session, number, slot=slot)
+        data = glb_of(self._session, number, slot=slot)
         name = self._session.photo_state(number, slot).files.observation.with_suffix(".glb").name
         return Response(data, media_type="model/gltf-binary", headers=_as_file(name))
 
-    async def photo_set(self, request: Request) -> Response:
+    def photo_set(self, request: Request) -> Response:
         form = request.path_params["form"]
-        data = await run_in_threadpool(zipped_photo_set, self._session, form)
+        data = zipped_photo_set(self._session, form)
         return Response(data, media_type="application/zip", headers=_as_file(f"{form}.zip"))
 
-    async def mask(self, request: Request) -> Response:
+    def mask(self, request: Request) -> Response:
         number, slot = _place(request)
+        mask = np.where(mask_pixels(self._session, number, slot=slot), 255, 0).astype(np.uint8)
+        # Its opacity is what the page draws, in a colour of its own.
+        data = io.BytesIO()
+        Image.fromarray(np.stack([np.zeros_like(mask), mask], axis=2), "LA").save(data, "PNG")
+        return Response(data.getvalue(), media_type="image/png")
 
-        def work() -> bytes:
-            pixels = mask_pixels(self._session, number, slot=slot)
-            mask = np.where(pixels, 255, 0).astype(np.uint8)
-            # Its opacity is what the page draws, in a colour of its own.
-            data = io.BytesIO()
-            empty = np.zeros_like(mask)
-            Image.fromarray(np.stack([empty, mask], axis=2), "LA").save(data, "PNG")
-            return data.getvalue()
-
-        return Response(await run_in_threadpool(work), media_type="image/png")
-
-    async def state(self, request: Request) -> Response:
-        return await self._answer(request, None)
-
-    async def claim(self, request: Request) -> Response:
+    def claim(self, request: Request) -> Response:
         """The revision of an object, and whether its photo was changed in another browser."""
         number, slot = _place(request)
         state = self._session.photo_state(number, slot)
         elsewhere = self._claims.is_elsewhere(number, request.cookies.get(_BROWSER, ""))
         return JSONResponse({"revision": state.history.revision, "elsewhere": elsewhere})
 
-    async def advice(self, request: Request) -> Response:
+    def advice(self, request: Request) -> Response:
         number, slot = _place(request)
+        return JSONResponse(advice_state(self._session, number, slot=slot))
 
-        def work() -> dict[str, Any]:
-            return advice_state(self._session, number, slot=slot)
-
-        return JSONResponse(await run_in_threadpool(work))
-
-    async def models(self, request: Request) -> Response:
+    def models(self, request: Request) -> Response:
         number, slot = _place(request)
+        return JSONResponse(ranking_state(self._session, number, slot=slot))
 
-        def work() -> dict[str, Any]:
-            return ranking_state(self._session, number, slot=slot)
-
-        return JSONResponse(await run_in_threadpool(work))
-
-    async def library(self, request: Request) -> Response:
-        choice = self._session.choice
-        if choice is None:
-            raise InputError("the session has no library", where="library")
-        data = await run_in_threadpool(thumbnail_of, choice, request.path_params["number"])
-        return Response(data, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
+    def state(self, request: Request) -> Response:
+        number, slot = _place(request)
+        return _as_json(page_state(self._session, number, slot=slot))
 
     async def act(self, request: Request) -> Response:
         if request.headers.get("content-type", "").partition(";")[0] != "application/json":
@@ -229,32 +208,28 @@ class _Routes:
             raise InputError("not JSON", where="body", fix="send an action as JSON") from None
         if not isinstance(action, dict):
             raise InputError("not a JSON object", where="body", fix="send an action as JSON")
-        return await self._answer(request, action)
+        return await run_in_threadpool(self._acted, request, action)
 
-    async def _answer(self, request: Request, action: dict[str, Any] | None) -> Response:
+    def _acted(self, request: Request, action: dict[str, Any]) -> Response:
         session = self._session
         number, slot = _place(request)
-        browser = request.cookies.get(_BROWSER, "")
         person = "" if request.client is None else request.client.host
+        with session.lock:
+            views = session.photo_state(number, slot).all_views
+            photos = {number, *(session.place_of(view)[0] for view in views)}
+            self._claims.take(photos, request.cookies.get(_BROWSER, ""), person)
+            outcome = perform(session, number, action, slot=slot)
+            return _as_json(page_state(session, number, outcome, slot=slot))
 
-        def work() -> bytes:
-            with session.lock:
-                outcome = None
-                if action is not None:
-                    views = session.photo_state(number, slot).all_views
-                    photos = {number, *(session.place_of(view)[0] for view in views)}
-                    self._claims.take(photos, browser, person)
-                    outcome = perform(session, number, action, slot=slot)
-                state = page_state(session, number, outcome, slot=slot)
-            return json.dumps(state, separators=(",", ":"), allow_nan=False).encode()
 
-        return Response(await run_in_threadpool(work), media_type="application/json")
+def _as_json(state: dict[str, Any]) -> Response:
+    data = json.dumps(state, separators=(",", ":"), allow_nan=False).encode()
+    return Response(data, media_type="application/json")
 
-    def _display(self, number: int) -> bytes:
-        with self._session.lock:
-            if number not in self._models:
-                self._models[number] = display_bytes(self._session.models[number].cad)
-            return self._models[number]
+
+def _kept(thumbnail: bytes) -> Response:
+    """A picture that the browser keeps for an hour."""
+    return Response(thumbnail, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
 
 
 def _place(request: Request) -> tuple[int, int | None]:
@@ -276,7 +251,7 @@ def _as_file(name: str) -> dict[str, str]:
     return {"Content-Disposition": f"attachment; filename*=UTF-8''{quote(name)}"}
 
 
-async def _send(name: str, media_type: str, request: Request) -> Response:
+def _send(name: str, media_type: str, request: Request) -> Response:
     return Response(asset(name), media_type=media_type)
 
 

@@ -14,21 +14,28 @@ import numpy.typing as npt
 from cadalign.annotate.document import AnnotationDocument
 from cadalign.annotate.estimate import Estimate, Known, warm_up
 from cadalign.annotate.history import history_path, write_history
-from cadalign.annotate.keypoints import KeypointRegistry
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import LiveAlignment, known_points, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.models import Models
+from cadalign.annotate.models import KeypointRegistry, Models
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.objects import Deletions, PhotoState, shown_objects
-from cadalign.annotate.observing import Observer
+from cadalign.annotate.objects import Deletions, Observer, PhotoState, shown_objects
+from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
-from cadalign.annotate.worklist import State, WorkList
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
+
+
+@dataclass(frozen=True)
+class ActionOutcome:
+    """Outcome of an action beside the changed document, for the user."""
+
+    selected: int | None = None  # number of the pair that was placed or changed
+    message: str = ""  # such as that the click missed the model
+    shown: PhotoState | None = None  # the object and photo to go on with, if not the same
 
 
 @dataclass(eq=False)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.annotate.keypoints import KeypointRegistry
 from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.model import ClickableModel
+from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint

@@ -17,7 +17,8 @@ from cadalign.annotate.actions import perform
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.guard import TOKEN_HEADER
 from cadalign.annotate.live import LiveAlignment
-from cadalign.annotate.page_state import advice_state, page_state
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.ranking import advice_state
 from cadalign.annotate.result_text import evidence_text, left_text
 from cadalign.annotate.session import Session
 from cadalign.annotate.suggestion import Marked, rank

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cadalign.annotate.document import AnnotationDocument, FocalChoice, Pair
 from cadalign.annotate.history import History
-from cadalign.annotate.keypoints import KeypointRegistry
+from cadalign.annotate.models import KeypointRegistry
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 

@@ -15,11 +15,10 @@ from cadalign import Alignment, Camera, fit
 from cadalign.annotate.document import FocalChoice
 from cadalign.annotate.estimate import Estimate, Known
 from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
-from cadalign.annotate.model import ClickableModel
+from cadalign.annotate.model import ClickableModel, Wireframe
 from cadalign.annotate.photos import Intrinsics
 from cadalign.annotate.result_text import UNKNOWNS, facts_of, next_best_text, notes_of
 from cadalign.annotate.suggestion import NextBest, find_next_best, updated_variances
-from cadalign.annotate.wireframe import Wireframe
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.uncertainty.misfit import projection_jacobian

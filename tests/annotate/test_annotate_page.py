@@ -18,7 +18,8 @@ from support.timing import Yardstick, reference_seconds
 from cadalign import ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.guard import Access
-from cadalign.annotate.page_state import advice_state, page_state
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.ranking import advice_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints

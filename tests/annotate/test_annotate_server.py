@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import pytest
 from support.annotating import Case, served
 
-from cadalign.annotate import connections, guard
+from cadalign.annotate import guard
 from cadalign.annotate.guard import MAX_BODY, Access
 from cadalign.annotate.server import listen
 from cadalign.errors import InputError
@@ -235,7 +235,6 @@ def answer_in_time(client: socket.socket) -> bytes:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch, original: Case) -> Iterator[Access]:
     """An annotator that waits for half a second."""
-    monkeypatch.setattr(connections, "PATIENCE", 0.5)
     monkeypatch.setattr(guard, "PATIENCE", 0.5)
     with served(original.open()) as opened:
         yield opened
@@ -290,7 +289,7 @@ def test_connections_are_few_and_others_still_served(access: Access) -> None:
                 still_open += 1
             except ConnectionError:
                 pass
-        assert still_open <= connections.MOST_CONNECTIONS
+        assert still_open <= guard.MOST_CONNECTIONS
 
 
 # --- the socket ------------------------------------------------------------------------------

@@ -16,8 +16,8 @@ from support.annotating import IDLE, Case, opened_page, place, place_of_pixel, w
 from cadalign.annotate.actions import perform
 from cadalign.annotate.exporting import coco_of, glb_of
 from cadalign.annotate.page_state import page_state, worklist_state
+from cadalign.annotate.photos import FILE
 from cadalign.annotate.session import Session
-from cadalign.annotate.worklist import FILE
 from cadalign.cli import main
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import CadalignError

@@ -284,13 +284,6 @@ def written_view(files: AnnotationFiles, camera: Camera, pairs: Sequence[Pair]) 
     }
 
 
-def model_named_in(observation: Path, default: Path) -> Path:
-    """The model that an observation names; the default if it names none."""
-    data = read_json(observation)
-    named = data.get("model") if isinstance(data, dict) else None
-    return path_from(named, observation.parent) if isinstance(named, str) else default
-
-
 def _remove(path: Path) -> None:
     with writing(path):
         path.unlink(missing_ok=True)

@@ -19,15 +19,14 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.render import RaycastRenderer, Scene
-from cadalign.render.views.viewpoints import frame_object, look_at
+from cadalign.render.drawing.stills import Angles, pose_in_view
 from cadalign.retrieval import Library, LibraryModel
 from cadalign.retrieval.models import ModelKey
 
 _THUMBNAIL = (180, 135)  # [px]
 _GREY = (185, 189, 196)
-_FILL = 0.92
 # ShapeNet's models face -z, with y up: seen from the front, the left and above.
-_AZIMUTH, _ELEVATION = 150.0, 20.0
+_SEEN_FROM = Angles(azimuth=150.0, elevation=20.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,9 +152,7 @@ def thumbnail_of(choice: ModelChoice, number: int) -> bytes:
         number = 0
     scene = Scene(choice.model(choice.keys[number]).load_mesh())
     camera = Camera.from_fov(*_THUMBNAIL, fov_x=30.0)
-    turned = look_at(azimuth=_AZIMUTH, elevation=_ELEVATION, distance=1.0)
-    pose = frame_object(scene.bounds, camera, rotation=turned.rotation, fill=_FILL)
-    frame = RaycastRenderer().render(scene, camera, pose)
+    frame = RaycastRenderer().render(scene, camera, pose_in_view(scene, camera, _SEEN_FROM))
     background = np.full((camera.height, camera.width, 3), _GREY, dtype=np.uint8)
     data = io.BytesIO()
     Image.fromarray(frame.composite(background)).save(data, "JPEG", quality=85)

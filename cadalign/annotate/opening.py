@@ -12,13 +12,14 @@ import numpy as np
 from cadalign.annotate.document import AnnotationDocument, FocalChoice, FurtherView, Priors
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
-from cadalign.annotate.files import AnnotationFiles, StoredView, model_named_in
+from cadalign.annotate.files import AnnotationFiles, StoredView
 from cadalign.annotate.history import History, history_path, read_history
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.models import SAME_PLACE, Models, read_proposals
 from cadalign.annotate.names import (
     file_name,
     keypoints_file,
+    named_model,
     object_files,
     observation_file,
     refuse_collisions,
@@ -168,11 +169,11 @@ class _Opener:
         """The objects of a photo, the first one first; options give evidence of the first photo."""
         options, model = self._options, self._options.model
         if options.library is not None and file.exists():  # another one may have been chosen
-            model = model_named_in(file, model)
+            model = named_model(file) or model
         files = AnnotationFiles(file, photo.path, self._models.of(model).path)
         states = [self._open_object(files, photo, camera, options if is_first else None)]
         for path in object_files(file, photo.path):
-            model = self._models.of(model_named_in(path, options.model)).path
+            model = self._models.of(named_model(path) or options.model).path
             files = AnnotationFiles(path, photo.path, model)
             states.append(self._open_object(files, photo, camera))
         return states

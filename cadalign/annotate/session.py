@@ -105,7 +105,8 @@ class Session:
         try:
             problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
             points, pixels, camera = problem.points_3d, problem.points_2d, problem.camera
-            joint = self.shape is not None or any(self.is_joint(state) for state in self.states)
+            joint = not all(self.observed(state)[0].is_plain for state in self.states)
+            joint |= self.shape is not None
             warm_up(points, pixels, camera, joint=joint)
             if not joint:
                 warm_up_advice(points, View(camera, pixels), problem.alignment)
@@ -179,7 +180,7 @@ class Session:
         missing = missing_text(
             known_points(self.shape, points),
             self.shape,
-            is_plain=observation.is_plain and not self.is_joint(state),
+            is_plain=observation.is_plain and self.shape is None,
             has_others=len(observation.views) > 1,
         )
         if missing:
@@ -191,15 +192,11 @@ class Session:
         lines = state.model.wireframe
         return live_alignment(owner.estimate[1], known, lines, observation, place, points, uv)
 
-    def is_joint(self, state: PhotoState) -> bool:
-        """True if more than the stretched model and keypoints is estimated from or for a photo."""
-        if self.shape is not None or state.lead is not None:
-            return True
-        return bool(state.document.complete_pairs) and not self.observed(state)[0].is_plain
-
     def observed(self, state: PhotoState) -> tuple[Observation, int]:
         """The pairs that count with the evidence beside them, and the photo's number in it."""
-        return self.observer.observation(state), self.observer.further(state).place
+        observation = self.observer.observation(state)
+        images = [view.image for view in observation.views]
+        return observation, images.index(state.files.image)
 
     def _known(self, state: PhotoState) -> Known:
         """Knowledge of the object beside its observation."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from cadalign.estimation.uncertainty.misfit import predicted_covariances, projec
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import rescaled_pixels, resized_camera
 from cadalign.geometry.projection import projected_covariances
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.views.visibility import visible_keypoints
@@ -197,7 +198,10 @@ def rank(
     """
     scene, alignment = model.light_scene, result.alignment
     times = max(1.0, max(result.camera.width, result.camera.height) / _MASKED_AT)
-    camera = _reduced(result.camera, times)
+    width, height = result.camera.width, result.camera.height
+    camera = resized_camera(
+        result.camera, max(1, round(width / times)), max(1, round(height / times))
+    )
     ids = tuple(range(len(marked.points_3d)))
     suggested = [] if suggestion is None else [suggestion.point.xyz]
     candidates = (_SUGGESTED,) * len(suggested)
@@ -209,7 +213,7 @@ def rank(
         scale_prior_sigma=None if result.options is None else result.options.scale_prior_sigma,
     )
     sigma = _widening(result) * marked.sigma / times
-    view = View(camera, _reduced_pixels(marked.points_2d, times), ids=ids, sigma=sigma)
+    view = View(camera, rescaled_pixels(marked.points_2d, 1 / times), ids=ids, sigma=sigma)
     mask = cast_geometry(scene, camera, alignment).mask
     # No contour is seen of an object beyond the image's borders.
     for given in (mask, None):
@@ -234,24 +238,6 @@ def present(result: Result) -> Advice | None:
 def warm_up_advice(points_3d: FloatArray, view: View, alignment: Alignment) -> None:
     """Compile or load what `rank` calls, by ranking what would help an alignment."""
     rank_evidence(Model(points_3d=points_3d), view, alignment)
-
-
-def _reduced(camera: Camera, times: float) -> Camera:
-    """The camera of the photo at 1 / times its size."""
-    ((cx, cy),) = _reduced_pixels(np.array([[camera.cx, camera.cy]]), times).tolist()
-    return replace(
-        camera,
-        width=max(1, round(camera.width / times)),
-        height=max(1, round(camera.height / times)),
-        fx=camera.fx / times,
-        fy=camera.fy / times,
-        cx=cx,
-        cy=cy,
-    )
-
-
-def _reduced_pixels(pixels: FloatArray, times: float) -> FloatArray:
-    return np.asarray((pixels + 0.5) / times - 0.5)
 
 
 def _widening(result: Result) -> float:

@@ -16,9 +16,10 @@ from support.refusals import refusal_line
 from cadalign.annotate.actions import perform
 from cadalign.annotate.library import ModelChoice, starting_model
 from cadalign.annotate.models import KeypointRegistry
-from cadalign.annotate.object_actions import carry_keypoints, ranking_state
+from cadalign.annotate.object_actions import carry_keypoints
 from cadalign.annotate.options import FileOptions
 from cadalign.annotate.page_state import page_state
+from cadalign.annotate.ranking import ranking_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, ModelKeypoint, write_sample_dataset

@@ -99,7 +99,7 @@ def test_stored_options_that_the_page_does_not_use_are_named(
         ).save(case.observation)
         assert caplog.text == ""
         case.open()
-    assert f"{case.observation}: the annotator fits without the stored sigma, loss" in caplog.text
+    assert f"{case.observation}: the annotator fits without the stored loss, and" in caplog.text
 
 
 def test_options_follow_the_pairs(case: Case) -> None:

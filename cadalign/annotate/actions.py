@@ -277,8 +277,8 @@ ACTIONS: dict[str, Callable[..., ActionOutcome]] = {
 }
 """Actions by the name that the page sends as ``do``."""
 
-# Those after which undoing brings back what was deleted, and those that may change the names of
-# keypoints instead of the document.
+# Actions after which undoing brings back what was deleted, and actions that may change the names
+# of keypoints instead of the document.
 _DELETING = ("delete_object", "undo", "redo")
 _RENAMING = ("rename", "identify")
 

@@ -58,7 +58,7 @@ class Known:
     shape : ObjectShape, optional
         The object's own shape; None for the stretched model.
     mesh : Mesh
-        Of the model.
+        The model's.
     stretch : float, optional
         Standard deviation of a prior on the logarithms of the scales.
     sigma : float, optional
@@ -164,7 +164,7 @@ class Problem:
     def attempts(self) -> Iterator[tuple[Problem, str]]:
         """Problems to try, the first as it is, down to what is left where marks do not suffice.
 
-        With what each assumes, in which ``{reason}`` stands for the first one's failure.
+        Each comes with what it assumes, where ``{reason}`` stands for why the ones before fail.
         """
         problem = self
         yield problem, ""
@@ -300,7 +300,7 @@ class Problem:
 
     @property
     def _unknowns(self) -> int:
-        """Of poses and stretch."""
+        """Number of unknowns of poses and stretch."""
         is_rigid = self.views[0].cam_from_rig is not None
         return _POSE_UNKNOWNS * (1 if is_rigid else len(self.views)) + _STRETCH_UNKNOWNS
 

@@ -40,7 +40,7 @@ class FurtherEvidence:
     Parameters
     ----------
     image : ImageEvidence
-        Of the photo.
+        The photo's.
     others : tuple of ObservedImage
         The observation's other images.
     place : int

@@ -187,8 +187,8 @@ def _with_headers(send: Send) -> Send:
 class BoundedProtocol(H11Protocol):
     """HTTP/1.1 whose requests have to begin, and their heads to end, within `PATIENCE`.
 
-    Of more than `MOST_CONNECTIONS`, the one that has been open longest without a request under way
-    is closed. Bodies are waited for by `Guard`.
+    Beyond `MOST_CONNECTIONS`, the one that has been open longest without a request under way is
+    closed. Bodies are waited for by `Guard`.
     """
 
     _deadline: asyncio.TimerHandle | None = None

@@ -32,7 +32,7 @@ _MOST = 200  # documents in the file, on each side of the current one
 
 
 class History:
-    """The current document of an object, those before it, and those that were undone.
+    """Documents of an object: the current one, earlier ones, and undone ones.
 
     ``revision`` grows with every change, those by undo and redo included; ``before`` and ``after``
     are the documents that undo and redo lead to, the next one last.
@@ -214,7 +214,7 @@ def _add_points(
 def _with_marks(
     current: AnnotationDocument, document: AnnotationDocument, same_evidence: SameEvidence
 ) -> AnnotationDocument:
-    """A document with the numbers, and with what was drawn, of that of the history."""
+    """A document with pair numbers and drawings of the history's."""
 
     def kept(
         one: AnnotationDocument, other: AnnotationDocument, photo: str | None

@@ -110,7 +110,7 @@ class ModelChoice:
         )
 
     def first_model(self, observations: Iterable[Path]) -> Path:
-        """The mesh to begin with: that of an earlier session, else that of the most keypoints."""
+        """The mesh to begin with: an earlier session's, else the one with the most keypoints."""
         for path in observations:
             mesh = named_model(path)
             if mesh is not None and self.key_of(mesh) is not None:

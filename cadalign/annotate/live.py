@@ -101,7 +101,7 @@ def live_alignment(
     estimate : Estimate
     known : Known
     wireframe : Wireframe
-        Of the model.
+        The model's.
     observation : Observation
         What the estimate was computed from.
     place : int

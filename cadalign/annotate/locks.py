@@ -46,7 +46,7 @@ class WriterLocks:
     whole_folder : bool
         Hold the folder's lock in place of one for each file.
     address : str
-        Address of the session's page, which others are told.
+        Address of the session's page, for the message to others.
     """
 
     def __init__(self, files: Sequence[Path], *, whole_folder: bool, address: str) -> None:

@@ -149,8 +149,8 @@ def read_proposals(
 ) -> list[tuple[Proposal, ...]]:
     """Read COCO's keypoints or a detector's for each photo, by its file name.
 
-    Of several objects in a photo the surest counts. Keypoints are found by name, else by semantic
-    id; those of a file with neither by their order, if there are as many as the model has. Raises
+    Where a photo has several objects, the surest counts. Keypoints are found by name, else by their
+    semantic id; in a file with neither by their order, if there are as many as the model has. Raises
     DataError if no photo or no keypoint of the model is in the file.
     """
     found = read_image_keypoints(path)
@@ -238,7 +238,7 @@ class Models:
     keypoints : Path, optional
         The first model's keypoints, where they are not beside it.
     shape : ObjectShape, optional
-        Of which the keypoints' ids are reserved.
+        Its keypoints' ids are reserved.
     choice : ModelChoice, optional
         A library, whose models' keypoints are given by it.
     """

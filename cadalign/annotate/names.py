@@ -54,7 +54,7 @@ def earlier_unfinished_file(observation: Path) -> Path:
 
 
 def mask_file(observation: Path, base: str | None) -> Path:
-    """Path of the mask beside an observation, other than that of the mask under its strokes."""
+    """Path of the mask beside an observation, not the file of the mask under its strokes."""
     first, second = (
         observation.with_name(file_name(observation.stem, ending)) for ending in (MASK, SECOND_MASK)
     )
@@ -62,7 +62,7 @@ def mask_file(observation: Path, base: str | None) -> Path:
 
 
 def object_file(observation: Path, number: int) -> Path:
-    """Path of a further object's observation beside that of the photo's first object."""
+    """Path of a further object's observation, beside the first object's."""
     return observation.with_name(file_name(f"{observation.stem}.object-{number}", ".json"))
 
 

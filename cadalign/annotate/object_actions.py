@@ -188,7 +188,7 @@ def _free_name(name: str, states: list[PhotoState], own: PhotoState | None) -> s
 
 
 def _add_object(session: Session, photo: int, model: OpenedModel, name: str) -> PhotoState:
-    """Add an object to the photo of a number; its camera is that of the photo's other objects."""
+    """Add an object to the photo of a number; with the camera of the photo's other objects."""
     states = session.objects[photo]
     like = states[0]
     if session.shape is not None and session.shape.learned is not None and model is not like.model:

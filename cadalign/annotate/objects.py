@@ -111,7 +111,7 @@ class PhotoState:
         return any(view.cam_from_rig is not None for view in views)
 
     def mask_file(self, base: str | None) -> Path:
-        """Path of the mask to draw, other than that of the one under its strokes."""
+        """Path of the mask to draw, not the file of the one under its strokes."""
         observation = self.files.observation
         if self.lead is not None:  # several photos share the observation
             stem = f"{observation.stem}.{self.photo.path.stem}"
@@ -225,7 +225,7 @@ class Observer:
                 place = len(others)
             elif isinstance(each, ObservedImage):
                 others.append(each)
-            elif tells_something(image := self.image(each, to_write=to_write)):
+            elif has_evidence(image := self.image(each, to_write=to_write)):
                 others.append(image)
         kept = owner.further
         return replace(
@@ -237,9 +237,9 @@ class Observer:
         own = self._own_evidence(state)
         return own.added_to_image(self._keypoints(state, to_write=to_write))
 
-    def tells(self, state: PhotoState) -> bool:
+    def counts(self, state: PhotoState) -> bool:
         """True if anything of a photo counts."""
-        return tells_something(self.image(state))
+        return has_evidence(self.image(state))
 
     def views_in_order(self, owner: PhotoState) -> list[PhotoState | ObservedImage]:
         """The views of an object in the order of its observation, those added last at the end.
@@ -296,7 +296,7 @@ class Observer:
         views = []
         for view in state.all_views[1:]:
             pairs = self._other_pairs(view)
-            if pairs or not self.tells(view):
+            if pairs or not self.counts(view):
                 camera = view.intrinsics.to_write(view.document.focal)
                 views.append(written_view(view.files, camera, pairs))
         return written_unfinished(self._other_pairs(state), views)
@@ -325,7 +325,7 @@ def filled(values: Iterable[float | None]) -> FloatArray | None:
     return np.array([1.0 if value is None else value for value in listed])
 
 
-def tells_something(image: ObservedImage) -> bool:
+def has_evidence(image: ObservedImage) -> bool:
     """True if an image has keypoints or other evidence of the object."""
     return bool(len(image.points_2d) or image.evidence.given)
 

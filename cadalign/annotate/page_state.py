@@ -106,7 +106,7 @@ def mask_pixels(session: Session, number: int, *, slot: int | None = None) -> Bo
 
 
 def _priors(session: Session, state: PhotoState) -> dict[str, Any]:
-    """The priors, and those that can be chosen: on the stretch [%], on the focal length."""
+    """Priors on the stretch [%] and on the focal length: chosen ones and likely ones."""
     priors = state.document.priors
     likely = priors.focal or state.intrinsics.likely_focal
     source = "EXIF" if likely == state.intrinsics.prior else "usual lenses"
@@ -202,7 +202,7 @@ def _keypoints(state: PhotoState) -> list[dict[str, Any]]:
 
 
 def _proposals(state: PhotoState) -> list[dict[str, Any]]:
-    """Those of a detector whose keypoints are not used yet."""
+    """A detector's proposals for keypoints that are not used yet."""
     used = state.document.keypoints
     return [
         {**asdict(proposal), "name": state.model.registry[proposal.keypoint].name}

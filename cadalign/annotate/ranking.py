@@ -74,8 +74,8 @@ class _Known:
 def ranking_state(session: Session, number: int, *, slot: int | None = None) -> dict[str, Any]:
     """Rank the models by the pairs of an object, as `cadalign retrieve` ranks them by its file.
 
-    Pairs of points that no model of the library has don't count. Without a known focal length that
-    of the alignment, else a likely one, is taken.
+    Pairs of points that no model of the library has don't count. Without a known focal length the
+    alignment's, else a likely one, is taken.
     """
     with session.lock:
         state = session.photo_state(number, slot)
@@ -128,7 +128,7 @@ def _marked(state: PhotoState, choice: ModelChoice) -> _Known:
 
 
 def _camera(session: Session, state: PhotoState) -> Camera:
-    """The calibrated camera, else that of the alignment, else a likely one."""
+    """The calibrated camera, else the alignment's, else a likely one."""
     if state.document.focal.known:
         return state.camera
     live, _ = session.live(state)

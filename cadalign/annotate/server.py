@@ -36,7 +36,7 @@ from cadalign.web import asset
 
 _LONGEST_NUMBER = 9  # digits
 _BYTES = "application/octet-stream"
-_BROWSER = "cadalign-browser"  # cookie that tells browsers apart, not the tabs of one
+_BROWSER = "cadalign-browser"  # cookie that identifies the browser, for all of its tabs
 
 
 def make_app(session: Session, access: Access) -> ASGIApp:
@@ -111,7 +111,7 @@ def serve(app: ASGIApp, listener: socket.socket) -> None:
 
 
 class _Routes:
-    """Handlers of the addresses; those that are not asynchronous run in threads."""
+    """Handlers of the addresses; Starlette runs synchronous ones in threads."""
 
     def __init__(self, session: Session, access: Access) -> None:
         self._session = session

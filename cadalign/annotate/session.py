@@ -46,7 +46,7 @@ class Session:
     ----------
     models : Models
     objects : list of lists of PhotoState
-        The objects of each photo, those of its own observation first.
+        The objects of each photo, its own observation's first.
     before_saving : callable
         Raises a CadalignError where nothing may be written.
     worklist : WorkList
@@ -220,7 +220,7 @@ class Session:
 
     def _used_views(self, state: PhotoState) -> list[PhotoState]:
         """The object's photos that count, this one among them."""
-        return [view for view in state.all_views if view is state or self.observer.tells(view)]
+        return [view for view in state.all_views if view is state or self.observer.counts(view)]
 
     def estimates_focal(self, state: PhotoState) -> bool:
         """True if the focal lengths of an object's photos are estimated.

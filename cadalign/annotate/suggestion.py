@@ -102,9 +102,9 @@ def suggest(
 def _suggest_of_shape(
     live: LiveAlignment, own: Sequence[ModelKeypoint], shape: ObjectShape
 ) -> Suggestion | None:
-    """Choose the visible keypoint whose measurement tells most about pose and shape.
+    """Choose the visible keypoint with the most information about pose and shape.
 
-    That is its mutual information with them, log det(I + C / sigma^2) / 2 for the predicted
+    It is the mutual information with them, log det(I + C / sigma^2) / 2 for the predicted
     covariance C of its place in the photo.
     """
     result, lines = live.result, live.wireframe
@@ -144,7 +144,7 @@ def find_next_best(
     """Choose the visible keypoint (n, 3) whose measurement shrinks the most uncertain unknown most.
 
     To be comparable, rotations count in radians, translations as shares of the distance, scales and
-    focal length by their logarithms. Of equally good candidates the first is chosen; None if there
+    focal length by their logarithms. The first of equally good candidates is chosen; None if there
     are none, or nothing is uncertain.
     """
     weights = np.ones(len(covariance))
@@ -154,7 +154,7 @@ def find_next_best(
     if not len(points_3d) or not spread[worst] > 0:
         return None
     variances = updated_variances(points_3d, camera, alignment, covariance, sigma)[:, worst]
-    # Rounded, so that candidates that are equal but for rounding are told apart by their order.
+    # Rounded, so that candidates that differ by rounding alone are chosen by their order.
     row = int(np.argmin(np.round(variances / covariance[worst, worst], 9)))
     after = float(np.sqrt(max(variances[row], 0.0)) * weights[worst])
     return NextBest(row, worst, float(spread[worst]), after)

@@ -34,13 +34,13 @@ export class Api {
     return this.enqueue((place) => ({ url: addressOf("state", place), options: {} }));
   }
 
-  /** What could be added to a photo's pairs, ranked; null if it cannot be told. Nothing waits for it. */
+  /** What could be added to a photo's pairs, ranked; null without an answer. Nothing waits for it. */
   async advice(place) {
     try {
       const response = await fetch(addressOf("advice", place));
       return response.ok ? await response.json() : null;
     } catch {
-      return null; // the next action tells that the server is gone
+      return null; // the next action reports that the server is gone
     }
   }
 
@@ -50,7 +50,7 @@ export class Api {
       const response = await fetch(addressOf("claim", this.place));
       return response.ok ? await response.json() : null;
     } catch {
-      return null; // the next action tells that the server is gone
+      return null; // the next action reports that the server is gone
     }
   }
 

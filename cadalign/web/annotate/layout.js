@@ -27,7 +27,7 @@ const KEYS = [
   ["H held", "hides the alignment over the photo"],
   ["R", "shows the aligned model before the photo in 3D, or the model to click on again"],
   ["O", "draws the alignment as edges, shaded, as a box, or not"],
-  ["Page up, Page down", "the photo before and after, of those that the list shows"],
+  ["Page up, Page down", "the photo before and after, as the list is filtered"],
   ["Q", "the library's models by how well they explain the pairs: there 1 to 9 choose one, 0 none of them"],
   ["E", "the next object of the photo"],
   ["T", "the objects of the photo: add, rename, delete; and the photos of the object"],

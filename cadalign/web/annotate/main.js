@@ -178,7 +178,7 @@ class App {
     this.panel.showRanking(ranked, true);
   }
 
-  /** Whether a ranking is that of the annotation that is shown. */
+  /** Whether a ranking belongs to the annotation that is shown. */
   isCurrent(ranked) {
     const { image, revision } = this.state;
     const isOfThis = ranked?.number === image.number && ranked.object === image.object;

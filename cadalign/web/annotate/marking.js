@@ -150,7 +150,7 @@ export class Marking {
     try {
       await image.decode();
     } catch {
-      return; // the next state tells what is wrong
+      return; // the next state reports what is wrong
     }
     if (key !== this.key || of !== this.of) return;
     const canvas = document.createElement("canvas");

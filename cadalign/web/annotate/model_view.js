@@ -78,7 +78,7 @@ export class ModelView {
     return Boolean(this.result);
   }
 
-  /** See the whole model, from its front as most models have it, or the whole result. */
+  /** See the whole model, from its usual front, or the whole result. */
   frame() {
     if (this.result) this.stage.frame(this.result, ASIDE);
     else if (this.mesh) this.stage.frame(this.mesh, FRONT);

@@ -150,8 +150,9 @@ def read_proposals(
     """Read COCO's keypoints or a detector's for each photo, by its file name.
 
     Where a photo has several objects, the surest counts. Keypoints are found by name, else by their
-    semantic id; in a file with neither by their order, if there are as many as the model has. Raises
-    DataError if no photo or no keypoint of the model is in the file.
+    semantic id; in a file with neither by their order, if there are as many as the model has.
+
+    Raises DataError if no photo or no keypoint of the model is in the file.
     """
     found = read_image_keypoints(path)
     by_photo = []

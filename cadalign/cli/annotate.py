@@ -157,7 +157,7 @@ def _export(options: SessionOptions, to: Path, form: str, console: Console) -> i
     for problem in problems:
         console.print(f"Left out: {problem}", markup=False)
     count = len(photos) - len(problems)
-    console.print(f"{to}: {count} photos as {form} has them", markup=False)
+    console.print(f"{to}: {count} photos in the form of {form}", markup=False)
     return 0
 
 

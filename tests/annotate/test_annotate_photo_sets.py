@@ -135,7 +135,7 @@ def test_command_and_page_write_the_same(
     folder = tmp_path / "set"
     given = [str(case.photo), str(case.model), "--camera", str(case.camera), "--no-open"]
     assert main(["annotate", *given, "--export", str(folder), "--form", "pix3d"]) == 0
-    assert "1 photos as pix3d has them" in capsys.readouterr().err.replace("\n", " ")
+    assert "1 photos in the form of pix3d" in capsys.readouterr().err.replace("\n", " ")
     with served(annotated) as access:
         headers = {"X-Cadalign-Token": access.token}
         answer = httpx.get(f"{access.address}export/pix3d.zip", headers=headers)

@@ -115,3 +115,24 @@ def test_options_follow_the_pairs(case: Case) -> None:
     while len(session.photos[0].document.pairs) > 4:
         perform(session, 0, {"do": "delete", "pair": session.photos[0].document.pairs[-1].number})
     assert Observation.load(case.observation).fit_options == {}
+
+
+def test_a_stored_sigma_counts_and_is_kept(
+    case: Case, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    instance = case.instance
+    options = {"sigma": 3.0}
+    Observation(instance.points_3d, instance.points_2d, instance.camera, fit_options=options).save(
+        case.observation
+    )
+    session = case.open()
+    assert caplog.text == ""
+    perform(session, 0, {"do": "move", "pair": 1, "uv": [150, 160]})
+    perform(session, 0, {"do": "undo"})
+    assert Observation.load(case.observation).fit_options == options
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None
+    assert live.sigma == 3.0
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    command = Result.from_json(capsys.readouterr().out)
+    np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)

@@ -17,7 +17,7 @@ from cadalign.errors import CadalignError
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
-from cadalign.estimation.uncertainty.misfit import predicted_covariances, projection_jacobian
+from cadalign.estimation.uncertainty.prediction import predicted_covariances, projection_jacobian
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -104,7 +104,7 @@ def observation_file(photo: Path, folder: Path) -> Path:
     if not _has_namesake(photo) and short not in taken:
         stem = _folded(photo.stem)
         is_plain = not stem.endswith(_AMBIGUOUS) and _OBJECT.search(stem) is None
-        if is_plain or _is_observation(short):
+        if is_plain or _observation(short):
             return short
     if full not in taken:
         return full
@@ -135,25 +135,21 @@ def _key(path: Path) -> Path:
     return path.parent.resolve() / path.name
 
 
-def _load(path: Path) -> dict[str, Any]:
-    """The object of a JSON file; empty if there is none."""
+def _observation(path: Path) -> dict[str, Any]:
+    """The fields of an observation file; empty where there is none."""
     data: Any = None
     if path.is_file():  # a pipe would be waited for
         with suppress(DataError):
             data = read_json(path)
-    return data if isinstance(data, dict) else {}
-
-
-def _is_observation(path: Path) -> bool:
-    data = _load(path)
-    return {"camera", "keypoints"} <= data.keys() or isinstance(data.get("views"), list)
+    if not isinstance(data, dict):
+        return {}
+    is_one = {"camera", "keypoints"} <= data.keys() or isinstance(data.get("views"), list)
+    return data if is_one else {}
 
 
 def _named_photos(path: Path) -> list[Path]:
-    """Photos that an observation names and that are there; none for what is no observation."""
-    if not _is_observation(path):
-        return []
-    data = _load(path)
+    """Photos that an observation names and that are there."""
+    data = _observation(path)
     views = data.get("views", [data])
     images = [view.get("image") for view in views if isinstance(view, dict)]
     named = [path_from(each, path.parent) for each in images if isinstance(each, str) and each]
@@ -162,8 +158,8 @@ def _named_photos(path: Path) -> list[Path]:
 
 def named_model(path: Path) -> Path | None:
     """The model's mesh that an observation file names and that is there; None without one."""
-    given = _load(path).get("model")
-    if not isinstance(given, str) or not given or not _is_observation(path):
+    given = _observation(path).get("model")
+    if not isinstance(given, str) or not given:
         return None
     mesh = path_from(given, path.parent)
     return mesh if mesh.is_file() else None

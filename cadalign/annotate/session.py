@@ -105,8 +105,10 @@ class Session:
         try:
             problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
             points, pixels, camera = problem.points_3d, problem.points_2d, problem.camera
-            joint = not all(self.observed(state)[0].is_plain for state in self.states)
-            joint |= self.shape is not None
+            marked = (state for state in self.states if state.document.complete_pairs)
+            joint = self.shape is not None or not all(
+                self.observed(state)[0].is_plain for state in marked
+            )
             warm_up(points, pixels, camera, joint=joint)
             if not joint:
                 warm_up_advice(points, View(camera, pixels), problem.alignment)

@@ -144,7 +144,7 @@ def test_a_click_does_not_wait_for_it(case: Case, monkeypatch: pytest.MonkeyPatc
             pool.submit(perform, session, 0, {"do": "undo"}).result(timeout=20)
         return ()
 
-    monkeypatch.setattr("cadalign.annotate.page_state.rank", meanwhile)
+    monkeypatch.setattr("cadalign.annotate.ranking.rank", meanwhile)
     before = page_state(session, 0)["revision"]
     assert advice_state(session, 0)["revision"] == before
     assert page_state(session, 0)["revision"] == before + 1

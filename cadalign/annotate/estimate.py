@@ -52,7 +52,7 @@ _FOCAL_ASSUMED = "The focal length is assumed: add a pair elsewhere to have it e
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What is known of an object beside its observation.
+    """Knowledge of an object beside its observation.
 
     Parameters
     ----------
@@ -94,23 +94,23 @@ class Known:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class LiveEstimate:
     """An alignment from all photos of an object, and what it was computed from.
 
     ``assumed`` says what was assumed of it; ``sigma`` [px] and ``fit_options`` are as of
     `LiveAlignment`.
     """
 
-    problem: Problem
+    problem: LiveProblem
     result: Result
     sigma: float = LEAST_SIGMA
     fit_options: Mapping[str, Any] = field(default_factory=dict)
     assumed: str = ""
 
     @classmethod
-    def of(cls, known: Known, observation: Observation) -> Estimate:
+    def of(cls, known: Known, observation: Observation) -> LiveEstimate:
         """Align, with as few assumptions as the marks need; raises a CadalignError without."""
-        problem = Problem.of(known, observation)
+        problem = LiveProblem.of(known, observation)
         reason: DegenerateError | None = None
         for attempt, assumed in problem.attempts():
             try:
@@ -127,7 +127,7 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class LiveProblem:
     """Arguments of `cadalign.align`, and how the pairs' standard deviation is found.
 
     ``noise`` is "given", "settled" for one that explains the residuals beside a prior on the
@@ -142,7 +142,7 @@ class Problem:
     focal_prior: FocalPrior | None
 
     @classmethod
-    def of(cls, known: Known, observation: Observation) -> Problem:
+    def of(cls, known: Known, observation: Observation) -> LiveProblem:
         """The problem of an observation."""
         model = known.model_for(observation)
         views = views_of(observation, model, sigma=known.sigma)
@@ -162,7 +162,7 @@ class Problem:
         model = self.model
         return model if isinstance(model, Model) and model.shape_sigma is None else None
 
-    def attempts(self) -> Iterator[tuple[Problem, str]]:
+    def attempts(self) -> Iterator[tuple[LiveProblem, str]]:
         """Problems to try, the first as it is, down to what is left where marks do not suffice.
 
         Each comes with what it assumes, where ``{reason}`` stands for why the ones before fail.
@@ -183,13 +183,13 @@ class Problem:
         rigid = replace(self.exact, scale_prior_sigma=None, stretch="none")
         yield replace(problem, model=rigid), "The model is shown unstretched: add a pair elsewhere."
 
-    def at_focal(self, cameras: Sequence[Camera]) -> Problem:
+    def at_focal(self, cameras: Sequence[Camera]) -> LiveProblem:
         """The problem with the focal lengths of these cameras known."""
         views = zip(self.views, cameras, strict=True)
         known = tuple(replace(view, camera=camera) for view, camera in views)
         return replace(self, views=known, estimates_focal=False, focal_prior=None)
 
-    def weighted(self, factor: float) -> Problem:
+    def weighted(self, factor: float) -> LiveProblem:
         """The problem with each pair's standard deviation times a factor."""
         views = (replace(view, sigma=factor * cast(FloatArray, view.sigma)) for view in self.views)
         return replace(self, views=tuple(views))
@@ -316,12 +316,12 @@ def warm_up(points_3d: FloatArray, points_2d: FloatArray, camera: Camera, *, joi
     view, prior = View(camera, points_2d, sigma=1.0), FocalPrior(camera.fx, 0.4)
     exact = Model(points_3d=points_3d, scale_prior_sigma=LIKELY_STRETCH)
     for estimates_focal in (False, True):
-        problem = Problem(exact, (view,), None, "settled", estimates_focal, prior)
+        problem = LiveProblem(exact, (view,), None, "settled", estimates_focal, prior)
         problem.solve()
         problem.contradicting(0)
     if joint:
         similar = Model(points_3d=points_3d, shape_sigma=0.01)
         for estimates_focal in (False, True):
-            problem = Problem(similar, (view,), None, "given", estimates_focal, None)
+            problem = LiveProblem(similar, (view,), None, "given", estimates_focal, None)
             problem.solve()
             problem.left_out()

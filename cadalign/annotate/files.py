@@ -200,7 +200,7 @@ class AnnotationFiles:
         return observation
 
     def _earlier_unfinished(self) -> _Unfinished | None:
-        """What a file of an earlier version has; None if there is none."""
+        """The unfinished pairs in a file of an earlier version; None if there is none."""
         path = earlier_unfinished_file(self.observation)
         if not path.is_file():
             return None

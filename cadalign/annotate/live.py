@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.annotate.estimate import LEAST_SIGMA, Estimate, Known
+from cadalign.annotate.estimate import LEAST_SIGMA, Known, LiveEstimate
 from cadalign.annotate.evidence import evidence_labels
 from cadalign.annotate.model import Wireframe, box_lines
 from cadalign.annotate.models import KeypointRegistry
@@ -86,7 +86,7 @@ class LiveAlignment:
 
 
 def live_alignment(
-    estimate: Estimate,
+    estimate: LiveEstimate,
     known: Known,
     wireframe: Wireframe,
     observation: Observation,
@@ -98,7 +98,7 @@ def live_alignment(
 
     Parameters
     ----------
-    estimate : Estimate
+    estimate : LiveEstimate
     known : Known
     wireframe : Wireframe
         The model's.

@@ -28,7 +28,7 @@ from cadalign.io.files import read_text
 logger = logging.getLogger("cadalign")
 
 LEASE = 60.0
-"""How long a photo stays with the person who changed it last [s]."""
+"""Time that a photo stays with the person who changed it last [s]."""
 _ENDING = "annotate-lock"
 _PATIENCE = 0.2  # for a lock that is just being removed [s]
 _QUEUE = 2.0  # for others that are passing through the folder's lock [s]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
-from cadalign.annotate.estimate import Estimate
+from cadalign.annotate.estimate import LiveEstimate
 from cadalign.annotate.evidence import FurtherEvidence, MaskDrawing
 from cadalign.annotate.files import AnnotationFiles, written_unfinished, written_view
 from cadalign.annotate.history import History
@@ -55,9 +55,9 @@ class PhotoState:
     live: tuple[AnnotationDocument, LiveAlignment, Suggestion | None] | None = field(
         default=None, repr=False
     )
-    """What was computed last, of that document of the object."""
-    estimate: tuple[AnnotationDocument, Estimate] | None = field(default=None, repr=False)
-    """The estimate from all photos that was computed last."""
+    """The last alignment and suggestion, with the document that they belong to."""
+    estimate: tuple[AnnotationDocument, LiveEstimate] | None = field(default=None, repr=False)
+    """The last estimate from all photos, with the document that it belongs to."""
 
     @property
     def document(self) -> AnnotationDocument:
@@ -292,7 +292,7 @@ class Observer:
         return evidence.added_to(state.further, state.camera, drawn)
 
     def _unfinished(self, state: PhotoState) -> dict[str, Any] | None:
-        """What an observation has no keypoints for: other pairs, and further photos without any."""
+        """Pairs that are no keypoints of the observation, and further photos without any."""
         views = []
         for view in state.all_views[1:]:
             pairs = self._other_pairs(view)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.document import AnnotationDocument
-from cadalign.annotate.estimate import Estimate, Known, warm_up
+from cadalign.annotate.estimate import Known, LiveEstimate, warm_up
 from cadalign.annotate.history import history_path, write_history
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import LiveAlignment, known_points, live_alignment, missing_text
@@ -189,7 +189,7 @@ class Session:
             return LiveAlignment(message=missing)
         known = self._known(state)
         if owner.estimate is None or owner.estimate[0] is not document:
-            owner.estimate = document, Estimate.of(known, observation)
+            owner.estimate = document, LiveEstimate.of(known, observation)
         uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
         lines = state.model.wireframe
         return live_alignment(owner.estimate[1], known, lines, observation, place, points, uv)

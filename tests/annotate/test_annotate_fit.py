@@ -13,7 +13,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, fit
 from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.estimate import Estimate, Known
+from cadalign.annotate.estimate import Known, LiveEstimate
 from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel, Wireframe
 from cadalign.annotate.photos import Intrinsics
@@ -59,7 +59,7 @@ def live_of(
         ModelKeypoint(f"point {row}", xyz, row)
         for row, xyz in enumerate(map(tuple, problem.points_3d.tolist()))
     ]
-    estimate = Estimate.of(known, observation)
+    estimate = LiveEstimate.of(known, observation)
     lines = Wireframe.of_model(ClickableModel(BOX))
     return live_alignment(estimate, known, lines, observation, 0, points, observation.points_2d)
 

@@ -23,7 +23,8 @@ from benchmarks.section import (
     medians_in_turns,
     seconds,
 )
-from cadalign import Alignment, Camera, RansacOptions, Result
+from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
+from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.estimation.options import BOUNDING_PRIOR
@@ -36,6 +37,7 @@ from cadalign.evaluation.simulation.problems import (
     random_rotation,
     simulate_problem,
 )
+from cadalign.shapes.tails import probability_within
 from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
@@ -309,12 +311,36 @@ class Coverage:
     """Random problems per row."""
     noise_px: float = 1.0
     """Standard deviation of the noise [px], which sigma states."""
+    region_problems: int = 150
+    """Random objects in a unit cube per row of the regions."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure coverage and warnings."""
+        yield RatioTable("Truths within nominal 68, 95 %", list(self._regions(given)))
         yield RatioTable("Errors within the 95 % ellipsoid", list(self._coverage(given)))
         title = "Large errors without a warning, and misfits found"
         yield RatioTable(title, list(self._warnings(given)))
+
+    def _regions(self, given: BenchmarkData) -> Iterator[Row]:
+        """Regions of rotation, translation and lengths, by what is estimated from how much."""
+        for kind in _KINDS:
+            for points in _REGION_SIZES:
+                squares: list[FloatArray] = []
+                for number in range(self.region_problems):
+                    rng = np.random.default_rng([given.seed, points, number])
+                    try:
+                        result, truth = _estimated(rng, kind, points, self.noise_px)
+                    except CadalignError:
+                        continue
+                    squares.append(_squares(result, truth))
+                within = np.array(squares)
+                row: Row = {"estimate": kind, "keypoints": points, "results": len(squares)}
+                for column, name in enumerate(("R", "t", "lengths")):
+                    shares = [
+                        100 * float((within[:, column] <= share).mean()) for share in (0.68, 0.95)
+                    ]
+                    row[name] = f"{shares[0]:.0f}, {shares[1]:.0f}"
+                yield row
 
     def _coverage(self, given: BenchmarkData) -> Iterator[Row]:
         for sigma, loss in ((self.noise_px, "linear"), (None, "linear"), (None, "cauchy")):
@@ -361,6 +387,64 @@ class Coverage:
             except CadalignError:
                 continue
             yield problem, result
+
+
+_KINDS = ("fit", "sigma=None", "20 % outliers", "focal", "shape_sigma=.05", "two views")
+_REGION_SIZES = (5, 6, 8, 12, 30, 100, 200)
+_REGION_CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
+_SHAPE_SIGMA = 0.05
+
+
+def _estimated(
+    rng: np.random.Generator, kind: str, points: int, noise_px: float
+) -> tuple[Result, Alignment]:
+    """An estimate of a random object from its first view, and the truth."""
+    model = rng.uniform(-0.5, 0.5, (points, 3))
+    scale = np.array([1.0, *np.exp(rng.normal(0, 0.2, 2))])
+    differs = _SHAPE_SIGMA if kind.startswith("shape_sigma") else 0.0
+    object_points = model * scale + rng.normal(0, 1, model.shape) * differs
+    poses = []
+    for _ in range(2):
+        turn = Rotation.random(random_state=rng).as_matrix()
+        place = rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0))
+        poses.append(Alignment(turn, place, np.ones(3)))
+    seen = [
+        _REGION_CAMERA.project(pose.apply(object_points)) + rng.normal(0, noise_px, (points, 2))
+        for pose in poses
+    ]
+    truth = Alignment(poses[0].rotation, poses[0].translation, scale)
+    if kind == "two views":
+        views = [View(_REGION_CAMERA, each, sigma=noise_px) for each in seen]
+        return cadalign.align(Model(points_3d=model), views), truth
+    if differs:
+        similar = Model(points_3d=model, shape_sigma=differs)
+        return cadalign.align(similar, View(_REGION_CAMERA, seen[0], sigma=noise_px)), truth
+    camera, options = _REGION_CAMERA, dict[str, Any](sigma=noise_px)
+    if kind == "sigma=None":
+        options = {"sigma": None}
+    elif kind == "20 % outliers":
+        wrong = rng.choice(points, points // 5, replace=False)
+        seen[0][wrong] = rng.uniform(0, (640, 480), (len(wrong), 2))
+        options["ransac"] = RansacOptions()
+    elif kind == "focal":
+        camera, options["focal"] = Camera.without_focal(640, 480), "estimate"
+    return cadalign.fit(model, seen[0], camera, **options), truth
+
+
+def _squares(result: Result, truth: Alignment) -> FloatArray:
+    """Nominal probabilities (3,) of the regions of R, t and lengths that reach the truth."""
+    covariance = result.covariance
+    assert covariance is not None
+    est = result.alignment
+    vector = Rotation.from_matrix(truth.rotation @ est.rotation.T).as_rotvec()
+    errors = (vector, truth.translation - est.translation, np.log(truth.scale / est.scale))
+    found = []
+    for first, error in zip((0, 3, 6), errors, strict=True):
+        rows = [row for row in range(first, first + 3) if covariance[row, row] > 0]
+        kept = error[[row - first for row in rows]]
+        square = kept @ np.linalg.solve(covariance[np.ix_(rows, rows)], kept)
+        found.append(probability_within(square, len(rows), result.degrees_of_freedom))
+    return np.array(found)
 
 
 def _cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:

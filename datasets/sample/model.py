@@ -20,7 +20,7 @@ _CREASE_DEGREES = 35.0
 class Draft:
     """A model in its builder's units, y up and the front at -z."""
 
-    solids: tuple[Solid, ...]
+    solids: Sequence[Solid]
     places: Mapping[int, Point]
     """By semantic id: each keypoint lands on the nearest point of the surface."""
     mirrored: tuple[tuple[int, int], ...] = ()

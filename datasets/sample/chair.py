@@ -33,7 +33,10 @@ _LEGS = {
     "tapered": (0.0, 0.03, (1.15, 0.7)),
     "splayed": (0.03, 0.1, (1.1, 0.6)),
 }
-_WOODS, _METALS = palette("966236 ba8650 603c26 cea470 7a4628 462e22"), palette("a8acb2 34363a 787c82")
+_WOODS, _METALS = (
+    palette("966236 ba8650 603c26 cea470 7a4628 462e22"),
+    palette("a8acb2 34363a 787c82"),
+)
 _FABRICS = palette("ac342e 2c5484 46764e d4a03c 784a78 42464e c4baa8 28787e")
 (_DARK,) = palette("26262a")
 _SPOKE_IDS = (10, 11, 12, 13, 14)
@@ -156,7 +159,10 @@ def _add_arms(c: _Chair, solids: list[Solid], pairs: dict[tuple[int, int], Point
     front = -0.32 * c.depth
     color, size = _DARK if c.base == "swivel" else c.frame, (0.05, 0.024, rear - front)
     pad = box((x, y - 0.012, (front + rear) / 2), size, color, radius=0.01)
-    post = [(c.width / 2 - 0.012, c.seat - 0.6 * c.thickness, front + 0.04), (x, y - 0.01, front + 0.04)]
+    post = [
+        (c.width / 2 - 0.012, c.seat - 0.6 * c.thickness, front + 0.04),
+        (x, y - 0.01, front + 0.04),
+    ]
     solids += both_sides(pad, beam(post, (0.026, 0.034), c.frame))
     pairs |= {(6, 8): (x + 0.025, y, front), (7, 9): (x + 0.025, y, rear)}
 

@@ -144,12 +144,14 @@ def beam(
     is x, or z where the path runs along x.
     """
     points = np.asarray(path, dtype=float)
-    tangent = _normalized(np.gradient(points, axis=0))
+    tangent = trimesh.unitize(np.gradient(points, axis=0))
     along = side or ((1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1))
-    first = _normalized(along - (tangent @ along)[:, None] * tangent)
+    first = trimesh.unitize(along - (tangent @ along)[:, None] * tangent)
     section = rectangle(*size, radius=radius or 0.18 * min(size), steps=2 if radius else 1)
     outlines = section * np.reshape(scales, (len(scales), 1, -1))
-    rings = outlines[..., :1] * first[:, None] + outlines[..., 1:] * np.cross(tangent, first)[:, None]
+    rings = (
+        outlines[..., :1] * first[:, None] + outlines[..., 1:] * np.cross(tangent, first)[:, None]
+    )
     return loft(points[:, None] + rings, color)
 
 
@@ -184,7 +186,3 @@ def ellipsoid(center: Point, size: Point, color: Color, *, count: int) -> Solid:
     angle = np.linspace(0, np.pi, count // 2 + 1)
     profile = np.stack([size[0] * np.sin(angle), -size[1] * np.cos(angle)], axis=1) / 2
     return lathe(profile, color, center=center, count=count, depth=size[2] / size[0])
-
-
-def _normalized(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

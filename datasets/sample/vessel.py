@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +28,7 @@ _WHITE, _BLACK, _GLASS, _SPAR, _CLOTH = palette("f0f0ec 202226 222e3c ced0d4 f6f
 _BOTTOMS = palette("8c2620 6e2222 28423c")
 _SIDES = palette("243e68 962824 225850 262c34 e2e2de 204a78")
 _ACCENTS = palette("cc2c26 eea824 205ca0 2e7c4e e86a20")
+_DECKS = palette("7e5c4e c49864 cca676 707670")
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,9 @@ class _Vessel:
         depth = 0.35 + 0.65 * np.sqrt(np.clip(share / 0.75, 0, 1))
         return np.asarray(self.beam / 2 * bow * stern * depth)
 
-    def ends(self, share: float) -> tuple[float, float]:
+    def ends(self, share: float) -> FloatArray:
         """z of stem and stern at a share of the height."""
-        return self.rake[0] * (1 - share) - 0.5, 0.5 - self.rake[1] * (1 - share)
+        return (np.array(self.rake) * (1 - share) - 0.5) * (1, -1)
 
     def outline(self, share: float, inset: float = 0.0) -> FloatArray:
         """A closed line around the hull, from the middle of the stern over the right side."""
@@ -126,15 +128,14 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
     )
     side = _SIDES[(number + turn + int(rng.integers(2))) % len(_SIDES)]
     solids, (top, width, front, rear), tips = build(v)
-    bow, stern = v.ends(v.water)
+    bow, stern = v.ends(v.water).tolist()
     pairs = {
-        (right, right + 1): (float(v.half(z)), float(v.edge(z)), z)
-        for right, z in ((2, 0.5), (4, 0.0), (6, -0.25))
-    } | {
         (8, 9): (width / 2, top, front),
         (10, 11): (width / 2, top, rear),
         (13, 14): (float(v.half(0.5, v.water)), 0.0, stern),
     }
+    for right, z in ((2, 0.5), (4, 0.0), (6, -0.25)):
+        pairs[right, right + 1] = float(v.half(z)), float(v.edge(z)), z
     places = {0: (0.0, float(v.edge(-0.5)), -0.5), 1: (0.0, 0.0, bow)}
     return Draft([*v.hull(side), *solids], mirrored_places(pairs) | places | tips, tuple(pairs))
 
@@ -144,28 +145,17 @@ _Above = tuple[list[Solid], Level, dict[int, Point]]
 of the funnel by semantic id."""
 
 
-def _block(roof: Level, low: float, *, floors: int = 1) -> list[Solid]:
-    """A white block below a roof, with a dark band of windows around each floor."""
-    high, width, front, rear = roof
-    tall, middle, deep = (high - low) / floors, (front + rear) / 2, rear - front
-    size, band = (width, high - low, deep), (width + 0.002, 0.34 * tall, deep + 0.002)
-    walls = box((0, (low + high) / 2, middle), size, _WHITE, radius=0.003, steps=1)
-    heights = low + tall * (np.arange(floors) + 0.55)
-    return [walls, *(box((0, y, middle), band, _GLASS) for y in heights)]
-
-
-def _storey(
-    low: float, high: float, width: float, ends: tuple[float, float], slope: float, roof: Color
-) -> list[Solid]:
-    """A wall, a band of glass that leans back by ``slope`` in front, and a roof."""
-    (front, rear), sill, top = ends, low + 0.35 * (high - low), high - 0.012
-    bend, lean = front + 0.3 * slope, front + slope
+def _storey(low: float, roof: Level, *, slope: float = 0.0, color: Color = _WHITE) -> list[Solid]:
+    """A wall, a band of glass that leans back by ``slope`` to the roof in front, and the roof."""
+    high, width, lean, rear = roof
+    tall, front = high - low, lean - slope
+    sill, top, bend = low + 0.35 * tall, high - 0.12 * tall, front + 0.3 * slope
     wall = [(low, width, front, rear), (sill, width, bend, rear)]
-    glass = [(sill, 0.98 * width, bend, rear), (top, 0.94 * width, lean, rear - 0.01)]
-    cover = [(top, 1.03 * width, lean - 0.02, rear + 0.025),
-             (high, 1.0 * width, lean - 0.012, rear + 0.018)]  # fmt: skip
-    levels = ((wall, _WHITE), (glass, _GLASS), (cover, roof))
-    return [stack(level, color, radius=0.035) for level, color in levels]
+    glass = [(sill, 0.98 * width, bend, rear), (top, 0.94 * width, lean, rear - 0.1 * tall)]
+    cover = [(top, 1.03 * width, lean - 0.2 * tall, rear + 0.25 * tall),
+             (high, width, lean - 0.12 * tall, rear + 0.18 * tall)]  # fmt: skip
+    levels = ((wall, _WHITE), (glass, _GLASS), (cover, color))
+    return [stack(level, tint, radius=0.35 * tall) for level, tint in levels]
 
 
 def _funnel(top: Point, low: float, radius: float, color: Color) -> list[Solid]:
@@ -189,79 +179,81 @@ def _mast(top: Point, low: float, radius: float, *yards: float) -> list[Solid]:
 def _cargo(v: _Vessel) -> _Above:
     """A container ship, its bridge at the stern."""
     low, wide, tall, long = v.deck(0.35) - 0.01, 0.15 * v.beam, 0.028 * v.tall, 0.64 / 7
-    high = low + 0.12 * v.tall
-    roof = (high + 0.026 * v.tall, v.beam, 0.3075, 0.3625)
-    summit, funnel = (0.0, roof[0] + 0.075 * v.tall, 0.33), (0.0, roof[0] + 0.045 * v.tall, 0.433)
-    containers = []  # of the same colours on the right and on the left
+    decks = low + 0.03 * v.tall * np.arange(5)
+    roof = top, *_ = (decks[-1] + 0.026 * v.tall, v.beam, 0.3075, 0.3625)
+    summit, funnel = (0.0, top + 0.075 * v.tall, 0.33), (0.0, top + 0.045 * v.tall, 0.433)
+    solids = [
+        *_storey(decks[-1], roof),
+        *_funnel(funnel, decks[-1] - 0.05, 0.027, v.accent),
+        *_mast(summit, top - 0.01, 0.005, 0.6),
+        *_mast((0.0, v.deck(-0.42) + 0.09, -0.43), v.deck(-0.42), 0.004),
+    ]
+    for floor, ceiling in pairwise(decks):
+        solids += _storey(floor, (ceiling, 0.84 * v.beam, 0.3, 0.415))
     for bay, z in enumerate(-0.36 + long * np.arange(0.5, 7)):
         deck, room = v.deck(min(z - long / 2, 0.1)), float(v.half(z - long / 2)) - 0.012
         for row in range(min(3, int(room / wide))):
             for layer in range(3 if bay == 0 else 4 - (bay + row + v.variant) % 2):
                 color = _ACCENTS[(5 * bay + 3 * row + (2 + bay) * layer) % len(_ACCENTS)]
                 center = ((row + 0.5) * wide, deck + (layer + 0.5) * tall, z)
-                containers.append(box(center, (0.95 * wide, 0.95 * tall, 0.92 * long), color))
-    solids = [
-        *_block((high, 0.84 * v.beam, 0.3, 0.415), low, floors=4),
-        *_block(roof, high),
-        *_funnel(funnel, high - 0.05, 0.027, v.accent),
-        *_mast(summit, roof[0] - 0.01, 0.005, 0.6),
-        *_mast((0.0, v.deck(-0.42) + 0.09, -0.43), v.deck(-0.42), 0.004),
-        *both_sides(*containers),
-    ]
+                size = (0.95 * wide, 0.95 * tall, 0.92 * long)
+                solids += both_sides(box(center, size, color))
     return solids, roof, {12: summit, 15: funnel}
 
 
 def _tug(v: _Vessel) -> _Above:
     """A tug: wheelhouse forward, a funnel, a low open stern."""
-    deck, house, front, rear = v.deck(0.05), 0.62 * v.beam, -0.21, -0.04
+    deck, house = v.deck(0.05), 0.62 * v.beam
     y, wide = deck + 0.1 * v.tall, (0.78, 0.66, 0.86)[v.variant] * house
     top = y + 0.125
-    summit, funnel = (0.0, top + 0.2 * v.tall, rear - 0.04), (0.0, y + 0.17 * v.tall, 0.08)
+    summit, funnel = (0.0, top + 0.2 * v.tall, -0.08), (0.0, y + 0.17 * v.tall, 0.08)
     solids = [
-        *_block((y, house, -0.24, 0.14), deck - 0.02),
-        *_storey(y - 0.01, top, wide, (front, rear), 0.01, v.accent),
+        *_storey(deck - 0.02, (y, house, -0.22, 0.12)),
+        *_storey(y - 0.01, (top, wide, -0.2, -0.04), slope=0.01, color=v.accent),
         *_funnel(funnel, y - 0.02, 0.06, v.accent),
         *_mast(summit, top - 0.02, 0.009, 0.3, 0.6),
     ]
-    return solids, (top, 1.02 * wide, front, rear + 0.018), {12: summit, 15: funnel}
+    return solids, (top, 1.02 * wide, -0.21, -0.022), {12: summit, 15: funnel}
 
 
 def _yacht(v: _Vessel) -> _Above:
     """A motor yacht of one, two or three storeys, dark windows all around."""
-    y, wide, front, rear = v.deck(0.05) - 0.004, 0.74 * v.beam, -0.2, 0.3
+    low, wide, front, rear = v.deck(0.05) - 0.004, 0.74 * v.beam, -0.12, 0.3
     solids: list[Solid] = []
     roofs = []
     for storey in range((2, 3, 1)[v.variant]):
-        high = y + (0.1 - 0.015 * storey) * v.tall
-        solids += _storey(y, high, wide, (front, rear), 0.08, _WHITE)
-        roofs.append((high, 0.96 * wide, front + 0.08, rear + 0.015))
-        y, wide, front, rear = high - 0.004, 0.88 * wide, front + 0.11, rear - 0.07
-    summit = (0.0, y + 0.19, rear - 0.01)
-    return [*solids, *_mast(summit, y - 0.01, 0.006, 0.3)], roofs[0], {12: summit}
+        high = low + (0.1 - 0.015 * storey) * v.tall
+        solids += _storey(low, (high, wide, front, rear), slope=0.08)
+        roofs.append((high, 0.96 * wide, front, rear + 0.015))
+        low, wide, front, rear = high - 0.004, 0.88 * wide, front + 0.11, rear - 0.07
+    summit = (0.0, low + 0.19, rear - 0.01)
+    return [*solids, *_mast(summit, low - 0.01, 0.006, 0.3)], roofs[0], {12: summit}
 
 
 def _sail(v: _Vessel) -> _Above:
     """A sailing boat with mainsail and foresail, one of them coloured or none."""
-    deck, wide, front, rear = v.deck(0.0), 0.5 * v.beam, -0.14, 0.2
-    high, low, top, keel = deck + 0.055, deck + 0.1, deck + 1.02 * v.tall, -v.draft
-    house = [(deck - 0.02, wide, front - 0.02, rear), (high, 0.88 * wide, front + 0.03, rear - 0.01)]
+    deck, wide, keel = v.deck(0.0), 0.5 * v.beam, -v.draft
+    roof, top = (deck + 0.055, 0.88 * wide, -0.11, 0.19), deck + 1.02 * v.tall
     fin = [(keel - 0.13, 0.03, -0.02, 0.14), (keel + 0.02, 0.026, -0.1, 0.16)]
     main, fore = (v.accent if v.variant == k else _CLOTH for k in (2, 1))
     solids = [
-        stack(house, _WHITE, radius=0.03),
+        stack([(deck - 0.02, wide, -0.16, 0.2), roof], _WHITE, radius=0.03),
         stack(fin, v.bottom, radius=0.012),
         box((0, deck + 0.025, 0.04), (0.97 * wide, 0.018, 0.2), _GLASS),
         box((0, deck + 0.01, 0.3), (0.36 * v.beam, 0.024, 0.17), _BLACK),
+        box((0, deck + 0.1, 0.1), (0.016, 0.016, 0.4), _SPAR),
         *_mast((0.0, top, -0.1), deck - 0.01, 0.011),
-        box((0, low, 0.1), (0.016, 0.016, 0.4), _SPAR),
-        _cloth((low + 0.012, top - 0.03), (-0.088, -0.088), (0.29, -0.076), main),
+        _cloth((deck + 0.112, top - 0.03), (-0.088, -0.088), (0.29, -0.076), main),
         _cloth((deck + 0.03, 0.86 * top), (-0.47, -0.13), (-0.12, -0.118), fore),
     ]
-    return solids, (high, 0.88 * wide, front + 0.03, rear - 0.01), {12: (0.0, top, -0.1)}
+    return solids, roof, {12: (0.0, top, -0.1)}
 
 
 def _cloth(
-    heights: tuple[float, float], luff: tuple[float, float], leech: tuple[float, float], color: Color
+    heights: tuple[float, float],
+    luff: tuple[float, float],
+    leech: tuple[float, float],
+    color: Color,
 ) -> Solid:
     """A flat sail in the plane x = 0: z of its front and rear edge, below and above."""
     shares = np.linspace(0, 1, 11)
@@ -271,12 +263,8 @@ def _cloth(
 
 
 _KINDS = (
-    (_Vessel(0.165, 0.04, 0.052, (0.03, 0.008), (0.045, 0.03), 0.2, 2.2, 0.82, 0.008,
-             (126, 92, 78)), _cargo),
-    (_Vessel(0.275, 0.05, 0.072, (0.035, 0.01), (0.11, 0.07), 0.58, 1.7, 0.6, 0.01,
-             (196, 152, 100)), _sail),
-    (_Vessel(0.25, 0.035, 0.082, (0.045, 0.0), (0.12, 0.02), 0.55, 1.8, 0.88, 0.014,
-             (204, 166, 118)), _yacht),
-    (_Vessel(0.325, 0.07, 0.072, (0.08, 0.015), (0.05, 0.05), 0.38, 2.3, 0.72, 0.025,
-             (112, 118, 112)), _tug),
+    (_Vessel(.165, .04, .052, (.03, .008), (.045, .03), .2, 2.2, .82, .008, _DECKS[0]), _cargo),
+    (_Vessel(.275, .05, .072, (.035, .01), (.11, .07), .58, 1.7, .6, .01, _DECKS[1]), _sail),
+    (_Vessel(.25, .035, .082, (.045, 0.0), (.12, .02), .55, 1.8, .88, .014, _DECKS[2]), _yacht),
+    (_Vessel(.325, .07, .072, (.08, .015), (.05, .05), .38, 2.3, .72, .025, _DECKS[3]), _tug),
 )  # fmt: skip

@@ -119,9 +119,10 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     cap[:, 1] = np.maximum(cap[:, 1], b.neck + 0.025)
     rim, top = cap[-1].tolist()
     foot = _EDGE * (1 - np.cos(np.linspace(0, np.pi / 2, 5)))
-    knots = (_EDGE, b.shoulder, b.neck, b.neck + 0.06 if b.cap == "nozzle" else 0.96)
-    parts = (np.linspace(*knots[i : i + 2], count)[1:] for i, count in enumerate((16, 15, 4)))
-    solids = [b.turned(np.concatenate([foot, *parts]), glass), lathe(cap, color, count=40)]
+    body, shoulder = np.linspace(_EDGE, b.shoulder, 16), np.linspace(b.shoulder, b.neck, 15)
+    neck = np.linspace(b.neck, max(cap[0, 1], b.neck + 0.06) + 0.01, 4)
+    heights = np.concatenate([foot, body[1:], shoulder[1:], neck[1:]])
+    solids = [b.turned(heights, glass), lathe(cap, color, count=40)]
     low, high = b.label[0], min(b.label[1], b.shoulder - 0.04)
     for start, end, grow, tint in ((0, 1, 1.012, label), (0.62, 0.86, 1.02, stripe)):
         heights = low + (high - low) * np.linspace(start, end, 7)

@@ -19,17 +19,17 @@ from cadalign.datasets.sample.solids import (
     lathe,
     loft,
     palette,
-    pick,
     stack,
 )
 
 _PAINTS = palette(
     "ba1e24 224e96 d6d8dc ecb228 3a7852 6e747c 3c3e46 ce6024 5aa0be eeece4 702238 96a078"
 )
-_RIMS = palette("c4c8ce a8acb2 dcdee2")
-_GLASS, _DARK, _TRIM, _PLATE, _HEAD_LAMP, _TAIL_LAMP = palette(
-    "1e2630 202023 3a3c40 f0f0e6 faf6d6 d6161a"
-)
+_GLASS, _DARK, _TRIM, _RIM, _PLATE = palette("1e2630 202023 3a3c40 c4c8ce f0f0e6")
+_HEAD_LAMP, _TAIL_LAMP = palette("faf6d6 d6161a")
+# Profiles of radius, in radii of the wheel, and distance outward [metres].
+_TYRE = ((0.92, -0.22), (1, -0.18), (1, -0.04), (0.94, 0.0), (0.7, 0.0), (0.68, -0.035))
+_DISC = ((0.71, -0.05), (0.71, 0.006), (0.64, 0.006), (0.55, -0.02), (0.24, -0.03), (0.15, 0.014))
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def car(rng: np.random.Generator, index: int) -> Draft:
         wheel=kind.wheel * rng.uniform(0.97, 1.04),
         paint=_PAINTS[(5 * index + int(rng.integers(3))) % len(_PAINTS)],
     )
-    rim, half, end = pick(rng, _RIMS), c.width / 2, c.length / 2
+    half, end = c.width / 2, c.length / 2
     y, width, front, rear = c.level(1.0)
     low, wide, foot, _ = c.level(0.06)
     lamp, tail = (0.72 * half, c.nose - 0.15, 0.04 - end), (0.76 * half, c.tail - 0.16, end - 0.03)
@@ -132,11 +132,18 @@ def car(rng: np.random.Generator, index: int) -> Draft:
         (16, 17): (0.9 * half, 0.43, end + 0.1),
         (18, 19): (half + 0.16, *mirror[1:]),
     }
+    wheels = [
+        lathe(
+            np.array(profile) * (c.wheel, 1), color, sideways=True,
+            center=(half + 0.012, c.wheel, c.z(axle)),
+        )
+        for axle in c.axles for profile, color in ((_TYRE, _DARK), (_DISC, _RIM))
+    ]  # fmt: skip
     solids = [
         _body(c),
         *_glass_house(c),
         *both_sides(
-            *(part for axle in c.axles for part in _wheel(c, c.z(axle), rim)),
+            *wheels,
             ellipsoid(lamp, (0.42 * half, 0.17, 0.2), _HEAD_LAMP, count=12),
             box(tail, (0.3 * half, 0.18, 0.16), _TAIL_LAMP, radius=0.03),
             ellipsoid(mirror, (0.2, 0.15, 0.12), c.paint, count=12),
@@ -197,27 +204,8 @@ def _glass_house(c: _Car) -> list[Solid]:
         stack([sunk, c.level(0.0), c.level(0.92)], _GLASS, radius=0.12),
         stack(roof, c.paint, radius=0.12),
     ]
-    (y, wide, front, rear), (top, width, start, stop) = c.level(-0.1), c.level(0.92)
-    ends = [(front + 0.045, start + 0.045), (rear - 0.045, stop - 0.045)]
-    for foot, head in (*ends, *((c.z(share), c.z(share)) for share in c.pillars)):
-        path = [(wide / 2 - 0.03, y, foot), (width / 2 - 0.03, top, head)]
+    (y, wide, front, rear), (top, width, start, stop) = c.level(-0.1, -0.045), c.level(0.92, -0.045)
+    for foot, head in ((front, start), (rear, stop), *((c.z(s), c.z(s)) for s in c.pillars)):
+        path = [(wide / 2 + 0.015, y, foot), (width / 2 + 0.015, top, head)]
         solids += both_sides(beam(path, (0.09, 0.08), c.paint, side=(0, 0, 1)))
-    return solids
-
-
-def _wheel(c: _Car, z: float, rim: Color) -> list[Solid]:
-    """The right wheel at z: tyre, rim, hub and spokes."""
-    r, center = c.wheel, np.array([c.width / 2 + 0.012, c.wheel, z])
-    tyre = [(0.92, -0.22), (1, -0.18), (1, -0.04), (0.94, 0.0), (0.7, 0.0), (0.68, -0.035)]
-    ring = [(0.7, -0.05), (0.71, 0.006), (0.64, 0.006), (0.62, -0.03)]
-    solids = [
-        lathe(np.array(profile) * (r, 1), color, center=center, count=count, sideways=True)
-        for profile, color, count in (
-            (tyre, _DARK, 24), (ring, rim, 20), ([(0.17, -0.05), (0.15, 0.014)], rim, 12)
-        )
-    ]  # fmt: skip
-    for angle in 2 * np.pi * np.arange(6) / 6:
-        outward = r * np.array([0, np.cos(angle), np.sin(angle)])
-        path = center + np.array([0.1, 0.64])[:, None] * outward - (0.006, 0, 0)
-        solids.append(beam(path, (0.03, 0.13 * r), rim, scales=(1, 0.8), side=(1, 0, 0)))
     return solids

@@ -29,10 +29,9 @@ _STYLES = (
 )  # fmt: skip
 # How far the feet stand out and the legs' tops lie inside [metres]; thickness of top and foot.
 _LEGS = {
-    "straight": (-0.023, 0.023, (1.0, 1.0)),
-    "tapered": (0.0, 0.03, (1.15, 0.7)),
+    "straight": (-0.023, 0.023, (1.0, 1.0)), "tapered": (0.0, 0.03, (1.15, 0.7)),
     "splayed": (0.03, 0.1, (1.1, 0.6)),
-}
+}  # fmt: skip
 _WOODS, _METALS = (
     palette("966236 ba8650 603c26 cea470 7a4628 462e22"),
     palette("a8acb2 34363a 787c82"),
@@ -40,6 +39,9 @@ _WOODS, _METALS = (
 _FABRICS = palette("ac342e 2c5484 46764e d4a03c 784a78 42464e c4baa8 28787e")
 (_DARK,) = palette("26262a")
 _SPOKE_IDS = (10, 11, 12, 13, 14)
+# Ranges of a chair's width, depth, seat, thickness, tall, tilt and leg.
+_LEAST = (0.4, 0.4, 0.42, 0.028, 0.38, 5, 0.032)
+_MOST = (0.52, 0.5, 0.5, 0.05, 0.58, 13, 0.046)
 
 
 @dataclass(frozen=True)
@@ -75,20 +77,14 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     middle of its top.
     """
     base, back, has_arms = _STYLES[index % len(_STYLES)]
+    width, depth, seat, thickness, tall, tilt, leg = rng.uniform(_LEAST, _MOST).tolist()
     c = _Chair(
-        base=base,
-        width=rng.uniform(0.4, 0.52),
-        depth=rng.uniform(0.4, 0.5),
-        seat=rng.uniform(0.42, 0.5),
-        thickness=rng.uniform(0.028, 0.05),
-        tall=rng.uniform(0.38, 0.58),
-        tilt=rng.uniform(5, 13),
-        leg=rng.uniform(0.032, 0.046),
+        base, width, depth, seat, thickness, tall, tilt, leg,
         bars=int(rng.integers(3, 6)),
         cushion=bool(rng.random() < 0.6) or back == "panel",
         frame=pick(rng, _METALS if base == "swivel" else _WOODS),
         fabric=pick(rng, _FABRICS),
-    )
+    )  # fmt: skip
     half = c.width / 2
     pairs = {
         (0, 1): c.back(1.0, half - 0.5 * c.leg),

@@ -186,7 +186,6 @@ def _cargo(v: _Vessel) -> _Above:
         *_storey(decks[-1], roof),
         *_funnel(funnel, decks[-1] - 0.05, 0.027, v.accent),
         *_mast(summit, top - 0.01, 0.005, 0.6),
-        *_mast((0.0, v.deck(-0.42) + 0.09, -0.43), v.deck(-0.42), 0.004),
     ]
     for floor, ceiling in pairwise(decks):
         solids += _storey(floor, (ceiling, 0.84 * v.beam, 0.3, 0.415))
@@ -204,7 +203,7 @@ def _cargo(v: _Vessel) -> _Above:
 def _tug(v: _Vessel) -> _Above:
     """A tug: wheelhouse forward, a funnel, a low open stern."""
     deck, house = v.deck(0.05), 0.62 * v.beam
-    y, wide = deck + 0.1 * v.tall, (0.78, 0.66, 0.86)[v.variant] * house
+    y, wide = deck + 0.1 * v.tall, 0.78 * house
     top = y + 0.125
     summit, funnel = (0.0, top + 0.2 * v.tall, -0.08), (0.0, y + 0.17 * v.tall, 0.08)
     solids = [
@@ -240,7 +239,6 @@ def _sail(v: _Vessel) -> _Above:
         stack([(deck - 0.02, wide, -0.16, 0.2), roof], _WHITE, radius=0.03),
         stack(fin, v.bottom, radius=0.012),
         box((0, deck + 0.025, 0.04), (0.97 * wide, 0.018, 0.2), _GLASS),
-        box((0, deck + 0.01, 0.3), (0.36 * v.beam, 0.024, 0.17), _BLACK),
         box((0, deck + 0.1, 0.1), (0.016, 0.016, 0.4), _SPAR),
         *_mast((0.0, top, -0.1), deck - 0.01, 0.011),
         _cloth((deck + 0.112, top - 0.03), (-0.088, -0.088), (0.29, -0.076), main),

@@ -63,8 +63,7 @@ class _Bottle:
         depth, exponent = (1.0, 2.0) if radius else map(float, self.section(height))
         # KeypointNet's order of four points around: (+x, -z), (+x, +z), (-x, +z), (-x, -z).
         x = (radius or float(self.radius_at(height))) * 2 ** (-1 / exponent)
-        z = x * depth
-        corners = ((x, -z), (x, z), (-x, z), (-x, -z))
+        corners = (x, -x * depth), (x, x * depth), (-x, x * depth), (-x, -x * depth)
         return {first + i: (right, height, rear) for i, (right, rear) in enumerate(corners)}
 
 
@@ -122,12 +121,13 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     body, shoulder = np.linspace(_EDGE, b.shoulder, 16), np.linspace(b.shoulder, b.neck, 15)
     neck = np.linspace(b.neck, max(cap[0, 1], b.neck + 0.06) + 0.01, 4)
     heights = np.concatenate([foot, body[1:], shoulder[1:], neck[1:]])
-    solids = [b.turned(heights, glass), lathe(cap, color, count=40)]
-    low, high = b.label[0], min(b.label[1], b.shoulder - 0.04)
-    for start, end, grow, tint in ((0, 1, 1.012, label), (0.62, 0.86, 1.02, stripe)):
-        heights = low + (high - low) * np.linspace(start, end, 7)
-        solids.append(b.turned(heights, tint, grow=grow))
-
+    paper = np.linspace(b.label[0], min(b.label[1], b.shoulder - 0.04), 9)
+    solids = [
+        b.turned(heights, glass),
+        lathe(cap, color, count=40),
+        b.turned(paper, label, grow=1.012),
+        b.turned(paper[5:8], stripe, grow=1.02),
+    ]
     groups = tuple(tuple(range(first, first + 4)) for first in (0, 4, 9, 13))
     is_round = (b.exponent, b.depth) == (2.0, 1.0)
     return Draft(

@@ -60,6 +60,10 @@ class _Car:
     def z(self, share: float) -> float:
         return (share - 0.5) * self.length
 
+    @property
+    def mirror(self) -> float:
+        return self.level(0.0)[2] + 0.36
+
     def level(self, share: float, grow: float = 0.0) -> Level:
         """A section of the glass house, at the belt line for 0 and at the roof for 1."""
         width = self.width * (0.9 - self.tumblehome * share)
@@ -118,8 +122,6 @@ def car(rng: np.random.Generator, index: int) -> Draft:
     half, end = c.width / 2, c.length / 2
     y, width, front, rear = c.level(1.0)
     low, wide, foot, _ = c.level(0.06)
-    lamp, tail = (0.72 * half, c.nose - 0.15, 0.04 - end), (0.76 * half, c.tail - 0.16, end - 0.03)
-    mirror = (half + 0.08, c.belt + 0.07, c.level(0.0)[2] + 0.36)
     pairs = {
         (0, 1): (width / 2, y, front),
         (2, 3): (width / 2, y, rear),
@@ -130,35 +132,9 @@ def car(rng: np.random.Generator, index: int) -> Draft:
         (12, 13): (wide / 2, low, foot),
         (14, 15): (0.88 * half, 0.42, -end - 0.1),
         (16, 17): (0.9 * half, 0.43, end + 0.1),
-        (18, 19): (half + 0.16, *mirror[1:]),
+        (18, 19): (half + 0.16, c.belt + 0.07, c.mirror),
     }
-    wheels = [
-        lathe(
-            np.array(profile) * (c.wheel, 1), color, sideways=True,
-            center=(half + 0.012, c.wheel, c.z(axle)),
-        )
-        for axle in c.axles for profile, color in ((_TYRE, _DARK), (_DISC, _RIM))
-    ]  # fmt: skip
-    solids = [
-        _body(c),
-        *_glass_house(c),
-        *both_sides(
-            *wheels,
-            ellipsoid(lamp, (0.42 * half, 0.17, 0.2), _HEAD_LAMP, count=12),
-            box(tail, (0.3 * half, 0.18, 0.16), _TAIL_LAMP, radius=0.03),
-            ellipsoid(mirror, (0.2, 0.15, 0.12), c.paint, count=12),
-        ),
-        box((0, c.nose - 0.16, -end), (0.78 * half, 0.15, 0.06), _DARK, radius=0.02),  # grille
-        box((0, 0.4, -end - 0.075), (0.5, 0.1, 0.02), _PLATE),
-        box((0, c.tail - 0.24, end + 0.002), (0.52, 0.11, 0.02), _PLATE),
-    ]
-    for direction, axle in zip((-1, 1), map(c.z, c.axles), strict=True):
-        long = 0.06 + min(0.36, end - abs(axle) - 1.22 * c.wheel)
-        bumper = (0, 0.41, direction * (end + 0.065 - long / 2))
-        solids.append(box(bumper, (1.97 * half, 0.2, long), _TRIM, radius=0.07, steps=3))
-        # It closes the space between the wheels.
-        block = (1.2 * (c.width - 0.5), 1.2 * c.wheel, 2.5 * c.wheel)
-        solids.append(box((0, c.sill + block[1] / 2, axle), block, _DARK))
+    solids = [_body(c), *_glass_house(c), *_fittings(c)]
     return Draft(solids, mirrored_places(pairs), tuple(pairs))
 
 
@@ -209,3 +185,30 @@ def _glass_house(c: _Car) -> list[Solid]:
         path = [(wide / 2 + 0.015, y, foot), (width / 2 + 0.015, top, head)]
         solids += both_sides(beam(path, (0.09, 0.08), c.paint, side=(0, 0, 1)))
     return solids
+
+
+def _fittings(c: _Car) -> list[Solid]:
+    """Wheels, lamps, mirrors, grille, plates and bumpers."""
+    half, end = c.width / 2, c.length / 2
+    lamp, tail = (0.72 * half, c.nose - 0.15, 0.04 - end), (0.76 * half, c.tail - 0.16, end - 0.03)
+    right = [
+        ellipsoid(lamp, (0.42 * half, 0.17, 0.2), _HEAD_LAMP, count=12),
+        box(tail, (0.3 * half, 0.18, 0.16), _TAIL_LAMP, radius=0.03),
+        ellipsoid((half + 0.08, c.belt + 0.07, c.mirror), (0.2, 0.15, 0.12), c.paint, count=12),
+    ]
+    middle = [
+        box((0, c.nose - 0.16, -end), (0.78 * half, 0.15, 0.06), _DARK, radius=0.02),  # grille
+        box((0, 0.4, -end - 0.075), (0.5, 0.1, 0.02), _PLATE),
+        box((0, c.tail - 0.24, end + 0.002), (0.52, 0.11, 0.02), _PLATE),
+    ]
+    for direction, axle in zip((-1, 1), map(c.z, c.axles), strict=True):
+        hub, block = (half + 0.012, c.wheel, axle), (1.2 * (c.width - 0.5), 1.2 * c.wheel)
+        for profile, color in ((_TYRE, _DARK), (_DISC, _RIM)):
+            shape = np.array(profile) * (c.wheel, 1)
+            right.append(lathe(shape, color, center=hub, sideways=True))
+        long = 0.06 + min(0.36, end - abs(axle) - 1.22 * c.wheel)
+        bumper = (0, 0.41, direction * (end + 0.065 - long / 2))
+        middle.append(box(bumper, (1.97 * half, 0.2, long), _TRIM, radius=0.07, steps=3))
+        # It closes the space between the wheels.
+        middle.append(box((0, c.sill + block[1] / 2, axle), (*block, 2.5 * c.wheel), _DARK))
+    return [*both_sides(*right), *middle]

@@ -101,10 +101,10 @@ def rectangle(width: float, height: float, *, radius: float, steps: int) -> Floa
     return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
 
 
-def stack(levels: Sequence[Level], color: Color, *, radius: float, steps: int = 3) -> Solid:
+def stack(levels: Sequence[Level], color: Color, *, radius: float) -> Solid:
     """A body through rectangles with round corners, from the lowest up."""
     rings = [
-        np.insert(rectangle(width, rear - front, radius=radius, steps=steps), 1, y, axis=1)
+        np.insert(rectangle(width, rear - front, radius=radius, steps=3), 1, y, axis=1)
         + (0, 0, (front + rear) / 2)
         for y, width, front, rear in levels
     ]

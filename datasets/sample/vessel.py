@@ -91,17 +91,14 @@ class _Vessel:
 
     def hull(self, side: Color) -> list[Solid]:
         """The part under water, a stripe at the water line, the side, and the deck."""
-        water, band = self.water, 0.88 * self.water + 0.12
-        below, line, above = (
-            [self.outline(share) for share in np.linspace(low, high, count)]
-            for low, high, count in ((0.0, water, 6), (water, band, 2), (band, 1.0, 5))
-        )
+        band = 0.88 * self.water + 0.12
+        below, above = np.linspace(0.0, self.water, 6), np.linspace(band, 1.0, 5)
         inner = self.outline(1.0, inset=0.012)
         sunk = inner - (0, self.bulwark, 0)
         return [
-            loft(below, self.bottom),
-            loft(line, _WHITE),
-            loft([*above, inner, sunk], side),
+            loft([self.outline(share) for share in below], self.bottom),
+            loft([self.outline(share) for share in (self.water, band)], _WHITE),
+            loft([*map(self.outline, above), inner, sunk], side),
             loft([sunk - (0, 0.004, 0), sunk + (0, 0.002, 0)], self.planks),
         ]
 
@@ -140,9 +137,8 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
     return Draft([*v.hull(side), *solids], mirrored_places(pairs) | places | tips, tuple(pairs))
 
 
+# What stands above the deck, the roof of the deck house, places by semantic id.
 _Above = tuple[list[Solid], Level, dict[int, Point]]
-"""What stands above the deck, the roof of the deck house, and the places of the highest point and
-of the funnel by semantic id."""
 
 
 def _storey(low: float, roof: Level, *, slope: float = 0.0, color: Color = _WHITE) -> list[Solid]:
@@ -160,20 +156,21 @@ def _storey(low: float, roof: Level, *, slope: float = 0.0, color: Color = _WHIT
 
 def _funnel(top: Point, low: float, radius: float, color: Color) -> list[Solid]:
     """A funnel with a black top."""
-    x, high, z = top
+    _, high, z = top
     bend = low + 0.8 * (high - low)
-    return [
-        lathe([(radius, low), (0.97 * radius, bend)], color, center=(x, 0, z)),
-        lathe([(0.95 * radius, bend), (0.93 * radius, high)], _BLACK, center=(x, 0, z)),
-    ]
+    lower, upper = (
+        [(radius, low), (0.97 * radius, bend)],
+        [(0.95 * radius, bend), (0.93 * radius, high)],
+    )
+    return [lathe(lower, color, center=(0, 0, z)), lathe(upper, _BLACK, center=(0, 0, z))]
 
 
 def _mast(top: Point, low: float, radius: float, *yards: float) -> list[Solid]:
     """A mast with bars across, at shares of its height."""
-    x, high, z = top
-    pole = lathe([(radius, low), (0.6 * radius, high)], _SPAR, center=(x, 0, z), count=12)
+    _, high, z = top
+    pole = lathe([(radius, low), (0.6 * radius, high)], _SPAR, center=(0, 0, z), count=12)
     size = (10 * radius, radius, radius)
-    return [pole, *(box((x, low + share * (high - low), z), size, _SPAR) for share in yards)]
+    return [pole, *(box((0, low + share * (high - low), z), size, _SPAR) for share in yards)]
 
 
 def _cargo(v: _Vessel) -> _Above:

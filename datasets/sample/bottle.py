@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.model import Draft
-from cadalign.datasets.sample.solids import Color, Point, Solid, lathe
+from cadalign.datasets.sample.solids import Color, Point, Solid, lathe, palette, pick
 
 _EDGE = 0.022  # radius of the rounded edge of the bottom
 
@@ -33,12 +33,7 @@ class _Bottle:
     glass: tuple[Color, ...]
     exponent: float = 2.0
     depth: float = 1.0
-    ribs: int = 0
     waist: float = 0.0
-
-    @property
-    def round(self) -> bool:
-        return (self.exponent, self.depth) == (2.0, 1.0)
 
     def radius_at(self, height: npt.ArrayLike) -> FloatArray:
         """Radii of the glass at heights."""
@@ -47,9 +42,8 @@ class _Bottle:
         above = np.clip((y - self.shoulder) / (self.neck - self.shoulder), 0, 1)
         # A smooth step from body to neck; the power moves it down (slender) or up (full).
         step = 0.5 - 0.5 * np.cos(np.pi * above ** (1 / self.curve))
-        ribs = 0.035 * (0.5 - 0.5 * np.cos(2 * np.pi * self.ribs * body))
-        radius = self.radius * (1 - self.waist * np.sin(np.pi * body) ** 4) * (1 - ribs)
         under = np.clip(_EDGE - y, 0, _EDGE)
+        radius = self.radius * (1 - self.waist * np.sin(np.pi * body) ** 4)
         radius = radius - _EDGE + np.sqrt(_EDGE**2 - under**2)
         return np.asarray(radius + (self.neck_radius - self.radius) * step)
 
@@ -60,29 +54,28 @@ class _Bottle:
 
     def turned(self, heights: FloatArray, color: Color, *, grow: float = 1.0) -> Solid:
         """The part of the bottle between the first and the last of some heights."""
-        low, high = heights[[0, -1]]
         profile = np.stack([grow * self.radius_at(heights), heights], axis=1)
-        closed = np.concatenate([[(0, low)], profile, [(0, high)]])
-        depth, exponent = self.section(closed[:, 1])
-        return lathe(closed, color, count=40, depth=depth, exponent=exponent)
+        depth, exponent = self.section(heights)
+        return lathe(profile, color, count=40, depth=depth, exponent=exponent)
 
     def ring(self, first: int, height: float, radius: float | None = None) -> dict[int, Point]:
         """Four places around the axis, by semantic id; on the glass, or on a round cap."""
         depth, exponent = (1.0, 2.0) if radius else map(float, self.section(height))
         # KeypointNet's order of four points around: (+x, -z), (+x, +z), (-x, +z), (-x, -z).
-        reach = (radius or float(self.radius_at(height))) * 2 ** (-1 / exponent)
-        corners = ((1, -1), (1, 1), (-1, 1), (-1, -1))
-        return {
-            first + i: (x * reach, height, z * reach * depth) for i, (x, z) in enumerate(corners)
-        }
+        x = (radius or float(self.radius_at(height))) * 2 ** (-1 / exponent)
+        corners = (x, -x * depth), (x, x * depth), (-x, x * depth), (-x, -x * depth)
+        return {first + i: (right, height, rear) for i, (right, rear) in enumerate(corners)}
 
 
-_GREEN, _BROWN, _CLEAR = ((40, 74, 44), (28, 56, 40)), ((98, 54, 22),), ((168, 208, 226),)
-_AMBER, _MILK = ((186, 112, 36), (200, 136, 60)), ((238, 236, 226), (226, 232, 236))
-_PAINT = ((206, 52, 44), (40, 96, 168), (236, 186, 52), (64, 140, 84))
+_GREEN, _BROWN, _CLEAR = palette("284a2c 1c3828"), palette("623616"), palette("a8d0e2")
+_AMBER, _MILK = palette("ba7024 c8883c"), palette("eeece2 e2e8ec")
+_PAINT = palette("ce342c 2860a8 ecba34 408c54")
+_CAP_COLORS = palette("b02428 202228 ceaa54 245296 f0f0ec")
+_LABELS = palette("eee6ce f6f6f2 decea0 cedee8")
+_STRIPES = palette("981e26 224276 285c3c a88032 302c2e")
 _KINDS = (
     _Bottle(0.125, 0.6, 0.72, 0.047, 0.55, "foil", (0.14, 0.46), _GREEN),  # Bordeaux wine
-    _Bottle(0.155, 0.68, 0.88, 0.058, 0.8, "screw", (0.38, 0.6), _CLEAR, ribs=7),  # water
+    _Bottle(0.155, 0.68, 0.88, 0.058, 0.8, "screw", (0.38, 0.6), _CLEAR),  # water
     _Bottle(0.15, 0.42, 0.74, 0.048, 1.35, "foil", (0.1, 0.34), _GREEN),  # Burgundy wine
     _Bottle(0.134, 0.55, 0.78, 0.052, 1.0, "crown", (0.16, 0.44), _BROWN),  # beer
     _Bottle(0.2, 0.56, 0.76, 0.062, 0.45, "stopper", (0.14, 0.42), _AMBER, 6.0),  # spirit
@@ -96,25 +89,13 @@ _KINDS = (
 )
 # Radius, relative to the neck's, and height from the cap's lower end to the rim of its top.
 _CAPS = {
-    "foil": [(1, 0.82), (1.03, 0.824), (1.03, 0.93), (1.13, 0.934), (1.13, 0.962), (1.05, 0.97)],
+    "foil": [(1.03, 0.82), (1.03, 0.93), (1.13, 0.934), (1.13, 0.962), (1.05, 0.97)],
     "crown": [(1.28, 0.942), (1.2, 0.958), (1.02, 0.972)],
-    "stopper": [(0.8, 0.93), (0.8, 0.965), (1.1, 0.972), (1.28, 0.99), (1.32, 1.005),
-                (1.26, 1.025), (1.1, 1.038), (1.0, 1.042)],
+    "stopper": [(0.8, 0.93), (0.8, 0.97), (1.24, 0.985), (1.32, 1.005), (1.24, 1.028), (1, 1.042)],
     "nozzle": [(1.1, 0.76), (1.1, 0.83), (0.75, 0.85), (0.28, 1.0), (0.22, 1.005)],
     "screw": [(1.16, 0.905), (1.16, 0.977), (1.1, 0.985)],
     "lid": [(1.12, 0.85), (1.12, 0.977), (1.06, 0.985)],
-}  # fmt: skip
-_GROOVED = ("screw", "lid")
-_CAP_COLORS: tuple[Color, ...] = (
-    (176, 36, 40), (32, 34, 40), (206, 170, 84), (36, 82, 150), (240, 240, 236),
-)  # fmt: skip
-_CORK = (96, 66, 42)
-_LABELS: tuple[Color, ...] = (
-    (238, 230, 206), (246, 246, 242), (222, 206, 160), (206, 222, 232),
-)  # fmt: skip
-_STRIPES: tuple[Color, ...] = (
-    (152, 30, 38), (34, 66, 118), (40, 92, 60), (168, 128, 50), (48, 44, 46),
-)  # fmt: skip
+}
 
 
 def bottle(rng: np.random.Generator, index: int) -> Draft:
@@ -124,8 +105,7 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     shoulder, 8 the middle of the top, 9 to 12 around the top's rim, 13 to 16 around the beginning
     of the neck.
     """
-    kind = _KINDS[index % len(_KINDS)]
-    color = _CAP_COLORS[int(rng.integers(len(_CAP_COLORS)))]
+    kind, color = _KINDS[index % len(_KINDS)], pick(rng, _CAP_COLORS)
     b = replace(
         kind,
         radius=kind.radius * rng.uniform(0.9, 1.14),
@@ -133,42 +113,28 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
         neck=kind.neck + rng.uniform(-0.02, 0.02),
         neck_radius=kind.neck_radius * rng.uniform(0.92, 1.1),
     )
-    glass = b.glass[int(rng.integers(len(b.glass)))]
-    color = _CORK if b.cap == "stopper" and rng.random() < 0.5 else color
-    label, stripe = (many[int(rng.integers(len(many)))] for many in (_LABELS, _STRIPES))
-
+    glass, label, stripe = (pick(rng, colors) for colors in (b.glass, _LABELS, _STRIPES))
     cap = np.array(_CAPS[b.cap]) * (b.neck_radius, 1)
     cap[:, 1] = np.maximum(cap[:, 1], b.neck + 0.025)
     rim, top = cap[-1].tolist()
-    mouth = b.neck + 0.06 if b.cap == "nozzle" else 0.96
     foot = _EDGE * (1 - np.cos(np.linspace(0, np.pi / 2, 5)))
-    body = np.linspace(_EDGE, b.shoulder, 36 if b.ribs else 20 if b.waist else 7)[1:]
-    shoulder, neck = np.linspace(b.shoulder, b.neck, 15)[1:], np.linspace(b.neck, mouth, 4)[1:]
-    collar = np.array([(0, -0.018), (1.15, -0.018), (1.15, -0.006), (0, -0.006)])
-    grooved = b.cap in _GROOVED
+    body, shoulder = np.linspace(_EDGE, b.shoulder, 16), np.linspace(b.shoulder, b.neck, 15)
+    neck = np.linspace(b.neck, max(cap[0, 1], b.neck + 0.06) + 0.01, 4)
+    heights = np.concatenate([foot, body[1:], shoulder[1:], neck[1:]])
+    paper = np.linspace(b.label[0], min(b.label[1], b.shoulder - 0.04), 9)
     solids = [
-        b.turned(np.concatenate([foot, body, shoulder, neck]), glass),
-        lathe(collar * (b.neck_radius, 1) + (0, cap[0, 1]), color if grooved else glass, count=40),
-        lathe(
-            np.concatenate([cap[:1] * (0, 1), cap, cap[-1:] * (0, 1)]), color,
-            count=80 if grooved else 40, grooves=0.05 * grooved,
-        ),
-    ]  # fmt: skip
-    low, tall = b.label[0], min(b.label[1], b.shoulder - 0.04) - b.label[0]
-    paper = replace(b, ribs=0)  # it spans the grooves of the glass
-    for start, end, grow, tint in (
-        (0, 1, 1.012, label), (0.62, 0.86, 1.02, stripe), (0.1, 0.15, 1.02, stripe)
-    ):  # fmt: skip
-        solids.append(paper.turned(low + tall * np.linspace(start, end, 7), tint, grow=grow))
-
-    places: dict[int, Point] = {8: (0.0, top + 0.1, 0.0)}
-    places |= b.ring(0, 0.02) | b.ring(4, b.shoulder) | b.ring(13, b.neck)
-    places |= b.ring(9, top - 0.004, rim)
+        b.turned(heights, glass),
+        lathe(cap, color, count=40),
+        b.turned(paper, label, grow=1.012),
+        b.turned(paper[5:8], stripe, grow=1.02),
+    ]
     groups = tuple(tuple(range(first, first + 4)) for first in (0, 4, 9, 13))
+    is_round = (b.exponent, b.depth) == (2.0, 1.0)
     return Draft(
-        solids=tuple(solids),
-        places=places,
+        solids,
+        b.ring(0, 0.02) | b.ring(4, b.shoulder) | b.ring(13, b.neck)
+        | b.ring(9, top - 0.004, rim) | {8: (0.0, top + 0.1, 0.0)},
         mirrored=tuple((group[i], group[(i + 1) % 4]) for group in groups for i in range(4)),
-        turned=groups if b.round else (),
-        round=b.round,
-    )
+        turned=groups if is_round else (),
+        round=is_round,
+    )  # fmt: skip

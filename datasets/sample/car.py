@@ -1,4 +1,4 @@
-"""Parametric cars: a body with wheel arches, a glass house, wheels, lamps and trim."""
+"""Parametric cars: a body with wheel arches, a glass house, wheels, lamps and bumpers."""
 
 from __future__ import annotations
 
@@ -18,16 +18,18 @@ from cadalign.datasets.sample.solids import (
     ellipsoid,
     lathe,
     loft,
+    palette,
     stack,
 )
 
-_PAINTS: tuple[Color, ...] = (
-    (186, 30, 36), (34, 78, 150), (214, 216, 220), (236, 178, 40), (58, 120, 82), (110, 116, 124),
-    (60, 62, 70), (206, 96, 36), (90, 160, 190), (238, 236, 228), (112, 34, 56), (150, 160, 120),
-)  # fmt: skip
-_RIMS: tuple[Color, ...] = ((196, 200, 206), (168, 172, 178), (220, 222, 226))
-_GLASS, _DARK, _TRIM, _PLATE = (30, 38, 48), (32, 32, 35), (58, 60, 64), (240, 240, 230)
-_HEAD_LAMP, _TAIL_LAMP = (250, 246, 214), (214, 22, 26)
+_PAINTS = palette(
+    "ba1e24 224e96 d6d8dc ecb228 3a7852 6e747c 3c3e46 ce6024 5aa0be eeece4 702238 96a078"
+)
+_GLASS, _DARK, _TRIM, _RIM, _PLATE = palette("1e2630 202023 3a3c40 c4c8ce f0f0e6")
+_HEAD_LAMP, _TAIL_LAMP = palette("faf6d6 d6161a")
+# Profiles of radius, in radii of the wheel, and distance outward [metres].
+_TYRE = ((0.92, -0.22), (1, -0.18), (1, -0.04), (0.94, 0.0), (0.7, 0.0), (0.68, -0.035))
+_DISC = ((0.71, -0.05), (0.71, 0.006), (0.64, 0.006), (0.55, -0.02), (0.24, -0.03), (0.15, 0.014))
 
 
 @dataclass(frozen=True)
@@ -58,22 +60,17 @@ class _Car:
     def z(self, share: float) -> float:
         return (share - 0.5) * self.length
 
-    # Heights of the glass house are shares, 0 at the belt line and 1 at the roof.
-
-    def front(self, share: float) -> float:
-        return self.z(self.cowl + share * (self.roof[0] - self.cowl))
-
-    def rear(self, share: float) -> float:
-        return self.z(self.deck + share * (self.roof[1] - self.deck))
-
-    def corner(self, share: float) -> tuple[float, float]:
-        """x and y of the right edge of the glass house."""
-        rise = self.height - 0.042 - self.belt
-        return self.width / 2 * (0.9 - self.tumblehome * share), self.belt + share * rise
+    @property
+    def mirror(self) -> float:
+        return self.level(0.0)[2] + 0.36
 
     def level(self, share: float, grow: float = 0.0) -> Level:
-        half, y = self.corner(share)
-        return y, 2 * (half + grow), self.front(share) - grow, self.rear(share) + grow
+        """A section of the glass house, at the belt line for 0 and at the roof for 1."""
+        width = self.width * (0.9 - self.tumblehome * share)
+        front = self.z(self.cowl + share * (self.roof[0] - self.cowl))
+        rear = self.z(self.deck + share * (self.roof[1] - self.deck))
+        y = self.belt + share * (self.height - 0.042 - self.belt)
+        return y, width + 2 * grow, front - grow, rear + grow
 
     def top(self, z: FloatArray) -> FloatArray:
         """Heights of the body's upper edge: bonnet, belt line, boot."""
@@ -81,27 +78,25 @@ class _Car:
         knots = [-end, -0.86 * end, self.z(self.cowl) + 0.05, self.z(self.deck), end - 0.1, end]
         heights = [self.nose - 0.02, self.nose + 0.06, belt, belt + 0.02, self.tail, self.tail]
         drop = 0.16 * np.clip(1 - (z + end) / 0.25, 0, 1) ** 2
-        return np.asarray(
-            np.interp(z, knots, heights) - drop - 0.12 * np.clip(1 - (end - z) / 0.12, 0, 1) ** 2
-        )
+        return np.asarray(np.interp(z, knots, heights) - drop - self.lift(z))
+
+    def lift(self, z: FloatArray) -> FloatArray:
+        """Rounding of the body's upper and lower edges at both ends."""
+        return np.asarray(0.12 * np.clip(1 - (self.length / 2 - np.abs(z)) / 0.12, 0, 1) ** 2)
 
 
 _KINDS = (
-    _Car(4.6, 1.8, 1.45, 0.76, 0.92, 0.96, 0.27, (0.43, 0.69), 0.84, (0.18, 0.78), 0.32,
-         (0.55,)),  # sedan
-    _Car(4.0, 1.74, 1.48, 0.76, 0.93, 0.9, 0.25, (0.43, 0.88), 0.975, (0.19, 0.82), 0.31,
-         (0.57,)),  # hatchback
-    _Car(4.7, 1.9, 1.74, 0.95, 1.08, 1.06, 0.25, (0.38, 0.9), 0.965, (0.18, 0.79), 0.39,
-         (0.53, 0.74), 0.15, 0.3),  # off-road car
-    _Car(4.4, 1.86, 1.24, 0.73, 0.85, 0.87, 0.37, (0.53, 0.66), 0.9, (0.18, 0.8), 0.315,
-         (0.67,), 0.26),  # sports car
-    _Car(4.75, 1.8, 1.48, 0.76, 0.92, 0.94, 0.25, (0.4, 0.91), 0.975, (0.17, 0.77), 0.32,
-         (0.53, 0.75)),  # estate car
-    _Car(3.45, 1.62, 1.54, 0.8, 0.95, 0.94, 0.17, (0.38, 0.92), 0.985, (0.19, 0.81), 0.29,
-         (0.62,), 0.16),  # city car
-    _Car(5.0, 1.94, 2.05, 0.98, 1.18, 1.12, 0.1, (0.24, 0.985), 0.995, (0.17, 0.78), 0.35,
-         (0.3, 0.52, 0.75), 0.1, 0.25),  # minibus
+    _Car(4.6, 1.8, 1.45, .76, .92, .96, .27, (.43, .69), .84, (.18, .78), .32, (.55,)),
+    _Car(4.0, 1.74, 1.48, .76, .93, .9, .25, (.43, .88), .975, (.19, .82), .31, (.57,)),
+    _Car(4.7, 1.9, 1.74, .95, 1.08, 1.06, .25, (.38, .9), .965, (.18, .79), .39, (.53, .74),
+         .15, .3),
+    _Car(4.4, 1.86, 1.24, .73, .85, .87, .37, (.53, .66), .9, (.18, .8), .315, (.67,), .26),
+    _Car(4.75, 1.8, 1.48, .76, .92, .94, .25, (.4, .91), .975, (.17, .77), .32, (.53, .75)),
+    _Car(3.45, 1.62, 1.54, .8, .95, .94, .17, (.38, .92), .985, (.19, .81), .29, (.62,), .16),
+    _Car(5.0, 1.94, 2.05, .98, 1.18, 1.12, .1, (.24, .985), .995, (.17, .78), .35, (.3, .52, .75),
+         .1, .25),
 )  # fmt: skip
+"""Sedan, hatchback, off-road car, sports car, estate car, city car, minibus."""
 
 
 def car(rng: np.random.Generator, index: int) -> Draft:
@@ -124,23 +119,22 @@ def car(rng: np.random.Generator, index: int) -> Draft:
         wheel=kind.wheel * rng.uniform(0.97, 1.04),
         paint=_PAINTS[(5 * index + int(rng.integers(3))) % len(_PAINTS)],
     )
-    rim, spokes = _RIMS[int(rng.integers(len(_RIMS)))], int(rng.integers(5, 9))
     half, end = c.width / 2, c.length / 2
-    front, rear = map(c.z, c.axles)
+    y, width, front, rear = c.level(1.0)
+    low, wide, foot, _ = c.level(0.06)
     pairs = {
-        (0, 1): (*c.corner(1.0), c.front(1.0)),
-        (2, 3): (*c.corner(1.0), c.rear(1.0)),
-        (4, 5): (half + 0.05, c.wheel, front),
-        (6, 7): (half + 0.05, c.wheel, rear),
+        (0, 1): (width / 2, y, front),
+        (2, 3): (width / 2, y, rear),
+        (4, 5): (half + 0.05, c.wheel, c.z(c.axles[0])),
+        (6, 7): (half + 0.05, c.wheel, c.z(c.axles[1])),
         (8, 9): (0.78 * half, c.nose - 0.09, -end - 0.1),
         (10, 11): (0.84 * half, c.tail - 0.14, end + 0.1),
-        (12, 13): (*c.corner(0.06), c.front(0.06)),
+        (12, 13): (wide / 2, low, foot),
         (14, 15): (0.88 * half, 0.42, -end - 0.1),
         (16, 17): (0.9 * half, 0.43, end + 0.1),
-        (18, 19): (half + 0.16, c.belt + 0.07, c.front(0.0) + 0.36),
+        (18, 19): (half + 0.16, c.belt + 0.07, c.mirror),
     }
-    right = (*_wheel(c, front, rim, spokes), *_wheel(c, rear, rim, spokes), *_right_trim(c))
-    solids = (_body(c), *_glass_house(c), *both_sides(*right), *_middle_trim(c))
+    solids = [_body(c), *_glass_house(c), *_fittings(c)]
     return Draft(solids, mirrored_places(pairs), tuple(pairs))
 
 
@@ -148,17 +142,18 @@ def _body(c: _Car) -> Solid:
     """Everything below the windows: the outline seen from the side, extruded with round edges."""
     end, reach = c.length / 2, 1.17 * c.wheel
     rounded = np.array([0.0, 0.015, 0.05, 0.12, 0.22, 0.36])
-    plain = np.concatenate([rounded - end, end - rounded, np.linspace(-end, end, 13)])
-    stations = [(float(z), c.sill) for z in (*plain, c.z(c.deck))]
+    plain = np.concatenate(
+        [rounded - end, end - rounded, np.linspace(-end, end, 13), [c.z(c.deck)]]
+    )
+    stations = [(z, c.sill) for z in plain.tolist()]
     angle = np.linspace(0, np.pi, 13)
     for axle in map(c.z, c.axles):
         stations = [(z, y) for z, y in stations if abs(z - axle) > reach + 0.02]
         # Two stations at the foot of each arch, a hair apart, make its upright ends.
         stations += [(axle - reach - 0.002, c.sill), (axle + reach + 0.002, c.sill)]
-        arch = axle + reach * np.cos(angle), c.wheel + reach * np.sin(angle)
-        stations += zip(*arch, strict=True)
+        stations += zip(axle + reach * np.cos(angle), c.wheel + reach * np.sin(angle), strict=True)
     z, low = np.array(sorted(stations)).T
-    low = low + 0.12 * np.clip(1 - (end - np.abs(z)) / 0.12, 0, 1) ** 2
+    low = low + c.lift(z)
     rings = []
     # Share of half the width; how much lower the top, higher the bottom, further in the ends are.
     for share, drop, lift, inset in (
@@ -166,10 +161,9 @@ def _body(c: _Car) -> Solid:
         (0.94, 0.35 * c.shoulder, 0.0, 0.07), (1.0, c.shoulder, 0.04, 0.15),
     ):  # fmt: skip
         ends = np.sign(z) * inset * np.clip((np.abs(z) - end + 0.5) / 0.5, 0, 1) ** 2
-        bottom = low + lift
-        top = np.maximum(c.top(z) - drop, bottom + 0.04)
-        over = np.stack([np.full(len(z), share * c.width / 2), top, z - ends], axis=1)
-        under = over * (1, 0, 1) + bottom[:, None] * (0, 1, 0)
+        top = np.maximum(c.top(z) - drop, low + lift + 0.04)
+        x = np.full(len(z), share * c.width / 2)
+        over, under = (np.stack([x, y, z - ends], axis=1) for y in (top, low + lift))
         front, rear = (over[[0, -1], None] + under[[0, -1], None]) / 2
         rings.append(np.concatenate([front, over, rear, under[::-1]]))
     return loft([*(ring * (-1, 1, 1) for ring in rings[::-1]), *rings], c.paint)
@@ -180,74 +174,41 @@ def _glass_house(c: _Car) -> list[Solid]:
     y, width, front, rear = c.level(-0.25)
     sunk = (y, width - 0.14, front, rear - 0.14)
     top, wide, start, stop = c.level(1.0)
-    long = stop - start
-    roof = [
-        c.level(0.86, 0.012),
-        c.level(0.93, 0.012),
-        (top, wide - 0.06, start + 0.03, stop - 0.03),
-        (top + 0.042, wide - 0.5, start + 0.25 * long, stop - 0.22 * long),
-    ]
+    ridge = (top + 0.042, wide - 0.5, 0.75 * start + 0.25 * stop, 0.22 * start + 0.78 * stop)
+    roof = [c.level(0.86, 0.012), c.level(0.93, 0.012), c.level(1.0, -0.03), ridge]
     solids = [
         stack([sunk, c.level(0.0), c.level(0.92)], _GLASS, radius=0.12),
         stack(roof, c.paint, radius=0.12),
     ]
-    low, high = -0.1, 0.92
-    ends = [(c.front(low) + 0.045, c.front(high) + 0.045), *((c.z(s),) * 2 for s in c.pillars)]
-    for foot, head in (*ends, (c.rear(low) - 0.045, c.rear(high) - 0.045)):
-        path = np.array([(*c.corner(low), foot), (*c.corner(high), head)]) - (0.03, 0, 0)
+    (y, wide, front, rear), (top, width, start, stop) = c.level(-0.1, -0.045), c.level(0.92, -0.045)
+    for foot, head in ((front, start), (rear, stop), *((c.z(s), c.z(s)) for s in c.pillars)):
+        path = [(wide / 2 + 0.015, y, foot), (width / 2 + 0.015, top, head)]
         solids += both_sides(beam(path, (0.09, 0.08), c.paint, side=(0, 0, 1)))
     return solids
 
 
-def _wheel(c: _Car, z: float, rim: Color, spokes: int) -> list[Solid]:
-    """The right wheel at z: tyre, rim, hub and spokes."""
-    r, center = c.wheel, np.array([c.width / 2 + 0.012, c.wheel, z])
-    tyre = [(0, -0.22), (0.92, -0.22), (1, -0.18), (1, -0.04), (0.94, 0.0), (0.7, 0.0),
-            (0.68, -0.035), (0, -0.035)]  # fmt: skip
-    ring = [(0, -0.05), (0.7, -0.05), (0.71, 0.006), (0.64, 0.006), (0.62, -0.03), (0, -0.03)]
-    hub = [(0, -0.05), (0.17, -0.05), (0.15, 0.01), (0, 0.014)]
-    solids = [
-        lathe(np.array(profile) * (r, 1), color, center=center, count=count, sideways=True)
-        for profile, color, count in ((tyre, _DARK, 24), (hub, rim, 12), (ring, rim, 20))
-    ]
-    for angle in 2 * np.pi * np.arange(spokes) / spokes:
-        outward = r * np.array([0, np.cos(angle), np.sin(angle)])
-        path = center + np.array([0.1, 0.64])[:, None] * outward - (0.006, 0, 0)
-        solids.append(beam(path, (0.03, 0.13 * r), rim, scales=(1, 0.8), side=(1, 0, 0)))
-    return solids
-
-
-def _right_trim(c: _Car) -> list[Solid]:
-    """Lamp, tail lamp, mirror, skirt and door handles of the right side."""
-    half, end, belt, z = c.width / 2, c.length / 2, c.belt, c.front(0.0) + 0.36
-    lamp, mirror = (0.72 * half, c.nose - 0.15, 0.04 - end), (half + 0.08, belt + 0.07, z)
-    tail, skirt = (0.76 * half, c.tail - 0.16, end - 0.03), (half - 0.03, c.sill + 0.03, 0.0)
-    between = c.z(c.axles[1]) - c.z(c.axles[0]) - 2.8 * c.wheel
-    solids = [
+def _fittings(c: _Car) -> list[Solid]:
+    """Wheels, lamps, mirrors, grille, plates and bumpers."""
+    half, end = c.width / 2, c.length / 2
+    lamp, tail = (0.72 * half, c.nose - 0.15, 0.04 - end), (0.76 * half, c.tail - 0.16, end - 0.03)
+    right = [
         ellipsoid(lamp, (0.42 * half, 0.17, 0.2), _HEAD_LAMP, count=12),
         box(tail, (0.3 * half, 0.18, 0.16), _TAIL_LAMP, radius=0.03),
-        ellipsoid(mirror, (0.2, 0.15, 0.12), c.paint, count=12),
-        beam([(half - 0.12, belt, z), (half + 0.06, belt + 0.05, z)], (0.04, 0.04), _DARK),
-        box(skirt, (0.08, 0.07, between), _TRIM, radius=0.02),
+        ellipsoid((half + 0.08, c.belt + 0.07, c.mirror), (0.2, 0.15, 0.12), c.paint, count=12),
     ]
-    for share in c.pillars:
-        handle = (half, belt - c.shoulder - 0.04, c.z(share) - 0.16)
-        solids.append(box(handle, (0.03, 0.03, 0.17), _TRIM, radius=0.01, steps=1))
-    return solids
-
-
-def _middle_trim(c: _Car) -> list[Solid]:
-    """Grille, plates, bumpers, and dark blocks that close the space between the wheels."""
-    half, end = c.width / 2, c.length / 2
-    solids = [
-        box((0, c.nose - 0.16, -end), (0.78 * half, 0.15, 0.06), _DARK, radius=0.02, steps=1),
+    middle = [
+        box((0, c.nose - 0.16, -end), (0.78 * half, 0.15, 0.06), _DARK, radius=0.02),  # grille
         box((0, 0.4, -end - 0.075), (0.5, 0.1, 0.02), _PLATE),
         box((0, c.tail - 0.24, end + 0.002), (0.52, 0.11, 0.02), _PLATE),
     ]
     for direction, axle in zip((-1, 1), map(c.z, c.axles), strict=True):
+        hub, block = (half + 0.012, c.wheel, axle), (1.2 * (c.width - 0.5), 1.2 * c.wheel)
+        for profile, color in ((_TYRE, _DARK), (_DISC, _RIM)):
+            shape = np.array(profile) * (c.wheel, 1)
+            right.append(lathe(shape, color, center=hub, sideways=True))
         long = 0.06 + min(0.36, end - abs(axle) - 1.22 * c.wheel)
         bumper = (0, 0.41, direction * (end + 0.065 - long / 2))
-        solids.append(box(bumper, (1.97 * half, 0.2, long), _TRIM, radius=0.07, steps=3))
-        block = (1.2 * (c.width - 0.5), 1.2 * c.wheel, 2.5 * c.wheel)
-        solids.append(box((0, c.sill + block[1] / 2, axle), block, _DARK))
-    return solids
+        middle.append(box(bumper, (1.97 * half, 0.2, long), _TRIM, radius=0.07, steps=3))
+        # It closes the space between the wheels.
+        middle.append(box((0, c.sill + block[1] / 2, axle), (*block, 2.5 * c.wheel), _DARK))
+    return [*both_sides(*right), *middle]

@@ -20,15 +20,11 @@ _CREASE_DEGREES = 35.0
 class Draft:
     """A model in its builder's units, y up and the front at -z."""
 
-    solids: tuple[Solid, ...]
-    places: Mapping[int, Point]
-    """By semantic id: each keypoint lands on the nearest point of the surface."""
-    mirrored: tuple[tuple[int, int], ...] = ()
-    """Semantic ids that a mirror plane of the model exchanges."""
-    turned: tuple[tuple[int, ...], ...] = ()
-    """Groups of semantic ids that a rotation about y permutes."""
-    round: bool = False
-    """Any rotation about y maps the model to itself, so that each group lies on a circle."""
+    solids: Sequence[Solid]
+    places: Mapping[int, Point]  # by semantic id; keypoints land on the surface's nearest point
+    mirrored: tuple[tuple[int, int], ...] = ()  # semantic ids that a mirror plane exchanges
+    turned: tuple[tuple[int, ...], ...] = ()  # semantic ids that a rotation about y permutes
+    round: bool = False  # any rotation about y is one: each group of them lies on a circle
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Closed solids of one colour, the parts of the sample models.
+"""Closed solids of one colour, the parts of the sample models: boxes, lathes and extrusions.
 
 All but sharp boxes are lofts, surfaces through a row of closed outlines, because a part around the
 plane x = 0 must be exactly mirror symmetric, also in its tessellation.
@@ -23,6 +23,15 @@ Level = tuple[float, float, float, float]
 
 _WELD_DECIMALS = 8
 _TINY_AREA = 1e-12
+
+
+def palette(text: str) -> tuple[Color, ...]:
+    """Colours by their hexadecimal digits, such as ``"b02428 202228"``."""
+    return tuple((red, green, blue) for red, green, blue in map(bytes.fromhex, text.split()))
+
+
+def pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
+    return colors[int(rng.integers(len(colors)))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,41 +59,13 @@ class Solid:
         corners = self.vertices[self.faces] - self.vertices.mean(axis=0)
         return float(np.linalg.det(corners).sum() / 6)
 
-    def mirrored(self) -> Solid:
-        """The mirror image under x -> -x."""
-        return replace(self, vertices=self.vertices * (-1, 1, 1), faces=self.faces[:, ::-1])
-
 
 def both_sides(*solids: Solid) -> list[Solid]:
     """The solids together with their mirror images under x -> -x."""
-    return [*solids, *(solid.mirrored() for solid in solids)]
-
-
-# Outlines -----------------------------------------------------------------------------------------
-
-
-def ellipse(width: float, height: float, *, count: int, exponent: float = 2.0) -> FloatArray:
-    """An outline (count, 2): a superellipse ``|x/a|^exponent + |y/b|^exponent = 1`` (Lame curve).
-
-    It starts at the top and is mirror symmetric in its first coordinate.
-    """
-    angle = 2 * np.pi * np.arange(count) / count
-    unit = np.round(np.stack([np.sin(angle), np.cos(angle)], axis=1), 12)
-    return np.asarray(np.sign(unit) * np.abs(unit) ** (2.0 / exponent) * (width / 2, height / 2))
-
-
-def rectangle(width: float, height: float, *, radius: float = 0.0, steps: int = 2) -> FloatArray:
-    """An outline (n, 2): a rectangle with round corners, starting at the middle of its top."""
-    radius = max(min(radius, 0.499 * width, 0.499 * height), 0.0)
-    angle = np.linspace(0, np.pi / 2, steps + 1)
-    arc = np.stack([np.sin(angle), np.cos(angle)], axis=1)
-    upper = np.array([width, height]) / 2 - radius + radius * arc
-    top = np.array([[0.0, height / 2]])
-    right = np.concatenate([upper, [[width / 2, 0.0]], upper[::-1] * (1, -1)])
-    return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
-
-
-# Solids -------------------------------------------------------------------------------------------
+    return [
+        *solids,
+        *(replace(s, vertices=s.vertices * (-1, 1, 1), faces=s.faces[:, ::-1]) for s in solids),
+    ]
 
 
 def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
@@ -109,24 +90,15 @@ def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
     return Solid.from_triangles(vertices, np.concatenate([first, second]), color)
 
 
-def box(
-    center: npt.ArrayLike, size: npt.ArrayLike, color: Color, *, radius: float = 0.0, steps: int = 2
-) -> Solid:
-    """A box; ``steps`` flat pieces make a quarter circle of its rounded edges."""
-    middle, extents = np.asarray(center, dtype=float), np.asarray(size, dtype=float)
-    if radius == 0:
-        block = trimesh.creation.box(extents=extents)
-        return Solid.from_triangles(block.vertices + middle, block.faces, color)
-    width, height, depth = extents
-    radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
+def rectangle(width: float, height: float, *, radius: float, steps: int) -> FloatArray:
+    """An outline (n, 2) with round corners of ``steps`` pieces, from the middle of its top."""
+    radius = max(min(radius, 0.499 * width, 0.499 * height), 0.0)
     angle = np.linspace(0, np.pi / 2, steps + 1)
-    lower = np.stack([1 - np.sin(angle), 1 - np.cos(angle)], axis=1) * radius - (0, height / 2)
-    levels = np.concatenate([lower, lower[::-1] * (1, -1)])
-    rings = [
-        np.insert(rectangle(width - 2 * i, depth - 2 * i, radius=radius - i, steps=steps), 1, y, 1)
-        for i, y in levels
-    ]
-    return loft(np.array(rings) + middle, color)
+    arc = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    upper = np.array([width, height]) / 2 - radius + radius * arc
+    top = np.array([[0.0, height / 2]])
+    right = np.concatenate([upper, [[width / 2, 0.0]], upper[::-1] * (1, -1)])
+    return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
 
 
 def stack(levels: Sequence[Level], color: Color, *, radius: float) -> Solid:
@@ -139,41 +111,22 @@ def stack(levels: Sequence[Level], color: Color, *, radius: float) -> Solid:
     return loft(rings, color)
 
 
-def sweep(
-    path: npt.ArrayLike | Sequence[npt.ArrayLike],
-    section: FloatArray,
-    color: Color,
-    *,
-    scales: npt.ArrayLike = 1.0,
-    side: Point | None = None,
+def box(
+    center: npt.ArrayLike, size: Point, color: Color, *, radius: float = 0.0, steps: int = 2
 ) -> Solid:
-    """Extrude an outline (n, 2) along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
-
-    The outline's first coordinate is along ``side``, made perpendicular to the path: by default
-    along x, or z where the path runs along x.
-    """
-    points = np.asarray(path, dtype=float)
-    tangent = _normalized(np.gradient(points, axis=0))
-    along = side or ((1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1))
-    first = _normalized(along - (tangent @ along)[:, None] * tangent)
-    second = np.cross(tangent, first)
-    scale = np.asarray(scales, dtype=float)
-    scale = np.broadcast_to(scale[:, None] if scale.ndim == 1 else scale, (len(points), 2))
-    outline = section[None] * scale[:, None, :]
-    rings = points[:, None] + outline[..., :1] * first[:, None] + outline[..., 1:] * second[:, None]
-    return loft(rings, color)
-
-
-def rod(
-    path: npt.ArrayLike | Sequence[npt.ArrayLike],
-    radius: float,
-    color: Color,
-    *,
-    scales: npt.ArrayLike = 1.0,
-    count: int = 12,
-) -> Solid:
-    """A round bar along a path (k, 3)."""
-    return sweep(path, ellipse(2 * radius, 2 * radius, count=count), color, scales=scales)
+    """A box; ``steps`` flat pieces make a quarter circle of its rounded edges."""
+    middle, (width, height, depth) = np.asarray(center, dtype=float), size
+    if radius == 0:
+        block = trimesh.creation.box(extents=size)
+        return Solid.from_triangles(block.vertices + middle, block.faces, color)
+    radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
+    angle = np.linspace(0, np.pi / 2, steps + 1)
+    lower = np.stack([1 - np.sin(angle), 1 - np.cos(angle)], axis=1) * radius - (0, height / 2)
+    rings = [
+        np.insert(rectangle(width - 2 * i, depth - 2 * i, radius=radius - i, steps=steps), 1, y, 1)
+        for i, y in np.concatenate([lower, lower[::-1] * (1, -1)])
+    ]
+    return loft(np.array(rings) + middle, color)
 
 
 def beam(
@@ -181,12 +134,25 @@ def beam(
     size: tuple[float, float],
     color: Color,
     *,
-    scales: npt.ArrayLike = 1.0,
+    scales: Sequence[float | tuple[float, float]] = (1.0,),
     side: Point | None = None,
+    radius: float | None = None,
 ) -> Solid:
-    """A bar of rectangular section along a path (k, 3); ``size`` is along and across ``side``."""
-    section = rectangle(*size, radius=0.18 * min(size), steps=1)
-    return sweep(path, section, color, scales=scales, side=side)
+    """Extrude a rectangle along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
+
+    ``size`` is along ``side``, made perpendicular to the path, and across it; by default ``side``
+    is x, or z where the path runs along x.
+    """
+    points = np.asarray(path, dtype=float)
+    tangent = trimesh.unitize(np.gradient(points, axis=0))
+    along = side or ((1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1))
+    first = trimesh.unitize(along - (tangent @ along)[:, None] * tangent)
+    section = rectangle(*size, radius=radius or 0.18 * min(size), steps=2 if radius else 1)
+    outlines = section * np.reshape(scales, (len(scales), 1, -1))
+    rings = (
+        outlines[..., :1] * first[:, None] + outlines[..., 1:] * np.cross(tangent, first)[:, None]
+    )
+    return loft(points[:, None] + rings, color)
 
 
 def lathe(
@@ -197,23 +163,21 @@ def lathe(
     count: int = 24,
     depth: npt.ArrayLike = 1.0,
     exponent: npt.ArrayLike = 2.0,
-    grooves: float = 0.0,
     sideways: bool = False,
 ) -> Solid:
     """Turn a profile (k, 2) of radius and height around a vertical axis, in ``count`` = 4 i points.
 
     ``depth``, one or (k,), is the extent along z relative to x; ``exponent`` is 2 for circles, more
-    for rounded squares (see `ellipse`). Every other point lies deeper by ``grooves``. The axis of a
-    ``sideways`` solid is along x, its heights are distances outward.
+    for rounded squares: sections are superellipses ``|x/a|^exponent + |z/b|^exponent = 1``. The
+    axis of a ``sideways`` solid is along x, its heights are distances outward.
     """
-    points = np.asarray(profile, dtype=float)
-    shape = np.broadcast_arrays(points[:, 0], points[:, 1], depth, exponent)
-    shrink = 1 - grooves * (np.arange(count)[:, None] % 2)
-    rings = np.array([
-        np.insert(shrink * ellipse(2 * r, 2 * r * share, count=count, exponent=power), 1, y, axis=1)
-        for r, y, share, power in zip(*shape, strict=True)
-    ])  # fmt: skip
-    rings = rings[..., [1, 0, 2]] if sideways else rings
+    radius, height = np.asarray(profile, dtype=float).T[..., None]
+    angle = 2 * np.pi * np.arange(count) / count
+    unit = np.round([np.sin(angle), np.cos(angle)], 12)[:, None]
+    across, along = radius * np.sign(unit) * np.abs(unit) ** (2 / np.reshape(exponent, (-1, 1)))
+    axis = np.broadcast_to(height, across.shape)
+    along = along * np.reshape(depth, (-1, 1))
+    rings = np.stack([axis, across, along] if sideways else [across, axis, along], axis=2)
     return loft(rings + np.asarray(center, dtype=float), color)
 
 
@@ -222,7 +186,3 @@ def ellipsoid(center: Point, size: Point, color: Color, *, count: int) -> Solid:
     angle = np.linspace(0, np.pi, count // 2 + 1)
     profile = np.stack([size[0] * np.sin(angle), -size[1] * np.cos(angle)], axis=1) / 2
     return lathe(profile, color, center=center, count=count, depth=size[2] / size[0])
-
-
-def _normalized(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

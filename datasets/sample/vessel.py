@@ -1,8 +1,9 @@
-"""Parametric vessels: cargo ships, sailing boats, motor yachts and tugs."""
+"""Parametric vessels: container ships, sailing boats, motor yachts and tugs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -11,26 +12,23 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.sample.model import Draft, mirrored_places
 from cadalign.datasets.sample.solids import (
     Color,
+    Level,
     Point,
     Solid,
     both_sides,
     box,
-    ellipsoid,
     lathe,
     loft,
-    rod,
+    palette,
+    pick,
     stack,
 )
 
-_WHITE, _BLACK, _GLASS = (240, 240, 236), (32, 34, 38), (34, 46, 60)
-_SPAR, _CLOTH = (206, 208, 212), (246, 243, 232)
-_BOTTOMS: tuple[Color, ...] = ((140, 38, 32), (110, 34, 34), (40, 66, 60))
-_SIDES: tuple[Color, ...] = (
-    (36, 62, 104), (150, 40, 36), (34, 88, 80), (38, 44, 52), (226, 226, 222), (32, 74, 120),
-)  # fmt: skip
-_ACCENTS: tuple[Color, ...] = (
-    (204, 44, 38), (238, 168, 36), (32, 92, 160), (46, 124, 78), (232, 106, 32),
-)  # fmt: skip
+_WHITE, _BLACK, _GLASS, _SPAR, _CLOTH = palette("f0f0ec 202226 222e3c ced0d4 f6f3e8")
+_BOTTOMS = palette("8c2620 6e2222 28423c")
+_SIDES = palette("243e68 962824 225850 262c34 e2e2de 204a78")
+_ACCENTS = palette("cc2c26 eea824 205ca0 2e7c4e e86a20")
+_DECKS = palette("7e5c4e c49864 cca676 707670")
 
 
 @dataclass(frozen=True)
@@ -76,13 +74,9 @@ class _Vessel:
         depth = 0.35 + 0.65 * np.sqrt(np.clip(share / 0.75, 0, 1))
         return np.asarray(self.beam / 2 * bow * stern * depth)
 
-    def side(self, z: float) -> Point:
-        """A point of the right edge."""
-        return float(self.half(z)), float(self.edge(z)), z
-
-    def ends(self, share: float) -> tuple[float, float]:
+    def ends(self, share: float) -> FloatArray:
         """z of stem and stern at a share of the height."""
-        return self.rake[0] * (1 - share) - 0.5, 0.5 - self.rake[1] * (1 - share)
+        return (np.array(self.rake) * (1 - share) - 0.5) * (1, -1)
 
     def outline(self, share: float, inset: float = 0.0) -> FloatArray:
         """A closed line around the hull, from the middle of the stern over the right side."""
@@ -97,25 +91,16 @@ class _Vessel:
 
     def hull(self, side: Color) -> list[Solid]:
         """The part under water, a stripe at the water line, the side, and the deck."""
-        water = self.water
-        band = water + 0.12 * (1 - water)
-        below, line, above = (
-            [self.outline(share) for share in np.linspace(low, high, count)]
-            for low, high, count in ((0.0, water, 6), (water, band, 2), (band, 1.0, 5))
-        )
+        band = 0.88 * self.water + 0.12
+        below, above = np.linspace(0.0, self.water, 6), np.linspace(band, 1.0, 5)
         inner = self.outline(1.0, inset=0.012)
         sunk = inner - (0, self.bulwark, 0)
         return [
-            loft(below, self.bottom),
-            loft(line, _WHITE),
-            loft([*above, inner, sunk], side),
+            loft([self.outline(share) for share in below], self.bottom),
+            loft([self.outline(share) for share in (self.water, band)], _WHITE),
+            loft([*map(self.outline, above), inner, sunk], side),
             loft([sunk - (0, 0.004, 0), sunk + (0, 0.002, 0)], self.planks),
         ]
-
-
-_Above = tuple[list[Solid], Point, Point, dict[int, Point]]
-"""What stands above the deck, the upper front and rear corner of the deck house on the right, and
-the places of the highest point and of the funnel by semantic id."""
 
 
 def vessel(rng: np.random.Generator, index: int) -> Draft:
@@ -135,203 +120,146 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
         stern_width=kind.stern_width * rng.uniform(0.85, 1.08),
         tall=rng.uniform(0.92, 1.1),
         variant=turn % 3,
-        bottom=_BOTTOMS[int(rng.integers(len(_BOTTOMS)))],
-        accent=_ACCENTS[int(rng.integers(len(_ACCENTS)))],
+        bottom=pick(rng, _BOTTOMS),
+        accent=pick(rng, _ACCENTS),
     )
     side = _SIDES[(number + turn + int(rng.integers(2))) % len(_SIDES)]
-    solids, house_front, house_rear, tips = build(v)
-    bow, stern = v.ends(v.water)
+    solids, (top, width, front, rear), tips = build(v)
+    bow, stern = v.ends(v.water).tolist()
     pairs = {
-        (2, 3): v.side(0.5),
-        (4, 5): v.side(0.0),
-        (6, 7): v.side(-0.25),
-        (8, 9): house_front,
-        (10, 11): house_rear,
+        (8, 9): (width / 2, top, front),
+        (10, 11): (width / 2, top, rear),
         (13, 14): (float(v.half(0.5, v.water)), 0.0, stern),
     }
-    places = mirrored_places(pairs) | tips
-    places |= {0: (0.0, float(v.edge(-0.5)), -0.5), 1: (0.0, 0.0, bow)}
-    return Draft((*v.hull(side), *solids), places, tuple(pairs))
+    for right, z in ((2, 0.5), (4, 0.0), (6, -0.25)):
+        pairs[right, right + 1] = float(v.half(z)), float(v.edge(z)), z
+    places = {0: (0.0, float(v.edge(-0.5)), -0.5), 1: (0.0, 0.0, bow)}
+    return Draft([*v.hull(side), *solids], mirrored_places(pairs) | places | tips, tuple(pairs))
 
 
-def _block(middle: Point, size: Point, *, count: int) -> list[Solid]:
-    """A white block with dark panes along its front and both sides."""
-    (x, y, z), (wide, tall, deep) = middle, size
-    solids = [box(middle, size, _WHITE, radius=0.003, steps=1)]
-    pane, height = 0.5 * wide / count, 0.34 * tall
-    for s in (np.arange(count) - (count - 1) / 2) * 0.9 * wide / count:
-        solids.append(box((x + s, y, z - deep / 2), (pane, height, 0.003), _GLASS))
-    for s in np.arange(-0.36 * deep, 0.37 * deep, 2 * pane):
-        solids += both_sides(box((wide / 2, y, z + s), (0.003, height, pane), _GLASS))
-    return solids
+# What stands above the deck, the roof of the deck house, places by semantic id.
+_Above = tuple[list[Solid], Level, dict[int, Point]]
 
 
-def _storey(
-    low: float, high: float, width: float, ends: tuple[float, float], slope: float, roof: Color
-) -> list[Solid]:
-    """A wall, a band of glass that leans back by ``slope`` in front, and a roof."""
-    (front, rear), sill, top = ends, low + 0.35 * (high - low), high - 0.012
-    bend, lean = front + 0.3 * slope, front + slope
+def _storey(low: float, roof: Level, *, slope: float = 0.0, color: Color = _WHITE) -> list[Solid]:
+    """A wall, a band of glass that leans back by ``slope`` to the roof in front, and the roof."""
+    high, width, lean, rear = roof
+    tall, front = high - low, lean - slope
+    sill, top, bend = low + 0.35 * tall, high - 0.12 * tall, front + 0.3 * slope
     wall = [(low, width, front, rear), (sill, width, bend, rear)]
-    glass = [(sill, 0.98 * width, bend, rear), (top, 0.94 * width, lean, rear - 0.01)]
-    cover = [(top, 1.03 * width, lean - 0.02, rear + 0.025),
-             (high, 1.0 * width, lean - 0.012, rear + 0.018)]  # fmt: skip
-    levels = ((wall, _WHITE), (glass, _GLASS), (cover, roof))
-    return [stack(level, color, radius=0.035) for level, color in levels]
+    glass = [(sill, 0.98 * width, bend, rear), (top, 0.94 * width, lean, rear - 0.1 * tall)]
+    cover = [(top, 1.03 * width, lean - 0.2 * tall, rear + 0.25 * tall),
+             (high, width, lean - 0.12 * tall, rear + 0.18 * tall)]  # fmt: skip
+    levels = ((wall, _WHITE), (glass, _GLASS), (cover, color))
+    return [stack(level, tint, radius=0.35 * tall) for level, tint in levels]
 
 
-def _funnel(foot: Point, tall: float, width: float, color: Color) -> list[Solid]:
-    """A funnel with a black top and a pale ring."""
-    solids = []
-    for radius, low, high, tint in (
-        (0.48, 0, 0.84, color), (0.49, 0.5, 0.64, _WHITE), (0.46, 0.83, 1, _BLACK)
-    ):  # fmt: skip
-        profile = np.array([(0, low), (radius, low), (0.97 * radius, high), (0, high)])
-        solids.append(lathe(profile * (width, tall), tint, center=foot, count=20))
-    return solids
+def _funnel(top: Point, low: float, radius: float, color: Color) -> list[Solid]:
+    """A funnel with a black top."""
+    _, high, z = top
+    bend = low + 0.8 * (high - low)
+    lower, upper = (
+        [(radius, low), (0.97 * radius, bend)],
+        [(0.95 * radius, bend), (0.93 * radius, high)],
+    )
+    return [lathe(lower, color, center=(0, 0, z)), lathe(upper, _BLACK, center=(0, 0, z))]
 
 
-def _mast(foot: Point, top: float, radius: float, yards: tuple[float, ...] = ()) -> list[Solid]:
+def _mast(top: Point, low: float, radius: float, *yards: float) -> list[Solid]:
     """A mast with bars across, at shares of its height."""
-    x, y, z = foot
-    bars = ((x, y + share * (top - y), z) for share in yards)
-    spar = rod([foot, (x, top, z)], radius, _SPAR, scales=(1, 0.6))
-    return [spar, *(box(bar, (10 * radius, radius, radius), _SPAR) for bar in bars)]
+    _, high, z = top
+    pole = lathe([(radius, low), (0.6 * radius, high)], _SPAR, center=(0, 0, z), count=12)
+    size = (10 * radius, radius, radius)
+    return [pole, *(box((0, low + share * (high - low), z), size, _SPAR) for share in yards)]
 
 
 def _cargo(v: _Vessel) -> _Above:
-    """A container ship or a gas tanker, its bridge at the stern."""
-    front, rear, tall = 0.3, 0.415, 0.03 * v.tall
-    y = v.deck(0.35) - 0.01
-    solids: list[Solid] = []
-    for _ in range(4):
-        middle = (0.0, y + tall / 2, (front + rear) / 2)
-        solids += _block(middle, (0.84 * v.beam, tall, rear - front), count=7)
-        y += tall
-    top, z = y + 0.026 * v.tall, front + 0.035
-    summit, funnel = (0.0, top + 0.075 * v.tall, front + 0.03), (0.0, top + 0.045 * v.tall, 0.433)
-    solids += [
-        *_block((0, (y + top) / 2, z), (v.beam, top - y, 0.055), count=9),
-        *_funnel((0, y - 0.05, 0.433), funnel[1] - y + 0.05, 0.055, v.accent),
-        *_mast((0, top - 0.01, summit[2]), summit[1], 0.005, (0.6,)),
-        *_mast((0, v.deck(-0.42), -0.43), v.deck(-0.42) + 0.09, 0.004),
+    """A container ship, its bridge at the stern."""
+    low, wide, tall, long = v.deck(0.35) - 0.01, 0.15 * v.beam, 0.028 * v.tall, 0.64 / 7
+    decks = low + 0.03 * v.tall * np.arange(5)
+    roof = top, *_ = (decks[-1] + 0.026 * v.tall, v.beam, 0.3075, 0.3625)
+    summit, funnel = (0.0, top + 0.075 * v.tall, 0.33), (0.0, top + 0.045 * v.tall, 0.433)
+    solids = [
+        *_storey(decks[-1], roof),
+        *_funnel(funnel, decks[-1] - 0.05, 0.027, v.accent),
+        *_mast(summit, top - 0.01, 0.005, 0.6),
     ]
-    freight = _tanks if v.variant == 1 else _containers
-    half = v.beam / 2
-    tips = {12: summit, 15: funnel}
-    return [*solids, *freight(v)], (half, top, z - 0.0275), (half, top, z + 0.0275), tips
-
-
-def _containers(v: _Vessel) -> list[Solid]:
-    """Stacks of containers; the colours are the same on the right and on the left."""
-    solids = []
-    wide, tall, long = 0.15 * v.beam, 0.028 * v.tall, 0.64 / 7
+    for floor, ceiling in pairwise(decks):
+        solids += _storey(floor, (ceiling, 0.84 * v.beam, 0.3, 0.415))
     for bay, z in enumerate(-0.36 + long * np.arange(0.5, 7)):
-        low, room = v.deck(min(z - long / 2, 0.1)), float(v.half(z - long / 2)) - 0.012
+        deck, room = v.deck(min(z - long / 2, 0.1)), float(v.half(z - long / 2)) - 0.012
         for row in range(min(3, int(room / wide))):
-            for layer in range(3 if bay == 0 else 4 - (bay + row) % 2):
-                color = _ACCENTS[(5 * bay + 3 * row + 2 * layer + bay * layer) % len(_ACCENTS)]
-                center = ((row + 0.5) * wide, low + (layer + 0.5) * tall, z)
-                solids.append(box(center, (0.95 * wide, 0.95 * tall, 0.92 * long), color))
-    return both_sides(*solids)
-
-
-def _tanks(v: _Vessel) -> list[Solid]:
-    """The domes of a gas tanker."""
-    size = (0.82 * v.beam, 0.82 * v.beam, 0.82 * v.beam)
-    deck = v.deck(0.1) + 0.025
-    return [ellipsoid((0, deck, z), size, v.accent, count=24) for z in (-0.26, -0.1, 0.06, 0.22)]
+            for layer in range(3 if bay == 0 else 4 - (bay + row + v.variant) % 2):
+                color = _ACCENTS[(5 * bay + 3 * row + (2 + bay) * layer) % len(_ACCENTS)]
+                center = ((row + 0.5) * wide, deck + (layer + 0.5) * tall, z)
+                size = (0.95 * wide, 0.95 * tall, 0.92 * long)
+                solids += both_sides(box(center, size, color))
+    return solids, roof, {12: summit, 15: funnel}
 
 
 def _tug(v: _Vessel) -> _Above:
-    """A tug: wheelhouse forward, one or two funnels, tyres along the side, a low open stern."""
-    house, twin = 0.62 * v.beam, v.variant == 2
-    deck, tall, wide = v.deck(0.05), 0.1 * v.tall, (0.78, 0.66, 0.86)[v.variant] * house
-    y, front, rear = deck + tall, -0.21, -0.04
+    """A tug: wheelhouse forward, a funnel, a low open stern."""
+    deck, house = v.deck(0.05), 0.62 * v.beam
+    y, wide = deck + 0.1 * v.tall, 0.78 * house
     top = y + 0.125
-    summit, funnel = (0.0, top + 0.2 * v.tall, rear - 0.04), (0.0, y + 0.17 * v.tall, 0.08)
-    width, x = (0.08, 0.27 * house) if twin else (0.125, 0.0)
-    stacks = _funnel((x, y - 0.02, 0.08), funnel[1] - y + 0.02, width, v.accent)
-    tyre = [(0, 0), (0.03, 0), (0.034, 0.01), (0.034, 0.02), (0.03, 0.028), (0.012, 0.028),
-            (0, 0.022)]  # fmt: skip
+    summit, funnel = (0.0, top + 0.2 * v.tall, -0.08), (0.0, y + 0.17 * v.tall, 0.08)
     solids = [
-        *_block((0, deck + tall / 2 - 0.02, -0.05), (house, tall + 0.04, 0.38), count=4),
-        *_storey(y - 0.01, top, wide, (front, rear), 0.01, v.accent),
-        *_mast((0, top - 0.02, summit[2]), summit[1], 0.009, (0.3, 0.6)),
-        *(both_sides(*stacks) if twin else stacks),
+        *_storey(deck - 0.02, (y, house, -0.22, 0.12)),
+        *_storey(y - 0.01, (top, wide, -0.2, -0.04), slope=0.01, color=v.accent),
+        *_funnel(funnel, y - 0.02, 0.06, v.accent),
+        *_mast(summit, top - 0.02, 0.009, 0.3, 0.6),
     ]
-    for z in np.linspace(-0.24, 0.36, 6):
-        x, y, _ = v.side(z)
-        center = (x - 0.012, y - 0.045, z)
-        solids += both_sides(lathe(tyre, _BLACK, center=center, count=16, sideways=True))
-    tips = {12: summit} if twin else {12: summit, 15: funnel}
-    return solids, (0.51 * wide, top, front), (0.51 * wide, top, rear + 0.018), tips
+    return solids, (top, 1.02 * wide, -0.21, -0.022), {12: summit, 15: funnel}
 
 
 def _yacht(v: _Vessel) -> _Above:
     """A motor yacht of one, two or three storeys, dark windows all around."""
-    y, wide, front, rear = v.deck(0.05) - 0.004, 0.74 * v.beam, -0.2, 0.3
+    low, wide, front, rear = v.deck(0.05) - 0.004, 0.74 * v.beam, -0.12, 0.3
     solids: list[Solid] = []
-    corners = []
+    roofs = []
     for storey in range((2, 3, 1)[v.variant]):
-        high = y + (0.1 - 0.015 * storey) * v.tall
-        solids += _storey(y, high, wide, (front, rear), 0.08, _WHITE)
-        corners.append(((0.48 * wide, high, front + 0.08), (0.48 * wide, high, rear + 0.015)))
-        y, wide, front, rear = high - 0.004, 0.88 * wide, front + 0.11, rear - 0.07
-    z, top = rear - 0.01, y + 0.19
-    solids += [
-        *_mast((0, y - 0.01, z), top, 0.006, (0.3,)),
-        box((0, y + 0.01, z), (0.4 * wide, 0.04, 0.05), _WHITE, radius=0.012),
-    ]
-    return solids, *corners[0], {12: (0.0, top, z)}
+        high = low + (0.1 - 0.015 * storey) * v.tall
+        solids += _storey(low, (high, wide, front, rear), slope=0.08)
+        roofs.append((high, 0.96 * wide, front, rear + 0.015))
+        low, wide, front, rear = high - 0.004, 0.88 * wide, front + 0.11, rear - 0.07
+    summit = (0.0, low + 0.19, rear - 0.01)
+    return [*solids, *_mast(summit, low - 0.01, 0.006, 0.3)], roofs[0], {12: summit}
 
 
 def _sail(v: _Vessel) -> _Above:
     """A sailing boat with mainsail and foresail, one of them coloured or none."""
-    deck, wide, front, rear = v.deck(0.0), 0.5 * v.beam, -0.14, 0.2
-    high, z, low, top, keel = deck + 0.055, -0.1, deck + 0.1, deck + 1.02 * v.tall, -v.draft
-    house = [
-        (deck - 0.02, wide, front - 0.02, rear),
-        (high, 0.88 * wide, front + 0.03, rear - 0.01),
-    ]
+    deck, wide, keel = v.deck(0.0), 0.5 * v.beam, -v.draft
+    roof, top = (deck + 0.055, 0.88 * wide, -0.11, 0.19), deck + 1.02 * v.tall
     fin = [(keel - 0.13, 0.03, -0.02, 0.14), (keel + 0.02, 0.026, -0.1, 0.16)]
     main, fore = (v.accent if v.variant == k else _CLOTH for k in (2, 1))
-    jib = ((-0.47, float(v.edge(-0.47)) + 0.02), (z - 0.03, 0.86 * top), (z - 0.02, deck + 0.1))
     solids = [
-        stack(house, _WHITE, radius=0.03),
+        stack([(deck - 0.02, wide, -0.16, 0.2), roof], _WHITE, radius=0.03),
         stack(fin, v.bottom, radius=0.012),
-        box((0, deck + 0.01, 0.3), (0.36 * v.beam, 0.024, 0.17), _BLACK),
-        rod([(0, low - 0.11, z), (0, top, z)], 0.011, _SPAR, scales=(1, 0.55)),
-        rod([(0, low, z), (0, low, z + 0.4)], 0.008, _SPAR),
-        _cloth((z + 0.012, low + 0.012), (z + 0.012, top - 0.03), (z + 0.39, low + 0.014), main),
-        _cloth(*jib, fore),
+        box((0, deck + 0.025, 0.04), (0.97 * wide, 0.018, 0.2), _GLASS),
+        box((0, deck + 0.1, 0.1), (0.016, 0.016, 0.4), _SPAR),
+        *_mast((0.0, top, -0.1), deck - 0.01, 0.011),
+        _cloth((deck + 0.112, top - 0.03), (-0.088, -0.088), (0.29, -0.076), main),
+        _cloth((deck + 0.03, 0.86 * top), (-0.47, -0.13), (-0.12, -0.118), fore),
     ]
-    for pane in (front + 0.08, front + 0.16, front + 0.24):
-        center, size = (0.475 * wide, deck + 0.022, pane), (0.02, 0.018, 0.05)
-        solids += both_sides(box(center, size, _GLASS, radius=0.006))
-    x = 0.44 * wide
-    return solids, (x, high, front + 0.03), (x, high, rear - 0.01), {12: (0.0, top, z)}
+    return solids, roof, {12: (0.0, top, -0.1)}
 
 
 def _cloth(
-    tack: tuple[float, float], head: tuple[float, float], clew: tuple[float, float], color: Color
+    heights: tuple[float, float],
+    luff: tuple[float, float],
+    leech: tuple[float, float],
+    color: Color,
 ) -> Solid:
-    """A flat sail with a curved rear edge in the plane x = 0, its corners as (z, y)."""
-    shares = np.linspace(0, 1, 11)[:, None]
-    luff, leech = (np.add(low, shares * np.subtract(head, low)) for low in (tack, clew))
-    leech[:, :1] += 0.15 * (clew[0] - tack[0]) * np.sin(np.pi * shares) + 0.012 * shares
-    foot, top = ((luff[[k]] + leech[[k]]) / 2 for k in (0, -1))
-    outline = np.concatenate([foot, luff, top, leech[::-1]])[:, ::-1]
-    return loft([np.insert(outline, 0, x, axis=1) for x in (-0.003, 0.003)], color)
+    """A flat sail in the plane x = 0: z of its front and rear edge, below and above."""
+    shares = np.linspace(0, 1, 11)
+    y, front, rear = (low + shares * (high - low) for low, high in (heights, luff, leech))
+    rear = rear + 0.15 * (leech[0] - luff[0]) * np.sin(np.pi * shares)
+    return stack([*zip(y, np.full(11, 0.006), front, rear, strict=True)], color, radius=0.0)
 
 
 _KINDS = (
-    (_Vessel(0.165, 0.04, 0.052, (0.03, 0.008), (0.045, 0.03), 0.2, 2.2, 0.82, 0.008,
-             (126, 92, 78)), _cargo),
-    (_Vessel(0.275, 0.05, 0.072, (0.035, 0.01), (0.11, 0.07), 0.58, 1.7, 0.6, 0.01,
-             (196, 152, 100)), _sail),
-    (_Vessel(0.25, 0.035, 0.082, (0.045, 0.0), (0.12, 0.02), 0.55, 1.8, 0.88, 0.014,
-             (204, 166, 118)), _yacht),
-    (_Vessel(0.325, 0.07, 0.072, (0.08, 0.015), (0.05, 0.05), 0.38, 2.3, 0.72, 0.025,
-             (112, 118, 112)), _tug),
+    (_Vessel(.165, .04, .052, (.03, .008), (.045, .03), .2, 2.2, .82, .008, _DECKS[0]), _cargo),
+    (_Vessel(.275, .05, .072, (.035, .01), (.11, .07), .58, 1.7, .6, .01, _DECKS[1]), _sail),
+    (_Vessel(.25, .035, .082, (.045, 0.0), (.12, .02), .55, 1.8, .88, .014, _DECKS[2]), _yacht),
+    (_Vessel(.325, .07, .072, (.08, .015), (.05, .05), .38, 2.3, .72, .025, _DECKS[3]), _tug),
 )  # fmt: skip

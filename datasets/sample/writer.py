@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from cadalign.datasets.models.categories import SYNSETS
 from cadalign.datasets.sample.bottle import bottle
@@ -21,17 +20,12 @@ from cadalign.datasets.sample.chair import chair
 from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
 from cadalign.datasets.sample.vessel import vessel
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import writing
+from cadalign.io.meshes.write import write_ply_mesh
 
-MAKERS: dict[str, Callable[[np.random.Generator, int], Draft]] = {
-    "chair": chair,
-    "bottle": bottle,
-    "car": car,
-    "vessel": vessel,
-}
+_Maker = Callable[[np.random.Generator, int], Draft]
+MAKERS: dict[str, _Maker] = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}
 """By category: draws and builds the model with a number; the styles take turns with the number."""
-
 _SPLITS = ("train", "train", "train", "train", "val", "test")  # take turns by number
 _MARKER = "sample_dataset.json"
 _LARGEST_OFFSET = 0.08
@@ -167,12 +161,9 @@ def _make(category: str, index: int, seed: int) -> SampleModel:
 def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> None:
     splits: dict[str, list[str]] = {name: [] for name in _SPLITS}
     annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    for name in names:
-        (root / "ShapeNetCore.v2.ply" / SYNSETS[name]).mkdir(parents=True)
     for model in sample_models(per_category=per_category, categories=names, seed=seed):
         synset, records = SYNSETS[model.category], annotations[model.category]
-        path = root / "ShapeNetCore.v2.ply" / synset / f"{model.model_id}.ply"
-        path.write_bytes(_ply_bytes(model.mesh))
+        write_ply_mesh(root / "ShapeNetCore.v2.ply" / synset / f"{model.model_id}.ply", model.mesh)
         splits[_SPLITS[len(records) % len(_SPLITS)]].append(f"{synset}-{model.model_id}\n")
         records.append(_annotation(model))
     (root / "annotations").mkdir()
@@ -185,17 +176,56 @@ def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> No
         path.write_text("".join(lines), encoding="utf-8", newline="\n")
 
 
+def _annotation(model: SampleModel) -> dict[str, Any]:
+    """A model's entry in KeypointNet's ``annotations/<category>.json``."""
+    row = {keypoint.semantic_id: i for i, keypoint in enumerate(model.keypoints)}
+    mirrored = [[row[semantic_id] for semantic_id in pair] for pair in model.mirrored]
+    turned = [[row[semantic_id] for semantic_id in group] for group in model.turned]
+    circles = [_circle(model, rows) if model.round else {} for rows in turned]
+    return {
+        "class_id": SYNSETS[model.category],
+        "model_id": model.model_id,
+        "keypoints": [_keypoint_entry(keypoint) for keypoint in model.keypoints],
+        "symmetries": {
+            "reflection": [{"kp_indexes": rows} for rows in mirrored],
+            "rotation": [
+                {"kp_indexes": rows, "is_circle": model.round, "circle": circle}
+                for rows, circle in zip(turned, circles, strict=True)
+            ],
+        },
+    }
+
+
+def _keypoint_entry(keypoint: SampleKeypoint) -> dict[str, Any]:
+    # Steps of the golden ratio around the colour circle never come back to a colour.
+    rgb = colorsys.hsv_to_rgb(keypoint.semantic_id * 0.6180339887498949 % 1.0, 0.85, 0.95)
+    return {
+        "xyz": keypoint.xyz.tolist(),
+        "rgb": [round(255 * value) for value in rgb],
+        "semantic_id": keypoint.semantic_id,
+        "pcd_info": {"point_index": keypoint.vertex_index},
+        "mesh_info": {"face_index": keypoint.face_index, "face_uv": keypoint.barycentric.tolist()},
+    }
+
+
+def _circle(model: SampleModel, rows: Sequence[int]) -> dict[str, Any]:
+    points = np.array([model.keypoints[row].xyz for row in rows])
+    # The axis is that of the model, not the mean of a few points on a polygon.
+    center = model.mesh.bounds.mean(axis=0)
+    center[1] = points[:, 1].mean()
+    radius = float(np.linalg.norm(points - center, axis=1).mean())
+    return {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
+
+
 def _marker(names: Sequence[str], per_category: int, seed: int) -> dict[str, Any]:
     """Origin of the files of a data set: the arguments, and the code that makes them."""
-    code = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        code.update(path.read_bytes())
+    sources = (path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     return {
         "made_by": "cadalign.datasets.sample",
         "categories": list(names),
         "per_category": int(per_category),
         "seed": int(seed),
-        "code": code.hexdigest(),
+        "code": hashlib.sha256(b"".join(sources)).hexdigest(),
     }
 
 
@@ -214,72 +244,16 @@ def _size(root: Path) -> int:
     return sum(path.stat().st_size for path in files)
 
 
-def _annotation(model: SampleModel) -> dict[str, Any]:
-    """A model's entry in KeypointNet's ``annotations/<category>.json``."""
-    position = {keypoint.semantic_id: i for i, keypoint in enumerate(model.keypoints)}
-    rotation = []
-    for group in model.turned:
-        members = [position[semantic_id] for semantic_id in group]
-        circle = _circle(model, members) if model.round else {}
-        rotation.append({"kp_indexes": members, "is_circle": model.round, "circle": circle})
-    return {
-        "class_id": SYNSETS[model.category],
-        "model_id": model.model_id,
-        "keypoints": [_keypoint_entry(keypoint) for keypoint in model.keypoints],
-        "symmetries": {
-            "reflection": [{"kp_indexes": [position[a], position[b]]} for a, b in model.mirrored],
-            "rotation": rotation,
-        },
-    }
-
-
-def _keypoint_entry(keypoint: SampleKeypoint) -> dict[str, Any]:
-    # Steps of the golden ratio around the colour circle never come back to a colour.
-    rgb = colorsys.hsv_to_rgb(keypoint.semantic_id * 0.6180339887498949 % 1.0, 0.85, 0.95)
-    return {
-        "xyz": keypoint.xyz.tolist(),
-        "rgb": [round(255 * value) for value in rgb],
-        "semantic_id": keypoint.semantic_id,
-        "pcd_info": {"point_index": keypoint.vertex_index},
-        "mesh_info": {"face_index": keypoint.face_index, "face_uv": keypoint.barycentric.tolist()},
-    }
-
-
-def _circle(model: SampleModel, members: Sequence[int]) -> dict[str, Any]:
-    points = np.array([model.keypoints[i].xyz for i in members])
-    # The axis is that of the model, not the mean of a few points on a polygon.
-    center = model.mesh.bounds.mean(axis=0)
-    center[1] = points[:, 1].mean()
-    radius = float(np.linalg.norm(points - center, axis=1).mean())
-    return {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
-
-
-def _ply_bytes(mesh: Mesh) -> bytes:
-    """A mesh with vertex colours as a binary PLY file, positions in single precision."""
-    assert mesh.vertex_colors is not None
-    colors = np.round(mesh.vertex_colors * 255).astype(np.uint8)
-    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
-    return bytes(trimesh.exchange.ply.export_ply(surface, vertex_normal=False))
-
-
 def _check_replaceable(target: Path) -> None:
     """Refuse to overwrite anything but an earlier sample data set."""
-    if not target.exists():
-        return
-    if not target.is_dir():
+    if target.exists() and not target.is_dir():
         raise DataError("is a file", where=str(target), fix="give a folder")
-    present = sorted(path for path in target.rglob("*") if not path.is_dir())
-    ours = (target / _MARKER).is_file()
-    foreign = [path for path in present if not ours or not _is_ours(path.relative_to(target))]
-    if foreign:
-        raise DataError(
-            f"holds files that are not of a sample data set, such as {foreign[0].name}",
-            where=str(target),
-            fix="give a new or an empty folder",
-        )
-
-
-def _is_ours(path: Path) -> bool:
-    known = {_MARKER, *(f"splits/{split}.txt" for split in _SPLITS)}
-    known |= {f"annotations/{category}.json" for category in MAKERS}
-    return path.as_posix() in known or path.match("ShapeNetCore.v2.ply/*/sample_*.ply")
+    ours = {_MARKER, *(f"splits/{split}.txt" for split in _SPLITS)}
+    ours |= {f"annotations/{category}.json" for category in MAKERS}
+    is_sample = (target / _MARKER).is_file()
+    for path in sorted(path for path in target.rglob("*") if not path.is_dir()):
+        place = path.relative_to(target)
+        known = place.as_posix() in ours or place.match("ShapeNetCore.v2.ply/*/sample_*.ply")
+        if not (is_sample and known):
+            what = f"holds files that are not of a sample data set, such as {path.name}"
+            raise DataError(what, where=str(target), fix="give a new or an empty folder")

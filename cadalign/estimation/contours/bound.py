@@ -85,7 +85,9 @@ def with_contours(
         for n in masked
     ]
     full = with_measured(evidence, keypoints, rows)
-    return full, state_with_points(state, keypoints, count_of(rows), np.zeros(OWN_MODES * len(rows)))
+    return full, state_with_points(
+        state, keypoints, count_of(rows), np.zeros(OWN_MODES * len(rows))
+    )
 
 
 def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> Measured:

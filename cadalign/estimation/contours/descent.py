@@ -138,9 +138,7 @@ def stack(
 ) -> Stacked | None:
     """The rims of a place as evidence; None where there are none."""
     rows = [
-        view.evidence_of(
-            rims, noise, look.posed, look.poses[view.image], camera=camera, bias=bias
-        )
+        view.evidence_of(rims, noise, look.posed, look.poses[view.image], camera=camera, bias=bias)
         for view, noise, camera, rims, bias in zip(
             masked.views, noises, look.cameras, look.rims, look.biases, strict=True
         )
@@ -209,7 +207,9 @@ class Descent(NamedTuple):
     def _shorter(self, here: Stacked) -> Stacked | None:
         """The first place on the way to the goal of a step that costs less."""
         goal = step_of(self.masked, here)
-        for share in _SHARES if goal is not None else ():
+        if goal is None:
+            return None
+        for share in _SHARES:
             there = self.at(here.place.towards(goal, share))
             if there is not None and there.cost < here.cost - _LEAST_GAIN:
                 return there
@@ -223,9 +223,7 @@ class Descent(NamedTuple):
             here.place.moved(sign * step) for step in _weakest_steps(here) for sign in (1.0, -1.0)
         ]
         goals.extend(
-            here.place.towards(other, share)
-            for other in self.others
-            for share in _SHARES_OF_OTHERS
+            here.place.towards(other, share) for other in self.others for share in _SHARES_OF_OTHERS
         )
         found = [each for each in map(self.at, goals) if each is not None]
         best = min(found, key=lambda each: each.cost, default=here)

@@ -226,9 +226,7 @@ def _finished(candidates: list[_Candidate]) -> list[_Candidate]:
         return candidates
     noises, found = candidates[0].settled.noises, []
     for each in candidates:
-        evidence, state = with_displacement_modes(
-            each.masked.evidence, each.settled.place.state
-        )
+        evidence, state = with_displacement_modes(each.masked.evidence, each.settled.place.state)
         masked = each.masked._replace(evidence=evidence)
         others = [other.settled.place for other in candidates if other is not each]
         place = each.settled.place._replace(state=state)

@@ -57,7 +57,7 @@ class ContourFit(NamedTuple):
 
 
 class Settled(NamedTuple):
-    """An estimate from all evidence; ``evidence`` and ``state`` hold the rims, ``place`` does not."""
+    """An estimate; its ``evidence`` and ``state`` hold the rims, ``place`` does not."""
 
     evidence: Evidence
     state: State
@@ -137,7 +137,8 @@ def _approach(
     is_exact = masked.surface.is_exact
     noises = [first_noise(view.sigma, reach, is_exact=is_exact) for view in masked.views]
     last: list[Rims] = []
-    for number in range(_MOST_ROUNDS):
+    rounds = 0
+    while rounds < _MOST_ROUNDS:
         look = look_at(masked, place, reach, is_fine=False)
         widest = max(noise.sigma for noise in noises)
         if _change(last, look.rims) < _SETTLED * max(1.0, widest):
@@ -149,11 +150,11 @@ def _approach(
         step = None if here is None else step_of(masked, here, _FEW_ITERATIONS)
         if here is None or step is None:
             return None
-        place, last = step, look.rims
+        place, last, rounds = step, look.rims, rounds + 1
         if is_exact:
             noises, own = with_learned_offsets(here.evidence, here.at(step), noises, step.own)
             place = step._replace(own=own)
-    return place, noises, reach, number
+    return place, noises, reach, rounds
 
 
 def _change(last: list[Rims], rims: list[Rims]) -> float:

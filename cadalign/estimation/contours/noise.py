@@ -59,8 +59,9 @@ class Noise(NamedTuple):
 
     def is_like(self, other: Noise) -> bool:
         """True if samples weigh about the same."""
-        variances = [(each.sigma**2 * each.correlation, each.offset**2) for each in (self, other)]
-        return bool((np.abs(np.log(np.divide(*variances))) < _ALIKE).all())
+        weights = self.sigma**2 * self.correlation / (other.sigma**2 * other.correlation)
+        offsets = (self.offset / other.offset) ** 2
+        return bool(max(abs(np.log(weights)), abs(np.log(offsets))) < _ALIKE)
 
 
 def first_noise(sigma: float | None, reach: float, *, is_exact: bool) -> Noise:

@@ -157,7 +157,7 @@ def stack(
 
 
 def step_of(masked: Masked, here: Stacked, iterations: int = _ITERATIONS) -> Place | None:
-    """The place where all evidence agrees best if every rim's point stays; None if there is none."""
+    """The place where all evidence agrees best if every rim's point stays, or None."""
     cost, state, _, _ = refine_joint(here.evidence, iterations, here.state)
     if not cost < np.inf:
         return None

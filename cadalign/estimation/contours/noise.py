@@ -27,10 +27,10 @@ OWN_MODES = 3
 REGISTRATION = 0.3
 """Standard deviation of a contour's registration along x and y [px]."""
 
-_LOSS_SCALE = 2.4  # in deviations: Cauchy's loss then keeps 95 % of the information
+_LOSS_SCALE = 2.4  # in standard deviations: Cauchy's loss then keeps 95 % of the information
 _LEAST_LOSS_SCALE = 1.0  # [px]: where pixels end, they displace a contour by up to that
 _LEAST_SIGMA = 0.1  # [px]
-_FIRST_OFFSET = 1.0  # [px], deviation of the offset that all of a contour has in common
+_FIRST_OFFSET = 1.0  # [px], standard deviation of the offset that all of a contour has in common
 _LEAST_OFFSET = 0.1
 _UNEVEN = 0.05  # share of the offset by which it differs from edge to edge
 _EDGE = 30.0  # samples of an edge
@@ -41,7 +41,11 @@ _ALIKE = 0.2  # change of a variance's logarithm
 
 
 class Noise(NamedTuple):
-    """Deviation of a contour [px], number of samples that count as one, deviation of the offset."""
+    """Noise of a contour's samples.
+
+    Their standard deviation ``sigma`` [px], the number of neighbours that count as one, and the
+    standard deviation of the ``offset`` [px] that all have in common.
+    """
 
     sigma: float
     correlation: float
@@ -49,7 +53,7 @@ class Noise(NamedTuple):
 
     @property
     def loss_scale(self) -> float:
-        """Scale of Cauchy's loss, in deviations of a sample."""
+        """Scale of Cauchy's loss, in standard deviations of a sample."""
         return max(_LOSS_SCALE, _LEAST_LOSS_SCALE / self.sigma)
 
     def cost(self, residual: float) -> float:
@@ -80,12 +84,11 @@ def noise_of(
     *,
     correlated: bool,
 ) -> Noise:
-    """Deviation and correlation that the residuals (S,) [px] show, free of the extraction's bias.
+    """Noise that the residuals (S,) [px] show, free of the extraction's bias.
 
     The correlation is that of the samples' influence on the estimate, which runs of outliers have,
-    too; what the residuals don't reach of the given deviation ``sigma`` is correlated as pixels
-    are. A contour beside the rim lies there unevenly, by a share of the offset that all of an edge
-    has in common.
+    too; what the residuals don't reach of the given ``sigma`` is correlated as pixels are. A contour
+    beside the rim lies there unevenly, by a share of the offset that all of an edge has in common.
     """
     found = trimmed_deviation(residuals[rims.found], _LEAST_LOSS_SCALE)
     measured = max(found, _LEAST_SIGMA)
@@ -105,7 +108,7 @@ def noise_of(
 def noise_of_similar(
     contour: Contour, sigma: float | None, rims: Rims, residuals: FloatArray, reach: float
 ) -> Noise:
-    """Deviation and correlation where the surface is only similar to the object's.
+    """Noise where the surface is only similar to the object's.
 
     Samples without a rim count as the farthest: there the surface lacks a part or has one more.
     """
@@ -118,7 +121,7 @@ def noise_of_similar(
 def with_learned_offsets(
     evidence: Evidence, state: State, noises: list[Noise], own: FloatArray
 ) -> tuple[list[Noise], FloatArray]:
-    """Deviations of the offsets by their own likelihood.
+    """Noises with the standard deviations of the offsets learned by their own likelihood.
 
     The contours' ``own`` coefficients (V, 3), last of the evidence's unknowns, come along.
     """

@@ -25,7 +25,7 @@ class ViewContour:
     """The contour in view number ``image``.
 
     ``slopes`` (S, 2, 2) are the derivatives of its samples' places [px] by their rays; ``sigma`` is
-    the given deviation [px], None to estimate it. The contour is that of ``mask``.
+    the given standard deviation [px], None to estimate it. The contour is that of ``mask``.
     """
 
     image: int

@@ -87,8 +87,8 @@ def noise_of(
     """Noise that the residuals (S,) [px] show, free of the extraction's bias.
 
     The correlation is that of the samples' influence on the estimate, which runs of outliers have,
-    too; what the residuals don't reach of the given ``sigma`` is correlated as pixels are. A contour
-    beside the rim lies there unevenly, by a share of the offset that all of an edge has in common.
+    too; what the residuals don't reach of the given ``sigma`` is correlated as pixels are. Beside
+    the rim a contour lies unevenly, by a share of the offset that all of an edge has in common.
     """
     found = trimmed_deviation(residuals[rims.found], _LEAST_LOSS_SCALE)
     measured = max(found, _LEAST_SIGMA)

@@ -8,13 +8,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.contours.loop import (
-    Noise,
-    ViewContour,
-    contour_view,
-    noise_of,
-    rim_rows,
-)
+from cadalign.estimation.contours.noise import OWN_MODES, Noise, noise_of
 from cadalign.estimation.contours.rims import extraction_bias, find_rims
 from cadalign.estimation.contours.rows import (
     Measured,
@@ -23,6 +17,7 @@ from cadalign.estimation.contours.rows import (
     with_measured,
 )
 from cadalign.estimation.contours.surface import PosedSurface, surfaces_of
+from cadalign.estimation.contours.view_contour import ViewContour, contour_view
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths, poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
@@ -90,7 +85,9 @@ def with_contours(
         for n in masked
     ]
     full = with_measured(evidence, keypoints, rows)
-    return full, state_with_points(state, keypoints, count_of(rows), np.zeros(len(rows)))
+    return full, state_with_points(
+        state, keypoints, count_of(rows), np.zeros(OWN_MODES * len(rows))
+    )
 
 
 def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> Measured:
@@ -99,7 +96,9 @@ def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> Meas
     centred = np.where(rims.found, rims.offset - offset, np.nan)
     known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
     bias = extraction_bias(posed.caster, seen.camera, gt, seen.mask, seen.contour, rims)
-    noise = noise_of(seen, rims, centred - bias, known, correlated=True)
+    noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
     agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
-    rows = rim_rows(seen, rims._replace(found=agreeing), noise, posed, gt, bias)
+    rows = seen.evidence_of(
+        rims._replace(found=agreeing), noise, posed, gt, camera=seen.camera, bias=bias
+    )
     return rows._replace(table=rows.table._replace(loss=np.full_like(rows.table.loss, LINEAR)))

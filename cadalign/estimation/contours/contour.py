@@ -25,6 +25,7 @@ _STEP = 0.25
 
 Image = npt.NDArray[np.float32]
 _TO_SIGMA = 1.4826  # from the median of absolute values to the deviation of a Gaussian
+_OUTLYING = 3.5  # in deviations
 _MOST_LAGS = 100
 _LEAST_PAIRS = 20
 
@@ -202,6 +203,17 @@ def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
 def robust_deviation(residuals: FloatArray) -> float:
     """Deviation of residuals (n,) about 0, outliers among them; 0 for none."""
     return _TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else 0.0
+
+
+def trimmed_deviation(residuals: FloatArray, least: float) -> float:
+    """Root mean square of residuals (n,) about 0 without outliers, which exceed ``least``.
+
+    It is 0 for none.
+    """
+    if not len(residuals):
+        return 0.0
+    kept = residuals[np.abs(residuals) < max(_OUTLYING * robust_deviation(residuals), least)]
+    return float(np.sqrt((kept**2).mean()))
 
 
 def correlation_length(contour: Contour, residuals: FloatArray, kept: BoolArray) -> float:

@@ -12,17 +12,16 @@ import numpy as np
 
 from cadalign.arrays import BoolArray
 from cadalign.errors import DegenerateError
+from cadalign.estimation.contours.descent import Masked
 from cadalign.estimation.contours.loop import (
     ContourFit,
     Settled,
-    ViewContour,
-    contour_view,
     settle,
+    settle_with,
 )
-from cadalign.estimation.contours.rows import (
-    with_displacement_modes,
-)
+from cadalign.estimation.contours.rows import with_displacement_modes
 from cadalign.estimation.contours.surface import Surface, surfaces_of
+from cadalign.estimation.contours.view_contour import ViewContour, contour_view
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Result
@@ -78,16 +77,10 @@ class MaskFit(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """A start, a surface, and where the rounds led.
-
-    ``evidence`` and ``state`` are those of the start, with displacements as modes: the surface
-    follows them.
-    """
+    """A start, what is to be refined from there, and where the steps led."""
 
     start: Minimum
-    evidence: Evidence
-    state: State
-    surface: Surface
+    masked: Masked
     settled: Settled
 
     @property
@@ -143,19 +136,20 @@ def fit_masks(
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
-    settle_all = partial(_settled, likely[:most], keypoints, is_wide=is_open)
+    explore = partial(_explored, likely[:most], keypoints, is_wide=is_open)
     best: list[_Candidate] = []
     while used:
-        best = settle_all(used, choice.surfaces)
+        best = explore(used, choice.surfaces)
         hulls = [hull_contour(each, views[each.image]) for each in used] if choice.hulls else []
         known = [each for each in hulls if each is not None]
         if known and len(known) == len(used):
-            by_hulls = settle_all(known, choice.hulls)
+            by_hulls = explore(known, choice.hulls)
             # Hulls that agree so much better: the rest of the outline is another object's.
             if by_hulls and (
                 not best or _misfit(by_hulls[0].settled) < _HULL_GAIN * _misfit(best[0].settled)
             ):
                 best, used = by_hulls, known
+        best = _finished(best)
         wrong = _contradicting(best, used)
         if wrong is None:
             break
@@ -192,7 +186,7 @@ def _is_determined(minimum: Minimum) -> bool:
     return bool(values[0] > _LEAST_INFORMATION)
 
 
-def _settled(
+def _explored(
     starts: Sequence[Minimum],
     keypoints: int,
     contours: list[ViewContour],
@@ -200,44 +194,46 @@ def _settled(
     *,
     is_wide: bool,
 ) -> list[_Candidate]:
-    """Every start with the surface that fits best.
+    """Every start with the surface that fits best, the best fit first.
 
-    The scores of several starts are made comparable by the noise of the best one.
+    Surfaces of a learned shape follow its modes alone: with the keypoints' own displacements a step
+    takes several times as long, and modes tell the surfaces apart.
     """
     found = []
     for start in starts:
-        evidence, state = with_displacement_modes(start.evidence, start.state)
-        # Surfaces of a learned shape follow its modes first: with the keypoints' own displacements
-        # a round takes several times as long, and modes tell the surfaces apart.
-        is_learned = len(start.evidence.shape.modes) > 0 and evidence is not start.evidence
-        given = (start.evidence, start.state) if is_learned else (evidence, state)
+        evidence, state = start.evidence, start.state
+        if not len(evidence.shape.modes):
+            evidence, state = with_displacement_modes(evidence, state)
         tried = []
         for surface in surfaces:
-            settled = settle(given[0], keypoints, given[1], contours, surface, is_wide=is_wide)
+            masked = Masked(evidence, keypoints, contours, surface)
+            settled = settle(masked, state, is_wide=is_wide)
             if settled is not None:
-                tried.append(_Candidate(start, evidence, state, surface, settled))
+                tried.append(_Candidate(start, masked, settled))
         if tried:
-            best = min(tried, key=lambda each: _misfit(each.settled))
-            if is_learned:
-                _, bare = with_displacement_modes(start.evidence, best.settled.bare)
-                settled = settle(evidence, keypoints, bare, contours, best.surface)
-                if settled is None:
-                    continue
-                best = best._replace(settled=settled)
-            found.append(best)
-    if len(found) > 1:
-        reference = min(found, key=lambda each: _misfit(each.settled))
-        noises = [fit.noise for fit in reference.settled.fits]
-        again = []
-        for each in found:
-            settled = settle(
-                each.evidence, keypoints, each.settled.bare, contours, each.surface, noises
-            )
-            if settled is not None:
-                again.append(each._replace(settled=settled))
-        found = again
-    found.sort(key=lambda each: each.score)
-    return found
+            found.append(min(tried, key=lambda each: _misfit(each.settled)))
+    return sorted(found, key=lambda each: _misfit(each.settled))
+
+
+def _finished(candidates: list[_Candidate]) -> list[_Candidate]:
+    """The candidates with all that their shapes can follow, the likeliest first.
+
+    Their scores are made comparable by the noise of the one that fits best.
+    """
+    if not candidates or (
+        len(candidates) == 1 and not candidates[0].masked.evidence.shape.spread.any()
+    ):
+        return candidates
+    noises, found = candidates[0].settled.noises, []
+    for each in candidates:
+        evidence, state = with_displacement_modes(each.masked.evidence, each.settled.place.state)
+        masked = each.masked._replace(evidence=evidence)
+        others = [other.settled.place for other in candidates if other is not each]
+        place = each.settled.place._replace(state=state)
+        settled = settle_with(masked, place, noises, others)
+        if settled is not None:
+            found.append(each._replace(masked=masked, settled=settled))
+    return sorted(found, key=lambda each: each.score)
 
 
 def _misfit(settled: Settled) -> float:
@@ -253,7 +249,7 @@ def _contradicting(
     if not candidates:
         return contours[0], "no part of the model's outline comes near its contour"
     best = candidates[0]
-    relative = _RELATIVE_TOLERANCE if best.surface.is_exact else _WARPED_TOLERANCE
+    relative = _RELATIVE_TOLERANCE if best.masked.surface.is_exact else _WARPED_TOLERANCE
     supports = []
     for contour, fit in zip(contours, best.settled.fits, strict=True):
         tolerance = max(_LEAST_TOLERANCE, relative * contour.contour.size)
@@ -274,15 +270,16 @@ def _tension(candidate: _Candidate) -> str | None:
     """Report other residuals that rise more than the masks' information explains."""
     from scipy.special import chdtri  # takes longer to import than all that is compiled
 
-    evidence, state = candidate.evidence, candidate.state
-    alone, joint = _cost(evidence, state), _cost(evidence, candidate.settled.bare)
+    start, evidence = candidate.start, candidate.masked.evidence
+    alone = _cost(*with_displacement_modes(start.evidence, start.state))
+    joint = _cost(evidence, candidate.settled.place.state)
     equations = 2 * len(evidence.sightings.point)
-    free = 6 * len(state.poses) + int(evidence.scales.free.sum())
+    free = 6 * len(start.state.poses) + int(evidence.scales.free.sum())
     if not equations:
         return None
     redundancy = equations - free
     scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
-    unknowns = min(free + len(state.coefficients), equations)
+    unknowns = min(free + len(evidence.shape.modes), equations)
     if joint - alone <= scale * chdtri(unknowns, _LEAST_PROBABILITY):
         return None
     times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))

@@ -25,7 +25,8 @@ _PRECISION = 0.01  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
 _REACH = 2.0  # [px], between a rim and the contour that is extracted from its silhouette
 _STEP = 0.25
-_BAND = 13  # [px], about the rims, that smoothing and reach depend on
+_BAND = 9  # [px], about the rims, that smoothing depends on
+_LEAST_COSINE = 0.3  # between rim and contour
 
 
 class Rims(NamedTuple):
@@ -116,6 +117,26 @@ def _is_steep(contour: Contour, found: BoolArray, offset: FloatArray) -> BoolArr
     steep[1:] |= jump
     steep[:-1] |= jump
     return steep
+
+
+def across_rims(contour: Contour, rims: Rims) -> FloatArray:
+    """Directions (S, 2) across the rims, of length 1 along the contour's normals.
+
+    A point of the rim that moves along it does not change the rim's distance from the contour.
+    They are the normals where no neighbour has a rim.
+    """
+    places = contour.points + rims.offset[:, None] * contour.normals
+    gaps = np.diff(places, axis=0)
+    known = rims.found[1:] & rims.found[:-1] & (contour.curve[1:] == contour.curve[:-1])
+    gaps[~known] = 0.0
+    along = np.zeros_like(places)
+    along[1:] += gaps
+    along[:-1] += gaps
+    across = np.column_stack([along[:, 1], -along[:, 0]])
+    projected = (across * contour.normals).sum(axis=1)
+    usable = np.abs(projected) > _LEAST_COSINE * np.linalg.norm(across, axis=1)
+    scale = np.where(usable, projected, 1.0)[:, None]
+    return np.where(usable[:, None], across / scale, contour.normals)
 
 
 class MaskImage(NamedTuple):

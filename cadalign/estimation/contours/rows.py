@@ -24,13 +24,13 @@ class PointRows(NamedTuple):
 class Measured(NamedTuple):
     """Points of a surface in one view, and what was measured at each.
 
-    ``table`` has a row for each point, whose number follows. The ``offset`` (n, 3) is one more mode
-    of the shape, that moves these points alone.
+    ``table`` has a row for each point, whose number follows. ``own`` (k, n, 3) are further modes of
+    the shape, that move these points alone.
     """
 
     points: PointRows
     table: Sightings | Planes
-    offset: FloatArray | None = None
+    own: FloatArray | None = None
 
 
 def count_of(measured: Sequence[Measured]) -> int:
@@ -44,12 +44,13 @@ def with_measured(evidence: Evidence, keypoints: int, measured: Sequence[Measure
     Modes that move the points of one view alone are the last ones, in the order of the views.
     """
     shape, total = evidence.shape, count_of(measured)
-    own, further = len(shape.modes), [each.offset for each in measured if each.offset is not None]
+    last = len(shape.modes)
+    further = sum(len(each.own) for each in measured if each.own is not None)
     end = keypoints + total
     mean = np.concatenate([shape.mean[:keypoints], np.zeros((total, 3)), shape.mean[keypoints:]])
-    modes = np.zeros((own + len(further), len(mean), 3))
-    modes[:own, :keypoints] = shape.modes[:, :keypoints]
-    modes[:own, end:] = shape.modes[:, keypoints:]
+    modes = np.zeros((last + further, len(mean), 3))
+    modes[:last, :keypoints] = shape.modes[:, :keypoints]
+    modes[:last, end:] = shape.modes[:, keypoints:]
 
     def moved(points: IntArray) -> IntArray:
         return np.where(points >= keypoints, points + total, points)
@@ -59,12 +60,13 @@ def with_measured(evidence: Evidence, keypoints: int, measured: Sequence[Measure
         for name, table in (("sightings", evidence.sightings), ("planes", evidence.planes))
     }
     first = keypoints
-    for number, (points, table, offset) in enumerate(measured):
+    for points, table, own in measured:
         there = slice(first, first + len(points.mean))
         mean[there] = points.mean
         modes[: len(points.modes), there] = points.modes  # none for a rigid surface
-        if offset is not None:
-            modes[own + number, there] = offset
+        if own is not None:
+            modes[last : last + len(own), there] = own
+            last += len(own)
         name = "sightings" if isinstance(table, Sightings) else "planes"
         tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
         first = there.stop

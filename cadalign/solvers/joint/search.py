@@ -81,6 +81,13 @@ def refine_joint(
     return cost, found, iterations, converged
 
 
+def objective_of(evidence: Evidence, state: State) -> float:
+    """What `refine_joint` lowers: the cost, with the log determinant of what is integrated out."""
+    reduction = reduce_modes(evidence)
+    row = packed(reduced_state(reduction, evidence.shape, state))
+    return float(joint_cost(Joint(reduction.evidence, has_latent(reduction.evidence)), row))
+
+
 def score_state(evidence: Evidence, state: State) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
     reduction = reduce_modes(evidence)

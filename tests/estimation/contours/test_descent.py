@@ -1,0 +1,149 @@
+"""Descents on masks' contours: where they end, and what is stated of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support.scenes import CAMERA, truth_of
+
+from cadalign import Alignment, Camera, Mesh, Model, Result, View, align
+from cadalign.datasets import KeypointNet
+from cadalign.estimation.contours.contour import Contour
+from cadalign.estimation.contours.descent import Descent, Masked, Place
+from cadalign.estimation.contours.loop import settle
+from cadalign.estimation.contours.rims import Rims, across_rims
+from cadalign.estimation.contours.surface import RigidSurface
+from cadalign.estimation.contours.view_contour import contour_view
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import prior_of
+from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.render import Scene, cast_geometry, sample_view
+from cadalign.solvers.constants import LINEAR
+from cadalign.solvers.joint.evidence import State
+
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+BOX = Mesh(CORNERS, np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))]))
+UNKNOWN = [0, 1, 2, 3, 4, 5, 7, 8]  # of a result's covariance, where x is known
+
+
+def squared_distance(result: Result, truth: Alignment) -> float:
+    """Error of pose and stretch in units of the stated covariance, squared."""
+    found = result.alignment
+    error = np.concatenate(
+        [
+            vector_from_rotation(found.rotation @ truth.rotation.T),
+            found.translation - truth.translation,
+            np.log(found.scale / truth.scale)[1:],
+        ]
+    )
+    return float(error @ np.linalg.solve(result.covariance[np.ix_(UNKNOWN, UNKNOWN)], error))
+
+
+def seen_from_anywhere(model: object, seed: int) -> tuple[Model, View, Alignment]:
+    """A stretched model from any direction, its keypoints with 1 px of noise, its exact mask."""
+    rng = np.random.default_rng(seed)
+    scene = Scene(model.load_mesh())  # type: ignore[attr-defined]
+    points = model.keypoints.xyz  # type: ignore[attr-defined]
+    scale = np.array([1.0, *np.exp(rng.uniform(-0.6, 0.6, 2))])
+    shown = sample_view(
+        scene, points, WIDE, rng=rng, min_visible=5, scale=scale, roll=180.0, elevation=(-89, 89)
+    )
+    ids, truth = np.flatnonzero(shown.visible).tolist(), shown.cam_from_model
+    pixels = WIDE.project(truth.apply(points[ids])) + rng.normal(0, 1, (len(ids), 2))
+    view = View(WIDE, pixels, ids=ids, mask=cast_geometry(scene, WIDE, truth).mask)
+    return Model(points_3d=points, mesh=scene.mesh), view, truth
+
+
+WIDE = Camera(640, 480, 935, 935, 319.5, 239.5)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [39, 44, 94, 184])
+def test_exact_masks_end_within_the_stated_uncertainty(real_data: Path, seed: int) -> None:
+    models = [m for m in KeypointNet(real_data / "keypointnet")["bathtub"] if m.mesh_path]
+    model, view, truth = seen_from_anywhere(models[0], seed)
+    assert squared_distance(align(model, view), truth) < chi2.ppf(0.999, 8)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("shift", [0.0, 0.5, -0.5])
+def test_a_mask_of_the_other_pixel_convention_is_within_the_stated_uncertainty(
+    sample_root: Path, shift: float
+) -> None:
+    distances = []
+    for category in ("bottle", "chair"):
+        model = KeypointNet(sample_root)[category][0]
+        for seed in range(2):
+            exact, view, truth = seen_from_anywhere(model, seed)
+            moved = Camera(640, 480, 935, 935, 319.5 + shift, 239.5 + shift)
+            mask = cast_geometry(Scene(model.load_mesh()), moved, truth).mask
+            given = View(WIDE, view.points_2d, ids=view.keypoint_ids, mask=mask)
+            result = align(exact, given)
+            assert not any("mask" in text for text in result.warnings)
+            distances.append(squared_distance(result, truth))
+    assert max(distances) < chi2.ppf(0.99, 8)
+
+
+def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
+    truth = truth_of((0.6, 0.4, 0.8))
+    rng = np.random.default_rng(0)
+    mask = cast_geometry(Scene(BOX), CAMERA, truth).mask
+    pixels = CAMERA.project(truth.apply(CORNERS)) + rng.normal(0, 1, (8, 2))
+    model, view = Model(points_3d=CORNERS, mesh=BOX), View(CAMERA, pixels, mask=mask)
+    evidence = evidence_of(prior_of(model), [view], None, loss=LINEAR, loss_scale=1.0)
+    pose = np.append(truth.rotation.ravel(), truth.translation)[None]
+    still = np.zeros_like(evidence.shape.mean)
+    start = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)
+    start.poses[0, 9:] *= 1.03
+    masked = Masked(evidence, 8, [contour_view(0, view, "mask")], RigidSurface(BOX))
+    found = settle(masked, start)
+    assert found is not None
+    descent = Descent(masked, found.noises, 4.0)
+    end = descent.at(found.place)
+    assert end is not None
+    again, _ = descent.run(end)
+    assert again is end
+    for _ in range(20):
+        step = np.zeros(6 + 3 + 3)
+        step[:9] = rng.normal(0, 1e-3, 9) * [1, 1, 1, 1, 1, 1, 0, 1, 1]
+        there = descent.at(found.place.moved(step))
+        assert there is not None
+        assert there.cost > end.cost
+
+
+def test_places_move_and_go_towards_others() -> None:
+    rng = np.random.default_rng(1)
+    pose = np.append(np.eye(3).ravel(), [0, 0, 4.0])[None]
+    still = State(pose, np.zeros(1), np.zeros(3), np.zeros(2), np.zeros((5, 3)))
+    place = Place(still, np.zeros((2, 3)))
+    step = rng.normal(0, 0.3, 6 + 1 + 3 + 6)
+    moved = place.moved(step)
+    assert np.allclose(vector_from_rotation(moved.state.poses[0, :9].reshape(3, 3)), step[:3])
+    assert np.allclose(moved.state.log_focals, step[6:7])
+    assert np.allclose(moved.own.ravel(), step[10:])
+    half, twice = place.towards(moved, 0.5), place.moved(step / 2)
+    assert np.allclose(half.state.poses, twice.state.poses)
+    assert np.allclose(half.state.log_scales, twice.state.log_scales)
+    assert np.allclose(half.own, twice.own)
+
+
+def test_directions_across_rims_are_the_rims_own() -> None:
+    """A contour of stairs beside a straight rim: its normals waver, the rim's does not."""
+    rng = np.random.default_rng(2)
+    count, slope = 40, 0.3
+    rim = np.column_stack([2.0 * np.arange(count), 2.0 * slope * np.arange(count)])
+    angles = np.arctan2(-1.0, slope) + rng.normal(0, 0.15, count)
+    normals = np.column_stack([np.cos(angles), np.sin(angles)])
+    offset = rng.normal(0, 0.3, count)
+    contour = Contour(rim - offset[:, None] * normals, normals, np.zeros(count, dtype=int))
+    found = np.ones(count, dtype=bool)
+    found[10:13] = False
+    rims = Rims(found, np.where(found, offset, 0.0), np.zeros((count, 3)), np.zeros(count, int))
+    across = across_rims(contour, rims)
+    assert np.allclose((across * normals).sum(axis=1), 1)
+    assert np.allclose(across[found] @ [1.0, slope], 0, atol=1e-9)
+    assert np.allclose(across[11], normals[11])

@@ -6,6 +6,7 @@ from cadalign.lazy import lazy_names
 
 if TYPE_CHECKING:
     from cadalign import datasets, errors, geometry, metrics, render, retrieval, shapes, solvers
+    from cadalign.batch.fits import fit_many, stream_fits
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
     from cadalign.estimation.fit import fit, fit_batch
@@ -65,6 +66,7 @@ __all__ = [
     "evaluate",
     "fit",
     "fit_batch",
+    "fit_many",
     "geometry",
     "load_mesh",
     "metrics",
@@ -73,6 +75,7 @@ __all__ = [
     "shapes",
     "simulate",
     "solvers",
+    "stream_fits",
     "to_dataframe",
     "views_from",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, make_dataclass, replace
+from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -12,8 +12,9 @@ from cadalign.cli.options import named_as_flags
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
-from cadalign.io.evidence import ImageEvidence, as_arguments, evidence_fields
+from cadalign.io.evidence import Size, evidence_fields
 from cadalign.io.observation import Observation
+from cadalign.io.observation_changes import ObservationChanges
 from cadalign.io.observation_file import SizeFields, read_size
 
 
@@ -31,13 +32,14 @@ class CameraOptions:
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera of --camera; ``size`` is the photo's, for a file of a matrix alone."""
-        if self.camera is not None:
-            from cadalign.io.camera_file import read_camera
+        return self.of_camera.read_camera(size)
 
-            return read_camera(self.camera, size=size, pixel_origin=self.pixel_origin)
-        if self.pixel_origin is not None:
+    @property
+    def of_camera(self) -> ObservationChanges:
+        """The camera as what takes the place of an observation's."""
+        if self.camera is None and self.pixel_origin is not None:
             raise InputError("given without --camera", where="--pixel-origin", fix="give both")
-        return None
+        return ObservationChanges(self.camera, self.pixel_origin)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,11 +78,15 @@ class EvidenceOptions:
 
         ``others`` are further fields.
         """
-        if given := others | self.given:
-            with named_as_flags(self):
-                evidence = ImageEvidence(**as_arguments(observation.evidence.given | given))
-                observation = replace(observation, evidence=evidence)
+        with named_as_flags(self):
+            evidence = others | self.given
+            return ObservationChanges(evidence=evidence, size=self.known_size).applied_to(
+                observation
+            )
+
+    @property
+    def known_size(self) -> Size | None:
+        """The known lengths."""
         if self.size is None:
-            return observation
-        size = read_size(convert(self.size, SizeFields, where="--size"))
-        return replace(observation, size=size)
+            return None
+        return read_size(convert(self.size, SizeFields, where="--size"))

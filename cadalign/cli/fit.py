@@ -4,32 +4,29 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from cadalign.batch.kinds import is_of_many
+from cadalign.batch.options import DetectorOptions
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
 from cadalign.cli.fit_options import EstimateOptions
 from cadalign.cli.options import UsageError, make_folder, named_as_flags, say, waiting
 from cadalign.errors import InputError
-from cadalign.io.documents import in_file, read_json
+from cadalign.estimation.observation_fit import refuse_photo
+from cadalign.io.documents import read_json
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
-    from cadalign.estimation.model import Model
-    from cadalign.estimation.options import FitOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
     from cadalign.io.observation import Observation
+    from cadalign.io.observation_changes import ObservationChanges
     from cadalign.render import OverlayStyle
     from cadalign.render.drawing.color import ByteImage
-    from cadalign.shapes.model import ShapeModel
-
-_PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,14 +157,15 @@ def draw(
 
 
 @dataclass(frozen=True)
-class Fit(EstimateOptions, CameraOptions, EvidenceOptions):
+class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
     """Align a model to what an observation file holds, and draw the result.
 
     Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
     known lengths. Prints the alignment and, where there is more than keypoints of one image, the
     deviations without each piece of evidence. Writes fit.json and overlay.png, overlay_1.png and so
-    on for further views. Of several files, or a folder of them, a folder each, results.csv, and
-    index.html with all pictures.
+    on for further views. Many observations are a run, which goes on where it was killed: it writes
+    results.parquet and results.csv with a row for each, and report.html. Exit codes of a run: 0 all
+    are aligned, 3 some failed, 1 all failed or refused, 2 a wrong command line.
     """
 
     observations: Annotated[
@@ -175,14 +173,24 @@ class Fit(EstimateOptions, CameraOptions, EvidenceOptions):
         tyro.conf.Positional,
         tyro.conf.arg(metavar="OBSERVATION ...", help_behavior_hint="(required)"),
     ]
-    """JSON files with camera and keypoints, optionally image, model and further evidence; or a
-    folder of such files."""
+    """A JSON file with camera and keypoints, optionally image, model and further evidence. Or many:
+    several such files, folders, patterns in quotes, JSON lines (.jsonl), or a detector's file of
+    keypoints (COCO's JSON, or CSV) with --camera and --model or --shape."""
+    _: KW_ONLY
+    out: Path | None = None
+    """Folder to write to; by default <observation>_fit beside the file or folder."""
     picture: bool = True
-    """Draw box and keypoints over each photo, as overlay.png; of several files, on one page."""
+    """Draw box and keypoints over the photo, as overlay.png; of many observations, write a page."""
+    workers: int | None = None
+    """Processes for many observations; -1 for one for each core, 0 for none. By default -1, for few
+    observations 0."""
+    dask: str | None = None
+    """Address of a Dask scheduler, whose workers are used instead."""
+    pictures: int = 100
+    """Of many observations, the number of those whose photos the page shows, the first ones."""
     overlay: Path | None = None
     """Draw the aligned model over the photo, too, and write it to this picture; further views to
-    FILE_1 and so on. The observation names the model. Of several observations, to a picture of this
-    name in the folder of each."""
+    FILE_1 and so on. The observation names the model."""
     overlay_mode: Literal["shaded", "translucent", "lines", "box"] = "shaded"
     """Style of drawing: in its own colours, as a red veil, its outline and creases, or its box."""
     overlay_opacity: float = 0.6
@@ -194,18 +202,14 @@ class Fit(EstimateOptions, CameraOptions, EvidenceOptions):
             fix = "give a JSON file with camera and keypoints, or a folder of such files"
             raise UsageError("no observation is given", where="OBSERVATION", fix=fix)
         path = self.observations[0]
-        if len(self.observations) > 1 or path.is_dir():
+        refuse_photo(path)
+        is_read = len(self.observations) == 1 and path.suffix.lower() == ".json" and path.is_file()
+        data = read_json(path) if is_read else None
+        if len(self.observations) > 1 or is_of_many(path, data):
             from cadalign.cli.fit_many import fit_many
 
-            return fit_many(
-                self.observations,
-                lambda path, data: self._fit_file(path, nullcontext(), data),
-                out=self.out,
-                picture=self.picture,
-                overlay=self.overlay,
-                json=self.json,
-            )
-        fitted = self._fit_file(path, waiting("fitting"))
+            return fit_many(self)
+        fitted = self._fit_file(path, data)
         paths = fitted.write(self.out or path.with_name(f"{path.stem}_fit"), overlay=self.overlay)
         if self.json:
             sys.stdout.write(fitted.text)
@@ -216,151 +220,34 @@ class Fit(EstimateOptions, CameraOptions, EvidenceOptions):
             say(f"{'Picture' if len(paths) == 1 else 'Pictures'}: {listed}")
         return 0
 
-    def _fit_file(
-        self, path: Path, status: AbstractContextManager[Any], data: Any = None
-    ) -> FittedFile:
-        """Fit what a file holds, which is parsed already if ``data`` is given.
+    @property
+    def changes(self) -> ObservationChanges:
+        """What the options put in the place of an observation's own."""
+        return replace(self.of_camera, evidence=self.given, size=self.known_size)
 
-        ``status`` is entered while an alignment by `cadalign.align` is computed.
-        """
-        observation = self._load(path, data)
-        is_learned = self.shape_of(observation) is not None
-        style = None
-        if self.overlay is not None:
-            style = overlay_style(
-                path,
-                mode=self.overlay_mode,
-                opacity=self.overlay_opacity,
-                has_model=is_learned or observation.model is not None,
-            )
-        views = None
-        if observation.is_plain and not is_learned and self.shape_sigma_of(observation) is None:
-            result = self._fit(observation, path)
-            found = FittedFile(result, result.to_dict(), "")
-        else:
+    def _fit_file(self, path: Path, data: Any) -> FittedFile:
+        """Fit what a file holds; ``data`` is its parsed content, if it was read already."""
+        with named_as_flags(self, self.fitting, self.ransac):
+            data = read_json(path) if data is None else data
+            observation = self.read(data, str(path), folder=path.parent, changes=self.changes)
+            style = None
+            if self.overlay is not None:
+                style = overlay_style(
+                    path,
+                    mode=self.overlay_mode,
+                    opacity=self.overlay_opacity,
+                    has_model=self.shape_of(observation) is not None
+                    or observation.model is not None,
+                )
+            status = waiting("fitting")
+            result, views = self.fit(observation, str(path), note=say, status=status)
+        found = FittedFile(result, result.to_dict(), "")
+        if views is not None:
             from cadalign.cli.contributions import list_contributions, tabulate_contributions
 
-            result, views = self._align(observation, path, status)
-            data = result.to_dict() | list_contributions(result)
+            data = found.data | list_contributions(result)
             found = FittedFile(result, data, tabulate_contributions(result))
         pictures, overlays = draw(
             observation, result, views=views, picture=self.picture, style=style
         )
         return replace(found, pictures=pictures, overlays=overlays)
-
-    def _load(self, path: Path, data: Any) -> Observation:
-        """Read a file; camera and evidence of the options take the place of its own."""
-        from cadalign.io.observation import Observation
-        from cadalign.io.observation_file import fill_xyz
-
-        _refuse_photo(path)
-        if data is None:
-            data = read_json(path)
-        has_shape = isinstance(data, dict) and data.get("shape") is not None
-        if self.shape is not None or (has_shape and self.takes_stored_shape):
-            data = fill_xyz(data)
-        with in_file(path):
-            observation = Observation.from_dict(data, folder=path.parent)
-        previous = observation.camera
-        camera = self.read_camera((previous.width, previous.height))
-        changed = self.add_to(
-            observation if camera is None else replace(observation, camera=camera)
-        )
-        if observation.others and changed is not observation:
-            raise InputError(
-                f"the file has {len(observation.views)} views, the options are for one",
-                where=str(path),
-                fix="write camera, masks and other evidence into its `views`",
-            )
-        return changed
-
-    def _fit(self, observation: Observation, path: Path) -> Result:
-        """Fit the stretched model to keypoints of one image."""
-        from cadalign.estimation.fit import fit
-
-        options = self.options_for(observation, path)
-        with named_as_flags(self, options):
-            return fit(
-                observation.points_3d,
-                observation.points_2d,
-                observation.camera,
-                **vars(options),
-                ransac=self.ransac if self.robust else None,
-                confidences=observation.confidences if self.robust else None,
-                symmetry=observation.symmetry,
-            )
-
-    def _align(
-        self, observation: Observation, path: Path, status: AbstractContextManager[Any]
-    ) -> tuple[Result, tuple[View, ...]]:
-        """Align any model to all evidence; returns the views of it, too."""
-        from cadalign.estimation.align import align
-        from cadalign.estimation.observed import views_of
-
-        self.check_for(observation)
-        options = self.options_for(observation, path)
-        model = self._model(observation, path, options)
-        stated = self.stated_sigma(observation)
-        with in_file(path):
-            views = views_of(observation, model, sigma=stated.get("sigma"))
-            size = observation.size
-        if "sigma" in stated and stated["sigma"] is None:
-            views = tuple(replace(view, sigma=None) for view in views)
-        with status, self._located(path):
-            result = align(
-                model,
-                views,
-                size=size,
-                init=observation.init,
-                loss=options.loss,
-                loss_scale=options.loss_scale,
-                ransac=self.ransac if self.robust else None,
-                focal=options.focal,
-                focal_prior=options.focal_prior,
-            )
-        return result, views
-
-    def _model(
-        self, observation: Observation, path: Path, options: FitOptions
-    ) -> Model | ShapeModel:
-        shape = self.shape_of(observation)
-        if shape is not None:
-            from cadalign.shapes.model import ShapeModel
-
-            if observation.symmetry is not None:
-                raise InputError(
-                    "has no effect together with a learned shape",
-                    where=f"{path}: symmetry",
-                    fix="leave out one of the two",
-                )
-            return ShapeModel.open(shape)
-        from cadalign.estimation.observed import model_of
-        from cadalign.io.meshes.load import load_mesh
-
-        mesh = None if observation.model is None else load_mesh(observation.model)
-        sigma = self.shape_sigma_of(observation)
-        with self._located(path):
-            return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
-
-    @contextmanager
-    def _located(self, path: Path) -> Iterator[None]:
-        """Let errors about arguments name the command line's option, or else the file."""
-        try:
-            with named_as_flags(self, self.ransac):
-                yield
-        except InputError as error:
-            if str(error.where).startswith("--"):
-                raise
-            with in_file(path):
-                raise
-
-
-def _refuse_photo(path: Path) -> None:
-    """Refuse an image in the place of an observation, and say what makes one."""
-    if path.suffix.lower() in _PHOTOS:
-        raise InputError(
-            "a photo, not an observation, which is a JSON file with camera and keypoints",
-            where=str(path),
-            fix=f"mark keypoints with `cadalign annotate {path.name} MODEL`, which writes one, or "
-            "use a detector's with `cadalign observe`",
-        )

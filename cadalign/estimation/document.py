@@ -180,7 +180,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "camera": result.camera.to_dict(),
         "rms": result.rms,
         "stretch": result.stretch.tolist(),
-        "std": None if std is None else asdict(std),
+        "std": None if std is None else {**vars(std)},
         "warnings": list(result.warnings),
         "ids": list(result.ids),
         "points_3d": result.points_3d.tolist(),
@@ -191,7 +191,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "points_covariance": _plain(statistics.points_covariance),
         "points_cam_covariance": _plain(statistics.points_cam_covariance),
         "degrees_of_freedom": result.degrees_of_freedom,
-        "focal_prior": None if result.focal_prior is None else asdict(result.focal_prior),
+        "focal_prior": result.focal_prior and asdict(result.focal_prior),
         "alternatives": [
             {
                 "alignment": other.alignment.to_dict(),
@@ -202,14 +202,14 @@ def write_result(result: ResultData) -> dict[str, Any]:
             }
             for other in result.alternatives
         ],
-        "evidence": [asdict(summary) for summary in result.evidence],
+        "evidence": [{**vars(summary)} for summary in result.evidence],
         "misfit": None if misfit is None else misfit.to_dict(),
         "options": None if result.options is None else _plain_options(result.options),
         "symmetry": None if result.symmetry is None else result.symmetry.to_dict(),
         "equal_under_symmetry": result.equal_under_symmetry,
         "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
         "mask_residuals": [each and _written_mask(each) for each in result.mask_residuals],
-        "stats": asdict(result.stats),
+        "stats": {**vars(result.stats)},
     }
 
 
@@ -242,7 +242,8 @@ def _plain(value: Any) -> Any:
 def _plain_options(options: FitOptions) -> dict[str, Any]:
     sigma = options.sigma
     plain = sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
-    return {**asdict(replace(options, sigma=None)), "sigma": plain}
+    prior = options.focal_prior
+    return {**vars(options), "sigma": plain, "focal_prior": prior and asdict(prior)}
 
 
 def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -61,6 +63,9 @@ class Results(Sequence[Result | CadalignError]):
         Makes the result of one problem that has a solution.
     is_single : bool
         Each of the results has one view.
+    stated_covariance : (B, 9, 9) or (B, 10, 10) float, optional
+        Stated covariances where they are known, as those of a run that was opened, whose
+        ``fisher_covariance`` only single results have.
     """
 
     rotation: FloatArray
@@ -75,6 +80,7 @@ class Results(Sequence[Result | CadalignError]):
     errors: Mapping[int, CadalignError]
     single: Callable[[int], Result]
     is_single: bool = True
+    stated_covariance: FloatArray | None = None
     _made: dict[int, Result] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -105,7 +111,7 @@ class Results(Sequence[Result | CadalignError]):
     def covariance(self) -> FloatArray | None:
         """Stated covariances (B, 9, 9) or (B, 10, 10), computed now; see `Result.covariance`."""
         if self.fisher_covariance is None:
-            return None
+            return self.stated_covariance
         stated = np.full(self.fisher_covariance.shape, np.nan)
         for k, result in enumerate(self):
             if k not in self.errors and result.covariance is not None:  # type: ignore[union-attr]
@@ -185,6 +191,40 @@ class Results(Sequence[Result | CadalignError]):
                 rows += [(k, v, replace(result, views=(view,))) for v, view in numbered]
         table = Results.of([each for _, _, each in rows])
         return table, [k for k, _, _ in rows], [v for _, v, _ in rows]
+
+    @classmethod
+    def open(cls, folder: str | os.PathLike[str], *, in_memory: bool = False) -> Results:
+        """Read the results of a run of `cadalign fit` or `cadalign.fit_many`.
+
+        Parameters
+        ----------
+        folder : str or path-like
+            The run's folder.
+        in_memory : bool
+            Read single results at once, not when they are asked for: for a folder that goes away.
+
+        Returns
+        -------
+        Results
+            In the order of the observations.
+
+        Raises
+        ------
+        DataError
+            If it is not the folder of a finished run, or a file in it cannot be read.
+
+        Examples
+        --------
+        >>> results = Results.open("runs/fit")  # doctest: +SKIP
+        >>> results[0].alignment, results.to_dataframe()  # doctest: +SKIP
+        """
+        from cadalign.estimation.results_file import RECORDS, StoredResults, read_arrays
+
+        path = Path(folder)
+        arrays, stored = read_arrays(path), StoredResults.open(path / RECORDS)
+        if in_memory:
+            stored.load()
+        return cls(**arrays, single=stored.single)
 
     @classmethod
     def of(

@@ -208,7 +208,4 @@ def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
 
 def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
     """The quaternion (4,) of a rotation matrix (3, 3), scalar first and not negative."""
-    from scipy.spatial.transform import Rotation  # too slow to load with `import cadalign`
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return np.array([w, x, y, z])
+    return np.array(_quaternion(np.asarray(rotation)))

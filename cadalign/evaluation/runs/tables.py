@@ -15,13 +15,20 @@ from cadalign.io.files import write_whole
 
 Row = dict[str, Any]
 """Cells of a table by column; what is missing or None is an empty cell."""
-Columns = tuple[tuple[str, type], ...]
-"""Names of a table's columns and their types: str, int, float or bool."""
+Columns = tuple[tuple[str, Any], ...]
+"""Names of a table's columns and their types: str, int, float, bool, list[float] or list[bool]."""
 
 DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
 # A table's row groups must not show in which pieces its rows came.
 ROW_GROUP = 1 << 14
-_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+_TYPES = {
+    str: pa.string(),
+    int: pa.int64(),
+    float: pa.float64(),
+    bool: pa.bool_(),
+    list[float]: pa.list_(pa.float64()),
+    list[bool]: pa.list_(pa.bool_()),
+}
 
 
 def schema_of(columns: Columns) -> pa.Schema:

@@ -1,0 +1,13 @@
+"""Many observations aligned as a run: what goes in, the table that comes out, its exports."""
+
+from typing import TYPE_CHECKING
+
+from cadalign.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from cadalign.batch.fits import fit_many, run_fits, stream_fits
+    from cadalign.batch.options import DetectorOptions, FitRunOptions
+
+__all__ = ["DetectorOptions", "FitRunOptions", "fit_many", "run_fits", "stream_fits"]
+
+__getattr__ = lazy_names(__name__)

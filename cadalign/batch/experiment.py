@@ -1,0 +1,221 @@
+"""Alignment of many observations, as the engine of runs sees it: observations become rows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from cadalign.batch.options import FitRunOptions
+from cadalign.batch.sources import ObservationTask, read_sources
+from cadalign.batch.table import (
+    COLUMNS,
+    RECORD_COLUMNS,
+    TIMING_COLUMNS,
+    naming_row,
+    result_row,
+)
+from cadalign.datasets.detections.image_keypoints import ImageKeypoints, join_keypoints
+from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.estimation.result import Result
+from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import Plan, Rows
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import in_file, parse_json
+from cadalign.io.files import read_text
+from cadalign.io.images import photo_size
+from cadalign.io.observation import Observation
+from cadalign.shapes.model import ShapeModel
+
+_LARGEST_CHUNK = 256
+_LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
+# Several times as fast as the standard library's; numbers that are not finite become null.
+_ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
+
+
+@dataclass(frozen=True)
+class ManyFits:
+    """Alignments of observations; see `cadalign.evaluation.runs.work.Experiment`.
+
+    Parameters
+    ----------
+    options : FitRunOptions
+    model : ModelKeypoints, optional
+        That keypoints of detectors are paired with.
+    folder : RunFolder, optional
+        The folder that pictures go to; none are drawn without.
+    """
+
+    options: FitRunOptions
+    model: ModelKeypoints | None = None
+    folder: RunFolder | None = field(default=None, repr=False)
+
+    columns = COLUMNS
+    timing_columns = TIMING_COLUMNS
+    record_columns = RECORD_COLUMNS
+
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
+        camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+        seen = Observation(points, camera.project(points + [0.0, 0.0, 2.0]), camera)
+        estimate = replace(self.options.estimate, shape=None)
+        result_row(estimate.fit(seen, "warm-up")[0])
+
+    def evaluate(self, tasks: Sequence[ObservationTask]) -> Rows:
+        """The rows of some observations."""
+        return Rows.joined([self._evaluate(task) for task in tasks])
+
+    def failure(self, task: ObservationTask, reason: str) -> Rows:
+        """The rows of an observation whose worker died, or that raised what nobody foresaw."""
+        return _failed(task, reason, None)
+
+    def _evaluate(self, task: ObservationTask) -> Rows:
+        start, seen = time.perf_counter(), None
+        try:
+            seen = self.observation(task)
+            result, _ = self.options.estimate.fit(seen, task.name)
+        except CadalignError as error:
+            return _failed(task, str(error), seen)
+        row = naming_row(task.row, task.name, seen) | result_row(result)
+        if self.folder is not None and task.row < self.options.pictures:
+            from cadalign.batch.pictures import draw_fit
+
+            draw_fit(self.folder, row, seen, result)
+        timing = {"row": task.row, "seconds": time.perf_counter() - start}
+        return Rows([row], [timing], [_record(task.row, seen, result)])
+
+    def observation(self, task: ObservationTask) -> Observation:
+        """The observation of a task.
+
+        Raises
+        ------
+        CadalignError
+            If it cannot be read.
+        """
+        options = self.options
+        if isinstance(task.content, ImageKeypoints):
+            return self._detected(task.content, Path(task.folder))
+        if task.content is None:
+            data = parse_json(read_text(Path(task.name)), task.name)
+        else:
+            data = _parsed(task.content, task.name)
+        return options.estimate.read(
+            data, task.name, folder=Path(task.folder), changes=options.changes
+        )
+
+    def _detected(self, found: ImageKeypoints, folder: Path) -> Observation:
+        """A detector's keypoints paired with the model's."""
+        detector, changes = self.options.detector, self.options.changes
+        assert self.model is not None
+        photo = _photo(found, detector.images or folder)
+        size = found.size or (None if photo is None else photo_size(photo))
+        with in_file(found.source):
+            camera = changes.read_camera(size)
+            if camera is None and size is None:
+                fix = "give --camera, or the folder of the photos (--images)"
+                raise InputError("neither camera nor photo is known", where="camera", fix=fix)
+        joined = join_keypoints(
+            found,
+            self.model,
+            camera or Camera.without_focal(*size),  # type: ignore[misc]
+            image=photo,
+            min_score=detector.min_score,
+            ignore_unknown=detector.ignore_unknown,
+        )
+        with in_file(found.source):
+            return replace(changes, camera=None).applied_to(joined)
+
+
+def plan_fits(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:
+    """Plan the alignment of the observations of all inputs.
+
+    Raises
+    ------
+    CadalignError
+        If an input cannot be read, or what a detector's file needs is missing.
+    """
+    tasks = read_sources(options.inputs)
+    model = _model_keypoints(options) if tasks.has_detections else None
+    shape = options.estimate.shape
+    config = {
+        **options.as_config(),
+        "experiment": options.experiment,
+        "contents": tasks.fingerprint(),
+        "shapes": None if shape is None else ShapeModel.open(shape).category,
+    }
+    drawn_in = folder.made_for_pictures() if options.pictures else None
+    chunk = max(1, min(_LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
+    return Plan(ManyFits(options, model, drawn_in), tasks, config, chunk)
+
+
+def _model_keypoints(options: FitRunOptions) -> ModelKeypoints:
+    """The keypoints that a detector's are paired with: the model's, or else the shape's."""
+    if options.detector.model is not None:
+        return ModelKeypoints.load(options.detector.model)
+    shape = options.estimate.shape
+    if shape is None:
+        raise InputError(
+            "the keypoints of the model are not known",
+            where="model",
+            fix="give the model's NAME.keypoints.json, or a learned shape",
+        )
+    opened = ShapeModel.open(shape)
+    named = isinstance(opened.ids[0], str)
+    return ModelKeypoints(
+        tuple(
+            ModelKeypoint(str(each), tuple(xyz), None if named else int(each))
+            for each, xyz in zip(opened.ids, opened.components[0].mean.tolist(), strict=False)
+        )
+    )
+
+
+def _photo(found: ImageKeypoints, folder: Path) -> Path | None:
+    """The photo of an object, if it is there."""
+    if found.image is None:
+        return None
+    path = folder / Path(found.image).name
+    return path if _exists(path) else None
+
+
+@lru_cache(maxsize=1024)
+def _exists(path: Path) -> bool:
+    return path.is_file()
+
+
+def _parsed(content: bytes, name: str) -> Any:
+    """The JSON of a line; the slow parser says what is wrong with it."""
+    try:
+        return msgspec.json.decode(content)
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+        try:
+            return parse_json(content.decode(), name)
+        except UnicodeError as error:
+            raise DataError(f"not valid JSON: {error}", where=name) from None
+
+
+def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Rows:
+    row = naming_row(task.row, task.name, seen)
+    row |= {"status": FAILED, "reason": reason, "method": "", "warnings": ""}
+    return Rows([row], [{"row": task.row}], [_record(task.row, seen, None)])
+
+
+def _record(row: int, seen: Observation | None, result: Result | None) -> Row:
+    """Observation and result as JSON; of the result without its time, on which no two runs agree."""
+    record = {"row": row, "observation": "", "result": ""}
+    if seen is not None:
+        record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()
+    if result is not None:
+        data = result.to_dict()
+        data["stats"]["seconds"] = 0.0
+        record["result"] = _ENCODER.encode(data).decode()
+    return record

@@ -1,0 +1,268 @@
+"""`fit_many` and `stream_fits`: many observations aligned, as a run or as they come."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, fields, replace
+from itertools import count, islice
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pyarrow.compute as pc
+
+from cadalign.batch.experiment import ManyFits, plan_fits
+from cadalign.batch.options import DetectorOptions, FitRunOptions
+from cadalign.batch.sources import ObservationTask
+from cadalign.batch.table import write_csv
+from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.estimation.observation_fit import ObservationFit
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.result import Result
+from cadalign.estimation.results import Results
+from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.parallel import Chunk
+from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
+from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
+from cadalign.io.files import write_whole
+from cadalign.io.observation import Observation
+from cadalign.io.observation_changes import ObservationChanges
+
+_FEW = 200  # observations, which are aligned sooner than processes start
+_STREAMED = 16  # observations that a worker gets at a time
+_SPOOL = "observations.jsonl"
+
+Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Numbers of observations of a finished run and of failures, these by reason."""
+
+    total: int
+    failed: int
+    reasons: tuple[tuple[str, int], ...]
+
+
+def fit_many(
+    observations: Observed,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    dask: str | None = None,
+    pictures: int = 0,
+    on_progress: OnProgress = lambda progress: None,
+    **options: Any,
+) -> Results:
+    """Align many observations, as a run that goes on where it was killed.
+
+    Parameters
+    ----------
+    observations : path, or iterable of path or of Observation
+        Observation files, folders and patterns of such, JSON lines, and detectors' files (COCO's
+        JSON or CSV); or observations, for example of a generator, which are first written to
+        ``observations.jsonl`` in the run's folder.
+    out : path-like, optional
+        The run's folder: ``results.parquet`` and ``results.csv`` (`cadalign.batch.table` names the
+        columns), and what `Results.open` needs. Started again with the same arguments, a run that
+        was killed goes on, and a finished one is read. Without it nothing is kept.
+    workers : int, optional
+        Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
+    dask : str, optional
+        Address of a Dask scheduler, whose workers are used instead.
+    pictures : int
+        Number of observations whose photos are kept for `cadalign.report.write_report`, the first
+        ones.
+    on_progress : callable
+        Is told of every chunk that is done.
+    **options
+        Fields of `cadalign.estimation.observation_fit.ObservationFit`, such as ``similar``,
+        ``robust``, ``shape``; of `FitOptions`, such as ``method``, ``loss``, ``stretch``; of
+        `cadalign.batch.DetectorOptions`, such as ``model``, ``images``; and ``camera``, the file of
+        a camera for all. What an observation stores holds where an option is at its default.
+
+    Returns
+    -------
+    Results
+        In the order of the observations; the error takes the place of a result that there is not.
+
+    Raises
+    ------
+    InputError
+        If an option is invalid or not known.
+    DataError
+        If an input cannot be read, or the folder holds another run or cannot be written to.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from cadalign import Camera, Observation
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> seen = (
+    ...     Observation(corners, camera.project(corners + [0.1, 0.2, depth]), camera)
+    ...     for depth in (5.0, 6.0)
+    ... )
+    >>> results = fit_many(seen, method="aepnp")
+    >>> results.translation[:, 2].round(3).tolist()
+    [5.0, 6.0]
+    """
+    with ExitStack() as stack:
+        is_kept = out is not None
+        if out is None:
+            out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
+        folder = RunFolder(Path(out))
+        chosen = replace(options_of(options), inputs=_inputs(observations, folder))
+        chosen = replace(chosen, pictures=pictures)
+        run_fits(chosen, folder, workers=workers, dask=dask, on_progress=on_progress)
+        return Results.open(folder.path, in_memory=not is_kept)
+
+
+def stream_fits(
+    observations: Iterable[Observation],
+    *,
+    workers: int = 0,
+    dask: str | None = None,
+    **options: Any,
+) -> Iterator[tuple[int, Result | CadalignError]]:
+    """Align observations as they come, without a folder; results arrive as they finish.
+
+    Parameters
+    ----------
+    observations : iterable of Observation
+        May be endless: only as many are asked for as workers are busy with.
+    workers, dask, **options
+        As for `fit_many`.
+
+    Yields
+    ------
+    int
+        Number of the observation, from 0; with workers they come in any order.
+    Result or CadalignError
+        Its result, or the reason why there is none.
+
+    Examples
+    --------
+    >>> for number, found in stream_fits(camera_feed(), similar=True):  # doctest: +SKIP
+    ...     print(number, found.alignment.translation)
+    """
+    experiment = ManyFits(options_of(options))
+    pool = workers_of(workers, dask)
+    size = 1 if not workers and dask is None else _STREAMED
+    for _, rows in pool.evaluate(experiment, _chunks(observations, size)):
+        for row, record in zip(rows.rows, rows.records, strict=True):
+            if row["status"] == OK:
+                yield row["row"], Result.from_json(record["result"])
+            else:
+                yield row["row"], DataError(row["reason"])
+
+
+def run_fits(
+    options: FitRunOptions,
+    folder: RunFolder,
+    *,
+    workers: int | None,
+    dask: str | None,
+    on_progress: OnProgress = lambda progress: None,
+) -> Tally:
+    """Do the run that the options describe, or what is left of it; see `fit_many`."""
+    plan = plan_fits(options, folder)
+    if workers is None:
+        workers = 0 if len(plan.tasks) < _FEW else -1
+    execute(plan, folder, workers=workers_of(workers, dask), on_progress=on_progress)
+    write_csv(folder)
+    return _tally(folder)
+
+
+def options_of(given: dict[str, Any]) -> FitRunOptions:
+    """The options of a run by their names, without inputs; see `fit_many`.
+
+    Raises
+    ------
+    InputError
+        If a name is not known.
+    """
+    kinds: tuple[Any, ...] = (ObservationFit, FitOptions, DetectorOptions, ObservationChanges)
+    parts: dict[Any, dict[str, Any]] = {kind: {} for kind in kinds}
+    for name, value in given.items():
+        owner = next((k for k in kinds if name in {field.name for field in fields(k)}), None)
+        if owner is None or name == "fitting":
+            known = dict.fromkeys(field.name for kind in kinds for field in fields(kind))
+            listed = ", ".join(each for each in known if each != "fitting")
+            raise InputError("not a known option", where=name, fix=f"known are {listed}")
+        is_path = name in ("shape", "model", "images", "camera") and value is not None
+        parts[owner][name] = Path(value) if is_path else value
+    if parts[ObservationFit].get("ransac") is not None:
+        parts[ObservationFit].setdefault("robust", True)
+    return FitRunOptions(
+        inputs=(),
+        estimate=ObservationFit(**parts[ObservationFit], fitting=FitOptions(**parts[FitOptions])),
+        changes=ObservationChanges(**parts[ObservationChanges]),
+        detector=DetectorOptions(**parts[DetectorOptions]),
+    )
+
+
+def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
+    """The inputs of a run; observations are written to a file of its folder."""
+    if isinstance(observations, str | os.PathLike):
+        return (Path(observations),)
+    source = iter(observations)
+    first = next(source, None)
+    if first is None:
+        raise InputError("there are none", where="observations")
+    if not isinstance(first, Observation):
+        return (Path(first), *(Path(each) for each in source))  # type: ignore[arg-type]
+    folder.make()
+    path = folder.path / _SPOOL
+    with folder.locked():
+        write_whole(path, lambda unfinished: _write_lines(unfinished, first, source))
+    return (path,)
+
+
+def _write_lines(path: Path, first: Observation, others: Iterator[Any]) -> None:
+    with path.open("wb") as file:
+        file.write(_line(first))
+        for number, each in enumerate(others, start=1):
+            if not isinstance(each, Observation):
+                what = f"expected a cadalign.Observation, got {type(each).__name__}"
+                raise InputError(what, where=f"observations[{number}]")
+            file.write(_line(each))
+
+
+def _line(observation: Observation) -> bytes:
+    data = observation.to_dict(states_origins=True)
+    return msgspec.json.encode(data) + b"\n"
+
+
+def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[ObservationTask]]:
+    """Observations as tasks, so many at a time."""
+    source = iter(observations)
+    rows = count()
+    for index in count():
+        some = list(islice(source, size))
+        if not some:
+            return
+        yield Chunk(
+            index,
+            [
+                ObservationTask(row, f"observation {row}", _line(each), os.getcwd())
+                for each, row in zip(some, rows, strict=False)  # takes no row for nothing
+            ],
+        )
+
+
+def _tally(folder: RunFolder) -> Tally:
+    """Count the failures of a finished run."""
+    counts: Counter[str] = Counter()
+    total = 0
+    for table in read_groups(folder.results, fix=DONE_ANEW):
+        total += len(table)
+        failed = table.filter(pc.not_equal(table["status"], OK))
+        for row in failed.select(["source", "reason"]).to_pylist():
+            counts[row["reason"].removeprefix(row["source"]).lstrip(": ,")] += 1
+    return Tally(total, counts.total(), tuple(counts.most_common()))

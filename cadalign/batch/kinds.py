@@ -1,0 +1,38 @@
+"""Kinds of inputs: one observation, or many.
+
+A module that loads quickly: the command for a single observation asks it, too.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+LINES = (".jsonl", ".ndjson")
+"""Endings of files with an observation in every line."""
+TABLE = ".csv"
+OBSERVATION, DETECTOR, OTHER = "observation", "detector", "other"
+_WILD = frozenset("*?[")
+
+
+def is_of_many(path: Path, data: object = None) -> bool:
+    """True for an input that may hold many observations; ``data`` is the content of a JSON file."""
+    if path.is_dir() or path.suffix.lower() in (*LINES, TABLE):
+        return True
+    return kind_of(data) == DETECTOR or is_pattern(path)
+
+
+def is_pattern(path: Path) -> bool:
+    """True for what matches files, and is none."""
+    return not _WILD.isdisjoint(str(path)) and not path.exists()
+
+
+def kind_of(data: object) -> str:
+    """What the content of a JSON file is meant as."""
+    if isinstance(data, list):
+        return DETECTOR
+    if not isinstance(data, dict):
+        return OTHER
+    if {"annotations", "instance_info"} & set(data):
+        return DETECTOR
+    is_meant = "views" in data or ("keypoints" in data and "format" not in data)
+    return OBSERVATION if is_meant else OTHER

@@ -1,0 +1,276 @@
+"""Inputs of a run over many observations, as tasks of which memory holds few at a time.
+
+An input is an observation file, a folder or a pattern of such files, JSON lines (an observation in
+every line, ``.jsonl`` or ``.ndjson``), or a detector's file of keypoints
+(`cadalign.datasets.read_image_keypoints`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from bisect import bisect_right
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from glob import glob
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+import numpy as np
+
+from cadalign.arrays import IntArray
+from cadalign.batch.kinds import DETECTOR, LINES, OBSERVATION, TABLE, is_pattern, kind_of
+from cadalign.datasets.detections.image_keypoints import ImageKeypoints
+from cadalign.datasets.detections.keypoint_files import read_image_keypoints
+from cadalign.errors import DataError
+from cadalign.estimation.observation_fit import refuse_photo
+from cadalign.io.files import open_input, read_bytes
+
+_DAMAGED = "damaged"
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationTask:
+    """One observation of a run.
+
+    Parameters
+    ----------
+    row : int
+        Its number in the run.
+    name : str
+        Its file, with the line or the object where the file holds several.
+    content : bytes or ImageKeypoints, optional
+        Its JSON, or a detector's keypoints; None to read the file ``name``.
+    folder : str
+        The folder that paths in it are relative to.
+    """
+
+    row: int
+    name: str
+    content: bytes | ImageKeypoints | None
+    folder: str
+
+
+class Source(Protocol):
+    """Observations of one input."""
+
+    def __len__(self) -> int:
+        """Their number."""
+
+    def tasks(self, first: int, last: int) -> list[ObservationTask]:
+        """Those from ``first`` on, ``last`` left out; their rows count within the source."""
+
+    def fingerprint(self) -> str:
+        """A text that changes with the content."""
+
+
+@dataclass(frozen=True, eq=False)
+class Files:
+    """Observation files, one each."""
+
+    paths: Sequence[Path]
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def tasks(self, first: int, last: int) -> list[ObservationTask]:
+        """See `Source.tasks`."""
+        chosen = enumerate(self.paths[first:last], start=first)
+        return [ObservationTask(row, str(path), None, _folder(path)) for row, path in chosen]
+
+    def fingerprint(self) -> str:
+        """Names, sizes and times of the files: to read thousands would take as long as the run."""
+        digest = hashlib.sha256()
+        for path in self.paths:
+            try:
+                status = path.stat()
+            except (OSError, ValueError):
+                continue  # its row says so
+            digest.update(f"{path.name} {status.st_size} {status.st_mtime_ns}\n".encode())
+        return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """A file of JSON lines; ``starts`` (n + 1,) are the places of its lines, empty ones too."""
+
+    path: Path
+    starts: IntArray
+    numbers: IntArray
+    digest: str
+
+    @classmethod
+    def of(cls, path: Path) -> Lines:
+        """Find the lines of a file."""
+        digest, starts, place = hashlib.sha256(), [], 0
+        numbers: list[int] = []
+        with open_input(path) as file:
+            for number, line in enumerate(file, start=1):
+                digest.update(line)
+                if line.strip():
+                    starts.append(place)
+                    numbers.append(number)
+                place += len(line)
+        starts.append(place)
+        return cls(path, np.array(starts), np.array(numbers), digest.hexdigest()[:16])
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def tasks(self, first: int, last: int) -> list[ObservationTask]:
+        """See `Source.tasks`."""
+        with open_input(self.path) as file:
+            file.seek(int(self.starts[first]))
+            content = file.read(int(self.starts[last] - self.starts[first]))
+        lines = [line for line in content.split(b"\n") if line.strip()]
+        numbered = zip(range(first, last), self.numbers[first:last].tolist(), lines, strict=True)
+        folder = _folder(self.path)
+        return [
+            ObservationTask(row, f"{self.path}, line {number}", line, folder)
+            for row, number, line in numbered
+        ]
+
+    def fingerprint(self) -> str:
+        """See `Source.fingerprint`."""
+        return self.digest
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """A detector's file, which memory holds whole."""
+
+    path: Path
+    objects: Sequence[ImageKeypoints]
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    def tasks(self, first: int, last: int) -> list[ObservationTask]:
+        """See `Source.tasks`."""
+        chosen = enumerate(self.objects[first:last], start=first)
+        folder = _folder(self.path)
+        return [ObservationTask(row, found.source, found, folder) for row, found in chosen]
+
+    def fingerprint(self) -> str:
+        """See `Source.fingerprint`."""
+        return hashlib.sha256(read_bytes(self.path)).hexdigest()[:16]
+
+
+class Tasks(Sequence[ObservationTask]):
+    """The observations of all inputs."""
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        self._sources = sources
+        self._ends = list(accumulate(map(len, sources)))
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __getitem__(self, place: Any) -> Any:
+        if not isinstance(place, slice):
+            (task,) = self._between(range(len(self))[place], range(len(self))[place] + 1)
+            return task
+        first, last, _ = place.indices(len(self))
+        return self._between(first, last)
+
+    def _between(self, first: int, last: int) -> list[ObservationTask]:
+        found: list[ObservationTask] = []
+        index = bisect_right(self._ends, first)
+        while first < last:
+            source, end = self._sources[index], self._ends[index]
+            start, stop = end - len(source), min(last, end)
+            own = source.tasks(first - start, stop - start)
+            found += [replace(task, row=task.row + start) for task in own]
+            first, index = stop, index + 1
+        return found
+
+    @property
+    def has_detections(self) -> bool:
+        """True if a detector's file is among the inputs."""
+        return any(isinstance(source, Detections) for source in self._sources)
+
+    def fingerprint(self) -> str:
+        """A text that changes with the content of the inputs."""
+        texts = "\n".join(source.fingerprint() for source in self._sources)
+        return hashlib.sha256(texts.encode()).hexdigest()[:16]
+
+
+def read_sources(inputs: Iterable[Path]) -> Tasks:
+    """Find the observations of inputs.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be read, or an input holds no observation.
+    """
+    sources: list[Source] = []
+    for path in inputs:
+        sources += _sources_of(path)
+    return Tasks(_files_joined(sources))
+
+
+def _sources_of(path: Path) -> list[Source]:
+    if path.is_dir():
+        return _of_folder(path)
+    if is_pattern(path):
+        found = [Path(name) for name in sorted(glob(str(path), recursive=True))]
+        if not found:
+            raise DataError("no file matches", where=str(path))
+        return [source for each in found for source in _sources_of(each)]
+    return [_of_file(path)]
+
+
+def _of_folder(folder: Path) -> list[Source]:
+    """The observations of a folder, whose other JSON files are passed over."""
+    files = [path for path in sorted(folder.iterdir()) if path.is_file()]
+    lines: list[Source] = [Lines.of(path) for path in files if path.suffix.lower() in LINES]
+    single = [path for path in files if path.suffix.lower() == ".json"]
+    found = [path for path in single if _kind_of_file(path) in (OBSERVATION, _DAMAGED)]
+    if not found and not lines:
+        raise DataError(
+            "the folder holds no observation",
+            where=str(folder),
+            fix="`cadalign annotate` and `cadalign observe --every` write them",
+        )
+    return [Files(found), *lines] if found else lines
+
+
+def _of_file(path: Path) -> Source:
+    suffix = path.suffix.lower()
+    refuse_photo(path)
+    if suffix in LINES:
+        lines = Lines.of(path)
+        if not len(lines):
+            raise DataError("the file holds no observation", where=str(path))
+        return lines
+    if suffix == TABLE or _kind_of_file(path) == DETECTOR:
+        return Detections(path, read_image_keypoints(path))
+    return Files([path])
+
+
+def _folder(path: Path) -> str:
+    """The folder of a file, the same for a worker that was started elsewhere."""
+    return str(path.absolute().parent)
+
+
+def _kind_of_file(path: Path) -> str:
+    """The kind of a JSON file's content."""
+    try:
+        data = msgspec.json.decode(read_bytes(path), type=dict[str, msgspec.Raw] | list[msgspec.Raw])
+    except (DataError, msgspec.MsgspecError, UnicodeError, RecursionError):
+        return _DAMAGED
+    return kind_of(data)
+
+
+def _files_joined(sources: Sequence[Source]) -> list[Source]:
+    """The sources with neighbouring files as one: thousands may be given, or match a pattern."""
+    joined: list[Source] = []
+    paths: list[Path] = []
+    for source in sources:
+        if isinstance(source, Files):
+            paths += source.paths
+            continue
+        joined += [Files(paths)] * bool(paths) + [source]
+        paths = []
+    return joined + [Files(paths)] * bool(paths)

@@ -1,0 +1,181 @@
+"""The table of a run over many observations: ``results.parquet``, and ``results.csv`` without the
+columns that are lists.
+
+Rows are in the order of the observations. Of several views pose and camera are the first's.
+
+row, source
+    Number of the observation in the run, and its file, with the line or the object in it.
+image, object, model
+    The photo, the object's name, and the file of the CAD model or of the learned shape; empty where
+    they are not known.
+status, reason
+    ``ok``, or ``failed`` and why; a failed row has no numbers.
+method, views, keypoints, inliers
+    The method, and the numbers of views, of keypoints and of those that the alignment rests on.
+qw, qx, qy, qz
+    Rotation from the model's axes to the camera's (OpenCV's: x right, y down, z forward) as a unit
+    quaternion, qw not negative.
+tx, ty, tz
+    Translation, the place of the model's origin in the camera's frame [model units].
+scale_x, scale_y, scale_z
+    Scale along the model's axes: ``R diag(scale) x + t`` is a model point in the camera's frame.
+focal_length, sigma
+    Horizontal focal length, and standard deviation of the keypoints, given or estimated [px]; no
+    sigma where each keypoint has its own.
+rotation_std_deg, tx_std, ty_std, tz_std, scale_x_std, scale_y_std, scale_z_std, focal_length_std
+    Standard deviations: of the rotation about all axes together [degrees], of the translation
+    [model units], relative ones of the scales and of the focal length (0.02 is 2 %); 0 where it
+    is known.
+rms_px, cost
+    Root mean square length of the inliers' residuals [px], and the minimised cost.
+alternatives, warning_count, warnings
+    Number of other alignments that explain the keypoints, number of warnings, and their texts.
+component, coefficients
+    Component of a learned shape's mixture that the object belongs to, and the coefficients of its
+    modes, each of unit variance; empty without a learned shape.
+covariance
+    Covariance (9, 9), or (10, 10) with an estimated focal length, by rows; see
+    `cadalign.Result.covariance`.
+residuals, is_inlier
+    Projected minus observed keypoints, u and v in turn [px], infinite for rejected ones behind the
+    camera; and for each keypoint whether the alignment rests on it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from cadalign.arrays import FloatArray
+from cadalign.estimation.result import Result
+from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups, schema_of
+from cadalign.geometry.rotations import quat_wxyz_from_rotation
+from cadalign.io.files import write_whole
+from cadalign.io.observation import Observation
+from cadalign.shapes.model import ShapeModel
+
+_AXES = "xyz"
+_LISTS: Columns = (
+    *(("coefficients", list[float]), ("covariance", list[float])),
+    *(("residuals", list[float]), ("is_inlier", list[bool])),
+)
+COLUMNS: Columns = (
+    *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),
+    *(("status", str), ("reason", str), ("method", str)),
+    *(("views", int), ("keypoints", int), ("inliers", int)),
+    *((f"q{axis}", float) for axis in "wxyz"),
+    *((f"t{axis}", float) for axis in _AXES),
+    *((f"scale_{axis}", float) for axis in _AXES),
+    *(("focal_length", float), ("sigma", float), ("rotation_std_deg", float)),
+    *((f"t{axis}_std", float) for axis in _AXES),
+    *((f"scale_{axis}_std", float) for axis in _AXES),
+    *(("focal_length_std", float), ("rms_px", float), ("cost", float)),
+    *(("alternatives", int), ("warning_count", int), ("warnings", str), ("component", int)),
+    *_LISTS,
+)
+TIMING_COLUMNS: Columns = (("row", int), ("seconds", float))
+RECORD_COLUMNS: Columns = (("row", int), ("observation", str), ("result", str))
+"""Observation and result as JSON: all that pages, exports and `cadalign.Results.open` need."""
+
+
+def naming_row(row: int, source: str, observation: Observation | None) -> Row:
+    """The cells that name an observation, None where it cannot be read."""
+    image = model = name = ""
+    if observation is not None:
+        image = "" if observation.image is None else str(observation.image)
+        known = observation.model or observation.shape
+        model = "" if known is None else str(known)
+        name = observation.object_name or ""
+    return {"row": row, "source": source, "image": image, "object": name, "model": model}
+
+
+def result_row(result: Result) -> Row:
+    """The cells of a result."""
+    pose, std = result.alignment, result.std
+    warnings = result.warnings
+    row: Row = {
+        "status": OK,
+        "reason": "",
+        "method": result.method,
+        "views": len(result.views),
+        "keypoints": len(result.inliers),
+        "inliers": int(result.inliers.sum()),
+        "focal_length": result.camera.fx,
+        "sigma": _one_sigma(result),
+        "rms_px": result.rms,
+        "cost": result.cost,
+        "alternatives": len(result.alternatives),
+        "warning_count": len(warnings),
+        "warnings": "; ".join(warnings),
+        "residuals": result.residuals.ravel().tolist(),
+        "is_inlier": result.inliers.tolist(),
+    }
+    quaternion = quat_wxyz_from_rotation(pose.rotation)
+    row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion.tolist(), strict=True)}
+    row |= _by_axis("t{}", pose.translation) | _by_axis("scale_{}", pose.scale)
+    if std is not None:
+        row |= _by_axis("t{}_std", std.translation) | _by_axis("scale_{}_std", std.scale)
+        row |= {"rotation_std_deg": std.rotation_deg, "focal_length_std": std.focal}
+    if result.covariance is not None:
+        row["covariance"] = result.covariance.ravel().tolist()
+    if isinstance(result.model, ShapeModel):
+        row["component"] = result.component
+        row["coefficients"] = shape_coefficients(result, result.model).tolist()
+    return row
+
+
+def shape_coefficients(result: Result, shape: ShapeModel) -> FloatArray:
+    """The likeliest coefficients (K,) of the modes of a learned shape for an estimated object.
+
+    Each keypoint may also be displaced by the component's ``residual_sigma``.
+    """
+    component = shape.components[result.component]
+    count = len(shape.ids)
+    modes = component.modes[:, :count].reshape(len(component.modes), -1)
+    offsets = (result.points_3d - component.mean[:count]).ravel()
+    if not len(modes):
+        return np.zeros(0)
+    if component.residual_sigma == 0:
+        return np.asarray(np.linalg.lstsq(modes.T, offsets, rcond=None)[0])
+    weight = component.residual_sigma**-2
+    normal = weight * modes @ modes.T + np.eye(len(modes))
+    return np.asarray(np.linalg.solve(normal, weight * modes @ offsets))
+
+
+def write_csv(folder: RunFolder) -> None:
+    """Write ``results.csv`` of a finished run, holding few rows at a time."""
+    lists = [name for name, _ in _LISTS]
+    schema = schema_of(tuple(each for each in COLUMNS if each not in _LISTS))
+
+    def write(unfinished: Any) -> None:
+        with pa_csv.CSVWriter(unfinished, schema) as writer:
+            for table in read_groups(folder.results, fix=DONE_ANEW):
+                writer.write_table(table.drop_columns(lists))
+
+    write_whole(folder.path / "results.csv", write)
+
+
+def _one_sigma(result: Result) -> float | None:
+    """The standard deviation of all keypoints."""
+    if result.sigma is not None:
+        return float(result.sigma)
+    given = None if result.options is None else result.options.sigma
+    return float(given) if given is not None and np.ndim(given) == 0 else None
+
+
+def _by_axis(name: str, values: Any) -> Row:
+    return {
+        name.format(axis): float(value) for axis, value in zip(_AXES, values, strict=True)
+    }
+
+
+def read_rows(folder: RunFolder) -> list[Row]:
+    """The rows of a finished run, without the columns that are lists."""
+    lists = [name for name, _ in _LISTS]
+    groups = read_groups(folder.results, fix=DONE_ANEW)
+    return [row for table in groups for row in table.drop_columns(lists).to_pylist()]

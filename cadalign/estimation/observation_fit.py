@@ -1,0 +1,381 @@
+"""One observation aligned: the options of an estimate, and those of the observation that hold.
+
+`cadalign fit` and runs over many observations align each in this way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+from cadalign.errors import InputError
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
+from cadalign.estimation.result import Result
+from cadalign.io.documents import in_file, within
+from cadalign.io.observation import Observation
+from cadalign.io.observation_changes import ObservationChanges
+from cadalign.io.observation_file import fill_xyz
+
+if TYPE_CHECKING:
+    from cadalign.estimation.model import Model
+    from cadalign.estimation.view import View
+    from cadalign.shapes.model import ShapeModel
+
+_OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a learned shape lacks
+Note = Callable[[str], object]
+"""What is told about an estimate, such as the source of its focal length."""
+
+
+_PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+
+
+def refuse_photo(path: Path) -> None:
+    """Refuse an image in the place of an observation, and say what makes one."""
+    if path.suffix.lower() in _PHOTOS:
+        raise InputError(
+            "a photo, not an observation, which is a JSON file with camera and keypoints",
+            where=str(path),
+            fix=f"mark keypoints with `cadalign annotate {path.name} MODEL`, which writes one, or "
+            "use a detector's with `cadalign observe`",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationFit:
+    """How an observation is aligned: model, noise, focal length and robust search."""
+
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    similar: bool = False
+    """Estimate sigma from the residuals: for a model that is only similar to the object. Its
+    proportions are similar, too: --scale-prior-sigma is 0.2, unless the file or a flag says
+    otherwise."""
+    scale_prior: bool = True
+    """Take a prior on the stretch: the flag's, the file's, or with --similar the default one; with
+    --no-scale-prior none."""
+    robust: bool = False
+    """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
+    shape: Path | None = None
+    """File of `cadalign shape learn`: estimate the object's own shape, of that category, in place
+    of a stretch. Keypoints need the shape's semantic ids or names, and no xyz; of options stored in
+    the file, sigma, loss and focal length count."""
+    shape_sigma: float | None = None
+    """Estimate the object's own shape from the model's: standard deviation of the keypoints'
+    positions on the object about those on the stretched model [model units]."""
+    focal: Literal["known", "estimate"] | None = None
+    """Focal length: known (the file's) or estimate; by default known, if every view has one. Views
+    of equal cameras share an estimated one."""
+    exif: bool = True
+    """Use the photo's EXIF data as a prior on an estimated focal length."""
+    stored: bool = True
+    """Take the options that the file stores, except for those that flags set to another value than
+    their defaults; with --no-stored flags alone count."""
+    fitting: FitOptions = FitOptions()
+    """Method and model; of sigma and focal length, the options above hold."""
+    ransac: RansacOptions = RansacOptions()
+    """The search for outliers, where it is asked for."""
+
+    @staticmethod
+    def named(option: str) -> str:
+        """Name of an option in messages."""
+        return option
+
+    @property
+    def takes_stored_shape(self) -> bool:
+        """True unless a flag says another shape than the file's."""
+        return self.stored and self.shape is None and self.shape_sigma is None
+
+    def shape_of(self, observation: Observation) -> Path | None:
+        """File of the learned shape to fit: the flag's, or else the file's."""
+        return observation.shape if self.takes_stored_shape else self.shape
+
+    def shape_sigma_of(self, observation: Observation) -> float | None:
+        """Deviation of a similar model's shape: the flag's, or else the file's."""
+        if not self.takes_stored_shape:
+            return self.shape_sigma
+        return cast("float | None", observation.fit_options.get("shape_sigma"))
+
+    def stated_sigma(self, observation: Observation) -> dict[str, Sigma | None]:
+        """The deviation that takes the place of the keypoints' own, empty if there is none.
+
+        None is to be estimated.
+        """
+        if self.similar:
+            if self.sigma is not None:
+                similar, sigma = self.named("similar"), self.named("sigma")
+                raise InputError(
+                    f"{similar} estimates the standard deviation, which {sigma} gives",
+                    where=sigma,
+                    fix="give one of the two options",
+                )
+            return {"sigma": None}
+        if self.sigma is not None:
+            return {"sigma": self.sigma}
+        if self.stored and "sigma" in observation.fit_options:
+            return {"sigma": cast("Sigma | None", observation.fit_options["sigma"])}
+        return {}
+
+    def sigma_of(self, observation: Observation) -> Sigma:
+        """Standard deviation of the keypoints: the given one, the file's, or 1."""
+        if self.sigma is not None:
+            return self.sigma
+        return 1.0 if observation.sigma is None else observation.sigma
+
+    def options_for(
+        self, observation: Observation, where: str, note: Note = lambda text: None
+    ) -> FitOptions:
+        """Options of the fit: those that are given, otherwise those of the file."""
+        given = dict(observation.fit_options) if self.stored else {}
+        given.pop("shape_sigma", None)  # which is the model's
+        has_prior, stored_prior = "focal_prior" in given, given.pop("focal_prior", None)
+        with in_file(where), within("fit"):
+            stored = FitOptions(**given)
+        set_by_flags = {
+            field.name: getattr(self.fitting, field.name)
+            for field in fields(self.fitting)
+            if getattr(self.fitting, field.name) != field.default
+        }
+        are_known = all(view.camera.focal_known for view in observation.views)
+        focal = self.focal or given.get("focal", "known" if are_known else "estimate")
+        if focal == "known" and not are_known:
+            raise InputError(
+                "the focal length is unknown",
+                where=f"{where}: camera",
+                fix=f"give {self.named('focal')} estimate, or a calibrated camera",
+            )
+        prior = None
+        if focal == "estimate":
+            if has_prior:
+                prior = None if stored_prior is None else FocalPrior(**stored_prior)
+            elif self.exif:
+                prior = _prior_of_photos(observation, note)
+            if prior is not None:
+                share = 100 * prior.relative_sigma
+                source = "the file's prior" if has_prior else "the photo's EXIF data"
+                note(f"Focal length from {source}: {prior.focal:.4g} px +-{share:.2g} %")
+        sigma = self.stated_sigma(observation).get("sigma", self.sigma_of(observation))
+        changes = {**set_by_flags, "sigma": sigma, "focal": focal, "focal_prior": prior}
+        chosen = replace(stored, **changes)
+        return self._with_scale_prior(chosen, is_stored="scale_prior_sigma" in given)
+
+    def _with_scale_prior(self, options: FitOptions, *, is_stored: bool) -> FitOptions:
+        """The options with the default prior on a similar model's stretch, or without any."""
+        if not self.scale_prior:
+            if self.fitting.scale_prior_sigma is not None:
+                left_out, given = map(self.named, ("no_scale_prior", "scale_prior_sigma"))
+                raise InputError(
+                    f"{left_out} leaves out the prior, which {given} gives",
+                    where=left_out,
+                    fix="give one of the two options",
+                )
+            return replace(options, scale_prior_sigma=None)
+        chosen = is_stored or options.scale_prior_sigma is not None
+        if chosen or not self.similar or options.method != "optimal" or not options.stretched_axes:
+            return options
+        return replace(options, scale_prior_sigma=SIMILAR_SCALE_SIGMA)
+
+    def check_for(self, observation: Observation) -> None:
+        """Refuse options that have no effect together with a shape or further evidence."""
+        if self.shape is not None and self.shape_sigma is not None:
+            raise InputError(
+                f"{self.named('shape')} has learned how far objects of the category differ",
+                where=self.named("shape_sigma"),
+                fix="give one of the two options",
+            )
+        learned = self.shape_of(observation)
+        is_shaped = learned is not None or self.shape_sigma_of(observation) is not None
+        refused = {
+            "similar": is_shaped and self.similar,
+            "no_scale_prior": is_shaped and not self.scale_prior,
+        }
+        for name in ("method", *(_OF_THE_MODEL if learned is not None else ())):
+            is_changed = getattr(self.fitting, name) != getattr(FitOptions, name)
+            refused[name] = is_changed
+        for name, is_given in refused.items():
+            if is_given:
+                raise InputError(
+                    f"has no effect together with {self._cause(observation)}",
+                    where=self.named(name),
+                    fix="leave out one of the two",
+                )
+
+    def _cause(self, observation: Observation) -> str:
+        """Name of what makes the fit more than one of a stretched model to keypoints."""
+        if self.shape is not None:
+            return self.named("shape")
+        if self.shape_sigma is not None:
+            return self.named("shape_sigma")
+        if self.shape_of(observation) is not None:
+            return "the file's shape"
+        if self.shape_sigma_of(observation) is not None:
+            return "the file's shape_sigma"
+        return f"the file's {_evidence(observation)}"
+
+    def read(
+        self, data: Any, where: str, *, folder: Path | None, changes: ObservationChanges
+    ) -> Observation:
+        """Read the parsed form of an observation, with changes; ``where`` is its name in messages.
+
+        Keypoints need no ``xyz`` where a learned shape is fitted.
+        """
+        has_shape = isinstance(data, dict) and data.get("shape") is not None
+        if self.shape is not None or (has_shape and self.takes_stored_shape):
+            data = fill_xyz(data)
+        with in_file(where):
+            return changes.applied_to(Observation.from_dict(data, folder=folder))
+
+    def fit(
+        self,
+        observation: Observation,
+        where: str,
+        *,
+        note: Note = lambda text: None,
+        status: AbstractContextManager[Any] | None = None,
+    ) -> tuple[Result, tuple[View, ...] | None]:
+        """Align an observation.
+
+        Parameters
+        ----------
+        observation : Observation
+        where : str
+            Its name in messages.
+        note : callable
+            Is told the source of a focal length.
+        status : context manager, optional
+            Entered while `cadalign.align` works.
+
+        Returns
+        -------
+        Result
+        tuple of View or None
+            What was aligned; None for a stretched model's keypoints in one image.
+
+        Raises
+        ------
+        CadalignError
+            If the options or the observation are invalid, or there is no alignment.
+        """
+        is_plain = observation.is_plain and self.shape_of(observation) is None
+        if is_plain and self.shape_sigma_of(observation) is None:
+            return self._fit(observation, where, note), None
+        return self._align(observation, where, note, status or nullcontext())
+
+    def _fit(self, observation: Observation, where: str, note: Note) -> Result:
+        """Fit the stretched model to keypoints of one image."""
+        from cadalign.estimation.fit import fit
+
+        options = self.options_for(observation, where, note)
+        return fit(
+            observation.points_3d,
+            observation.points_2d,
+            observation.camera,
+            **vars(options),
+            ransac=self.ransac if self.robust else None,
+            confidences=observation.confidences if self.robust else None,
+            symmetry=observation.symmetry,
+        )
+
+    def _align(
+        self,
+        observation: Observation,
+        where: str,
+        note: Note,
+        status: AbstractContextManager[Any],
+    ) -> tuple[Result, tuple[View, ...]]:
+        """Align any model to all evidence."""
+        from cadalign.estimation.align import align
+        from cadalign.estimation.observed import views_of
+
+        self.check_for(observation)
+        options = self.options_for(observation, where, note)
+        model = self._model(observation, where, options)
+        stated = self.stated_sigma(observation)
+        with in_file(where):
+            views = views_of(observation, model, sigma=stated.get("sigma"))
+            size = observation.size
+        if "sigma" in stated and stated["sigma"] is None:
+            views = tuple(replace(view, sigma=None) for view in views)
+        with status, self._located(where):
+            result = align(
+                model,
+                views,
+                size=size,
+                init=observation.init,
+                loss=options.loss,
+                loss_scale=options.loss_scale,
+                ransac=self.ransac if self.robust else None,
+                focal=options.focal,
+                focal_prior=options.focal_prior,
+            )
+        return result, views
+
+    def _model(
+        self, observation: Observation, where: str, options: FitOptions
+    ) -> Model | ShapeModel:
+        shape = self.shape_of(observation)
+        if shape is not None:
+            if observation.symmetry is not None:
+                raise InputError(
+                    "has no effect together with a learned shape",
+                    where=f"{where}: symmetry",
+                    fix="leave out one of the two",
+                )
+            return _opened(shape)
+        from cadalign.estimation.observed import model_of
+        from cadalign.io.meshes.load import load_mesh
+
+        mesh = None if observation.model is None else load_mesh(observation.model)
+        sigma = self.shape_sigma_of(observation)
+        with self._located(where):
+            return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+
+    @contextmanager
+    def _located(self, where: str) -> Iterator[None]:
+        """Let errors about arguments name the option, or else the observation."""
+        try:
+            yield
+        except InputError as error:
+            if error.where in {field.name for field in (*fields(self), *fields(self.ransac))}:
+                raise
+            with in_file(where):
+                raise
+
+
+
+@lru_cache(maxsize=4)
+def _opened(path: Path) -> ShapeModel:
+    """Open a learned shape, which runs use again and again."""
+    from cadalign.shapes.model import ShapeModel
+
+    return ShapeModel.open(path)
+
+
+def _evidence(observation: Observation) -> str:
+    """Name of the first field of a file that `cadalign.fit` does not take."""
+    if observation.others:
+        return "views"
+    if observation.depths is not None:
+        return "depth"
+    return next(iter(observation.evidence.given), "size" if observation.size else "init")
+
+
+def _prior_of_photos(observation: Observation, note: Note) -> FocalPrior | None:
+    """The prior of the first photo's EXIF data, unless those of another photo differ from it."""
+    if observation.image is None:
+        return None
+    first = FocalPrior.from_exif(observation.image)
+    for view in observation.others:
+        other = None if first is None or view.image is None else FocalPrior.from_exif(view.image)
+        if first is None or other is None:
+            continue
+        if not first.is_like(other):
+            note(
+                f"The photos' EXIF data differ ({first.focal:.4g} and {other.focal:.4g} px): unused"
+            )
+            return None
+    return first

@@ -90,7 +90,9 @@ class ManyFits:
         if self.folder is not None and task.row < self.options.pictures:
             from cadalign.batch.pictures import draw_fit
 
-            draw_fit(self.folder, row, seen, result)
+            troubles = draw_fit(self.folder, row, seen, result)
+            row["warning_count"] += len(troubles)
+            row["warnings"] = "; ".join(filter(None, (row["warnings"], *troubles)))
         timing = {"row": task.row, "seconds": time.perf_counter() - start}
         return Rows([row], [timing], [_record(task.row, seen, result)])
 
@@ -193,14 +195,11 @@ def _exists(path: Path) -> bool:
 
 
 def _parsed(content: bytes, name: str) -> Any:
-    """The JSON of a line; the slow parser says what is wrong with it."""
+    """The JSON of a line."""
     try:
         return msgspec.json.decode(content)
-    except (msgspec.MsgspecError, UnicodeError, RecursionError):
-        try:
-            return parse_json(content.decode(), name)
-        except UnicodeError as error:
-            raise DataError(f"not valid JSON: {error}", where=name) from None
+    except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+        raise DataError(f"not valid JSON: {error}", where=name) from None
 
 
 def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Rows:
@@ -210,7 +209,7 @@ def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row
 
 
 def _record(row: int, seen: Observation | None, result: Result | None) -> Row:
-    """Observation and result as JSON; of the result without its time, on which no two runs agree."""
+    """Observation and result as JSON, but for its time, on which no two runs agree."""
     record = {"row": row, "observation": "", "result": ""}
     if seen is not None:
         record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()

@@ -48,9 +48,9 @@ class FitRunOptions(ExperimentOptions):
     command: ClassVar[str] = "fit"
 
     inputs: tuple[Path, ...]
-    estimate: ObservationFit = ObservationFit()
+    estimate: ObservationFit = field(default_factory=ObservationFit)
     changes: ObservationChanges = field(default_factory=ObservationChanges)
-    detector: DetectorOptions = DetectorOptions()
+    detector: DetectorOptions = field(default_factory=DetectorOptions)
     pictures: int = 0
 
     def __post_init__(self) -> None:

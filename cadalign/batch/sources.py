@@ -257,7 +257,8 @@ def _folder(path: Path) -> str:
 def _kind_of_file(path: Path) -> str:
     """The kind of a JSON file's content."""
     try:
-        data = msgspec.json.decode(read_bytes(path), type=dict[str, msgspec.Raw] | list[msgspec.Raw])
+        content = read_bytes(path)
+        data = msgspec.json.decode(content, type=dict[str, msgspec.Raw] | list[msgspec.Raw])
     except (DataError, msgspec.MsgspecError, UnicodeError, RecursionError):
         return _DAMAGED
     return kind_of(data)

@@ -46,7 +46,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from cadalign.arrays import FloatArray
@@ -64,6 +63,8 @@ _LISTS: Columns = (
     *(("coefficients", list[float]), ("covariance", list[float])),
     *(("residuals", list[float]), ("is_inlier", list[bool])),
 )
+LISTS = [name for name, _ in _LISTS]
+"""Columns that hold several numbers in a cell."""
 COLUMNS: Columns = (
     *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),
     *(("status", str), ("reason", str), ("method", str)),
@@ -149,13 +150,12 @@ def shape_coefficients(result: Result, shape: ShapeModel) -> FloatArray:
 
 def write_csv(folder: RunFolder) -> None:
     """Write ``results.csv`` of a finished run, holding few rows at a time."""
-    lists = [name for name, _ in _LISTS]
     schema = schema_of(tuple(each for each in COLUMNS if each not in _LISTS))
 
     def write(unfinished: Any) -> None:
         with pa_csv.CSVWriter(unfinished, schema) as writer:
             for table in read_groups(folder.results, fix=DONE_ANEW):
-                writer.write_table(table.drop_columns(lists))
+                writer.write_table(table.drop_columns(LISTS))
 
     write_whole(folder.path / "results.csv", write)
 
@@ -164,18 +164,15 @@ def _one_sigma(result: Result) -> float | None:
     """The standard deviation of all keypoints."""
     if result.sigma is not None:
         return float(result.sigma)
-    given = None if result.options is None else result.options.sigma
-    return float(given) if given is not None and np.ndim(given) == 0 else None
+    given: Any = None if result.options is None else result.options.sigma
+    return None if given is None or np.ndim(given) else float(given)
 
 
 def _by_axis(name: str, values: Any) -> Row:
-    return {
-        name.format(axis): float(value) for axis, value in zip(_AXES, values, strict=True)
-    }
+    return {name.format(axis): float(value) for axis, value in zip(_AXES, values, strict=True)}
 
 
 def read_rows(folder: RunFolder) -> list[Row]:
     """The rows of a finished run, without the columns that are lists."""
-    lists = [name for name, _ in _LISTS]
     groups = read_groups(folder.results, fix=DONE_ANEW)
-    return [row for table in groups for row in table.drop_columns(lists).to_pylist()]
+    return [row for table in groups for row in table.drop_columns(LISTS).to_pylist()]

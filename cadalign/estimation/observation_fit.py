@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -75,15 +75,15 @@ class ObservationFit:
     stored: bool = True
     """Take the options that the file stores, except for those that flags set to another value than
     their defaults; with --no-stored flags alone count."""
-    fitting: FitOptions = FitOptions()
+    fitting: FitOptions = field(default_factory=FitOptions)
     """Method and model; of sigma and focal length, the options above hold."""
-    ransac: RansacOptions = RansacOptions()
+    ransac: RansacOptions = field(default_factory=RansacOptions)
     """The search for outliers, where it is asked for."""
 
     @staticmethod
-    def named(option: str) -> str:
+    def named(name: str) -> str:
         """Name of an option in messages."""
-        return option
+        return name
 
     @property
     def takes_stored_shape(self) -> bool:
@@ -344,7 +344,6 @@ class ObservationFit:
                 raise
             with in_file(where):
                 raise
-
 
 
 @lru_cache(maxsize=4)

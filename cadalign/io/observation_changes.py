@@ -38,7 +38,9 @@ class ObservationChanges:
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
-        return self.camera and _read_camera(self.camera, size, self.pixel_origin)
+        if self.camera is None:
+            return None
+        return _read_camera(self.camera, size, self.pixel_origin)
 
     def applied_to(self, observation: Observation) -> Observation:
         """The observation with all of this in the place of its own.

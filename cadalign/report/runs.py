@@ -8,13 +8,16 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from cadalign.batch.spec import SPEC
 from cadalign.errors import InputError
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.registry import spec_of, spec_of_config
+from cadalign.evaluation.registry import register, spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import refuse_nul
+
+register(SPEC)  # runs over many observations are shown as those of experiments are
 
 _LABELS = {
     "root": "dataset",

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from cadalign import Alignment, Camera, Result, __version__
+from cadalign import Alignment, Camera, Result, Results, __version__
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.io.observation import Observation
@@ -65,32 +65,81 @@ def test_every_object_of_a_file_becomes_an_observation_and_is_fitted(
     (written / "broken.json").write_text("{")
     (written / "notes.json").write_text("{}")
     assert main(["fit", str(written)]) == 3
-    text = capsys.readouterr().out
-    assert "a_1.json" in text
-    assert "not valid JSON" in text
+    text = capsys.readouterr().err
+    assert "failed 1: line 1: not valid JSON" in text
+    assert "3 of 4 aligned, 1 failed: " in text
     out = folder / "found_observations_fit"
     with (out / "results.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [Path(row["file"]).name for row in rows] == [
+    assert [Path(row["source"]).name for row in rows] == [
         "a_0.json",
         "a_1.json",
         "b.json",
         "broken.json",
     ]
-    assert [bool(row["error"]) for row in rows] == [False, False, False, True]
-    for name, pose in zip(("a_0", "a_1", "b"), POSES, strict=True):
-        found = Result.load(out / name / "fit.json")
+    assert [row["status"] for row in rows] == ["ok", "ok", "ok", "failed"]
+    for found, pose in zip(Results.open(out), POSES, strict=False):
         np.testing.assert_allclose(found.alignment.scale, pose.scale, atol=1e-4)
-    page = (out / "index.html").read_text()
-    assert page.count("<img") == 3
-    assert page.index("b.json") < page.index("broken.json")
+    assert sorted(path.name for path in (out / "thumbs").iterdir()) == [
+        "no model_a.png, row 0.webp",
+        "no model_a.png, row 1.webp",
+    ]
+    assert "broken.json, row 3" in (out / "report.html").read_text()
+
+
+def test_a_detectors_file_needs_no_observations(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera, model = ["--camera", str(folder / "K.txt")], str(folder / "model.keypoints.json")
+    out = ["--out", str(folder / "out"), "--no-picture"]
+    assert main(["fit", str(folder / "found.json"), *camera, "--model", model, *out]) == 0
+    results = Results.open(folder / "out")
+    for found, pose in zip(results, POSES, strict=True):
+        np.testing.assert_allclose(found.alignment.scale, pose.scale, atol=1e-4)
+    rows = list(csv.DictReader((folder / "out" / "results.csv").open()))
+    assert [Path(row["image"]).name for row in rows] == ["a.png", "a.png", ""]
+    assert rows[1]["source"].endswith("found.json: annotations[1]")
+    capsys.readouterr()
+    assert main(["fit", str(folder / "found.json"), *camera, *out]) == 1
+    assert "--model: the keypoints of the model are not known; give the" in capsys.readouterr().err
+
+
+def test_what_is_wrong_with_the_inputs_is_one_line(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(folder / "out")]
+    for arguments, text in [
+        (["no such*.json"], "no such*.json: no file matches"),
+        ([str(folder / "a.png"), "b.json"], "a photo, not an observation"),
+        ([str(folder / "found.json"), "--overlay", "o.png"], "--overlay: is for one observation"),
+        ([str(folder / "gone.jsonl")], "gone.jsonl: no such file"),
+    ]:
+        assert main(["fit", *arguments, *out]) == 1
+        shown = capsys.readouterr().err
+        assert text in shown
+        assert "Traceback" not in shown
+
+
+def test_a_photo_and_a_model_that_cannot_be_read_are_warnings_of_their_row(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(observe(folder, "--every", "--image", str(folder))) == 0
+    written = folder / "found_observations"
+    (folder / "a.png").write_text("no photo")
+    data = json.loads((written / "b.json").read_text())
+    (written / "b.json").write_text(json.dumps({**data, "model": "gone.obj"}))
+    assert main(["fit", str(written)]) == 0
+    rows = list(csv.DictReader((folder / "found_observations_fit" / "results.csv").open()))
+    assert "the photo is not shown: " in rows[0]["warnings"]
+    assert "the model is shown as a box: " in rows[2]["warnings"]
+    assert [row["status"] for row in rows] == ["ok"] * 3
 
 
 def test_several_files_are_fitted_as_a_folder_is(folder: Path) -> None:
     assert main(observe(folder, "--every")) == 0
     files = [str(folder / "found_observations" / f"{name}.json") for name in ("a_0", "b")]
     assert main(["fit", *files, "--out", str(folder / "out"), "--stretch", "y"]) == 0
-    assert Result.load(folder / "out" / "b" / "fit.json").stretched_axes == "y"
+    assert [found.stretched_axes for found in Results.open(folder / "out")] == ["y", "y"]
 
 
 def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -55,7 +55,7 @@ class Run:
     total: int
 
     @classmethod
-    def open(cls, path: Path, name: str | None = None, *, columns: Columns = COLUMNS) -> Run:
+    def open(cls, path: Path, name: str | None = None, *, columns: Columns = COLUMNS) -> Self:
         """Read a run, whose result table must have these columns; see `checked`."""
         folder = RunFolder(path)
         if not path.is_dir():

@@ -1,0 +1,122 @@
+"""Pictures of aligned observations for the page: the photo, the object in it, its mesh."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError, DataError, RenderError
+from cadalign.estimation.result import Result
+from cadalign.evaluation.instances.drawing import write_webp
+from cadalign.evaluation.instances.preview import write_preview
+from cadalign.evaluation.instances.record import record_stem
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import AbortError
+from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import resized_camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.images import ByteImage, read_image
+from cadalign.io.meshes.load import load_mesh
+from cadalign.io.observation import Observation
+from cadalign.render.drawing.overlay import draw_overlay
+from cadalign.render.drawing.result_overlay import mesh_of
+
+_MOST = 1024  # pixels of a picture's longer side
+_THUMB = (320, 240)
+_MARGIN = 0.2  # of a thumb, around the object
+
+
+def page_names(row: Row) -> Row:
+    """Names of an observation on the page, unique by its number in the run."""
+    known = row["image"] or row["source"]
+    parts = (Path(known).name, row["object"], f"row {row['row']}")
+    category = Path(row["model"]).stem.removesuffix(".keypoints") or "no model"
+    return {"category": category, "model_id": ", ".join(filter(None, parts)), "view": 0}
+
+
+def draw_fit(folder: RunFolder, row: Row, seen: Observation, result: Result) -> tuple[str, ...]:
+    """Write the pictures of an aligned observation; says what could not be drawn.
+
+    ``pictures`` gets the photo, ``thumbs`` the part around the object with its box, ``sketches`` a
+    preview of the model's mesh, warped to the estimated shape.
+
+    Raises
+    ------
+    AbortError
+        If a picture cannot be written, as on a full disk.
+    """
+    names = page_names(row)
+    stem = record_stem(names["category"], names["model_id"])
+    troubles = []
+    photo = mesh = None
+    try:
+        photo = None if seen.image is None else read_image(seen.image, result.camera)
+    except CadalignError as error:
+        troubles.append(f"the photo is not shown: {error}")
+    try:
+        mesh = _mesh(seen, result)
+    except CadalignError as error:
+        troubles.append(f"the model is shown as a box: {error}")
+    try:
+        if photo is not None:
+            small, camera = _resized(photo, result.camera)
+            write_webp(folder.pictures / f"{stem}.webp", small)
+            write_webp(folder.thumbs / f"{stem}.webp", _thumb(small, camera, result))
+        if mesh is not None:
+            write_preview(folder.previews / f"{stem}.json", mesh)
+    except (DataError, OSError) as error:
+        raise AbortError(
+            f"a picture cannot be written: {error}",
+            fix="free some space, and start the same command again: the run goes on",
+        ) from None
+    except RenderError as error:
+        troubles.append(f"not drawn: {error}")
+    return tuple(troubles)
+
+
+def _mesh(seen: Observation, result: Result) -> Mesh | None:
+    """The object's mesh in the model's frame, before the stretch."""
+    if result.model is not None:
+        return mesh_of(seen, result)
+    return None if seen.model is None else load_mesh(seen.model)
+
+
+def _resized(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
+    """A photo in a size for a page, and its camera."""
+    factor = min(1.0, _MOST / max(camera.width, camera.height))
+    size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
+    if size != photo.shape[1::-1]:
+        photo = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return photo, resized_camera(camera, *size)
+
+
+def _thumb(photo: ByteImage, camera: Camera, result: Result) -> ByteImage:
+    """The part of a photo around the object, with its box and keypoints."""
+    box = Box.from_model(result.bounds, result.alignment)
+    scale = camera.width / result.camera.width
+    observed = (result.views[0].points_2d + 0.5) * scale - 0.5
+    drawn: Any = draw_overlay(
+        photo, camera, est_box=box, observed=observed, axes=False, legend=False
+    )
+    corners = camera.project_where_ahead(box.corners)
+    points = np.concatenate([observed, corners])
+    return _cropped(drawn, points[np.isfinite(points).all(axis=1)])
+
+
+def _cropped(photo: ByteImage, points: FloatArray) -> ByteImage:
+    """The part of a photo around points, in the size of a thumb."""
+    limit = np.array(photo.shape[1::-1], dtype=float)
+    low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
+    across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel
+    across = min(max(across, 0.1), float((limit / _THUMB).max()))
+    corner = (low + high) / 2 - across * np.array(_THUMB) / 2
+    warp = np.array([[across, 0, corner[0]], [0, across, corner[1]]])
+    how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
+    crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(crop, dtype=np.uint8)

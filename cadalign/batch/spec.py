@@ -1,0 +1,218 @@
+"""Specification of runs over many observations: all that their page shows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+import pyarrow as pa
+
+from cadalign.batch.experiment import plan_fits
+from cadalign.batch.options import FitRunOptions
+from cadalign.batch.pictures import page_names
+from cadalign.batch.table import COLUMNS as TABLE_COLUMNS
+from cadalign.batch.table import LISTS, RECORD_COLUMNS
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.plots import Plot, cumulative
+from cadalign.evaluation.runs.opened import Cells, Run
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.spec import Spec
+from cadalign.evaluation.summary import (
+    Summary,
+    by_category_and_method,
+    known,
+    mean_of,
+    median_of,
+    where,
+)
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+
+METHOD = "alignment"
+"""Name of the estimate on the page, the same in all runs, such that they can be compared."""
+ROTATION_STD = Metric("rotation_std_deg", "rotation uncertainty", "deg", head="R std. dev.")
+DISTANCE_STD = Metric(
+    "distance_std", "distance uncertainty", "%", factor=100.0, head="distance std. dev."
+)
+"""Standard deviation of the translation's depth over that depth."""
+WARNINGS = Metric("warning_count", "warnings", digits=1, log=False, limit=5.0)
+MATCHED = Metric("matched", "keypoints kept", "%", 0, better="high", factor=100.0, log=False)
+_GALLERY = (replace(metrics.RMS, limit=20.0), ROTATION_STD, DISTANCE_STD, WARNINGS, MATCHED)
+_HEADLINE = (
+    *(metrics.INSTANCES, metrics.FAILED, metrics.KEYPOINTS),
+    *_GALLERY,
+    metrics.QUERY_MILLISECONDS,
+)
+_PLACES = np.array([0.1, 0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 50])
+
+
+@dataclass(frozen=True, eq=False)
+class FitRun(Run):
+    """A run over many observations, in the terms of a page on instances."""
+
+    @classmethod
+    def open(cls, path: Path, name: str | None = None, *, columns: Columns = TABLE_COLUMNS) -> Self:
+        """See `Run.open`."""
+        run = super().open(path, name, columns=columns)
+        return replace(run, results=_as_instances(run.results))
+
+    def records(self, columns: Columns) -> Iterator[Row]:
+        """The records of the observations that could be read, made of their stored results."""
+        table = self.results
+        for stored in super().records(RECORD_COLUMNS):
+            if not stored["observation"]:
+                continue
+            place = stored["row"] if self.is_finished else self._places[stored["row"]]
+            names = table.select(["category", "model_id", "view", "reason"]).slice(place, 1)
+            (row,) = names.to_pylist()
+            reason = row.pop("reason")
+            yield {**row, "exhibit": _exhibit(stored, reason)}
+
+    @property
+    def _places(self) -> dict[int, int]:
+        return {row: place for place, row in enumerate(self.results["row"].to_pylist())}
+
+
+def _as_instances(table: pa.Table) -> pa.Table:
+    """The table of results with the names of instances, and the numbers of the gallery."""
+    shown = table.drop_columns(LISTS)
+    naming = shown.select(["row", "source", "image", "object", "model"]).to_pylist()
+    names = [page_names(row) for row in naming]
+    for name in ("category", "model_id", "view"):
+        shown = shown.append_column(name, pa.array([each[name] for each in names]))
+    inliers, keypoints = (_floats(shown, name) for name in ("inliers", "keypoints"))
+    shown = shown.append_column(MATCHED.key, pa.array(inliers / np.maximum(keypoints, 1)))
+    distance = _floats(shown, "tz_std") / np.abs(_floats(shown, "tz"))
+    shown = shown.append_column(DISTANCE_STD.key, pa.array(distance))
+    place = shown.schema.get_field_index("method")
+    return shown.set_column(place, "method", pa.array([METHOD] * len(shown), pa.string()))
+
+
+def _floats(table: pa.Table, name: str) -> Any:
+    return table[name].to_numpy().astype(float)
+
+
+def _exhibit(stored: Row, reason: str) -> str:
+    """The instance record of a stored result; see `cadalign.evaluation.instances.record`."""
+    seen = msgspec.json.decode(stored["observation"])
+    if not stored["result"]:
+        view = seen["views"][0] if "views" in seen else seen
+        points = [each["xyz"] for each in view["keypoints"]]
+        pixels = [each["uv"] for each in view["keypoints"]]
+        camera, bounds = Camera.from_dict(view["camera"]), _extent(points)
+        estimate: Row = {"method": METHOD, "reason": reason}
+    else:
+        found = msgspec.json.decode(stored["result"])
+        view, places = found["views"][0], found["points_3d"]
+        row_of = {label: row for row, label in enumerate(found["ids"])}
+        points = [places[row_of[label]] for label in view["ids"] or ()] or places
+        pixels = view["points_2d"]
+        camera, bounds = Camera.from_dict(view["camera"]), found["bounds"] or _extent(places)
+        names = ("sigma", "std", "warnings")
+        estimate = {
+            "method": METHOD,
+            **_pose(found["alignment"]),
+            "rms_px": round(found["rms"], 4),
+            **{name: found[name] for name in names},
+            "alternatives": [
+                {**_pose(other["alignment"]), "likelihood": other["relative_likelihood"]}
+                for other in found["alternatives"]
+            ],
+        }
+    shown = [k for k, pixel in enumerate(pixels) if pixel is not None]
+    record = {
+        "camera": {
+            name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
+        },
+        "gt": None,
+        "stretch": [1.0, 1.0, 1.0],
+        "bounds": bounds,
+        "points_3d": [points[k] for k in shown],
+        "points_2d": [pixels[k] for k in shown],
+        "semantic_ids": shown,
+        "estimates": [estimate],
+    }
+    return msgspec.json.encode(record).decode()
+
+
+def _pose(data: Row) -> Row:
+    pose = Alignment.from_dict(data)
+    return {
+        "rotation": pose.rotation.ravel().tolist(),
+        "translation": pose.translation.tolist(),
+        "scale": pose.scale.tolist(),
+    }
+
+
+def _extent(points: Sequence[Sequence[float]]) -> list[list[float]]:
+    placed = np.array(points).reshape(-1, 3)
+    if not len(placed):
+        return [[0.0] * 3, [0.0] * 3]
+    return [placed.min(axis=0).tolist(), placed.max(axis=0).tolist()]
+
+
+def summarize(run: Run) -> list[Summary]:
+    """Medians for every model, and for all together."""
+    return by_category_and_method(run, _summarize)
+
+
+def _summarize(category: str, method: str, cells: Cells) -> Summary:
+    solved = where(cells, cells["status"] == OK)
+    values = {
+        "instances": len(cells["status"]),
+        "failed": len(cells["status"]) - len(solved["status"]),
+        metrics.KEYPOINTS.key: mean_of(solved["keypoints"]),
+        **{metric.key: median_of(solved[metric.key]) for metric in _GALLERY},
+        WARNINGS.key: mean_of(solved[WARNINGS.key]),
+        "milliseconds": 1e3 * median_of(solved["seconds"]),
+    }
+    return Summary(category, {"category": category, "method": method}, values)
+
+
+def plots(runs: Sequence[Run]) -> list[Plot]:
+    """Shares of the observations within a residual and within an uncertainty."""
+    return [
+        cumulative(runs, metric, _PLACES, title=f"{metric.label} of the observations")
+        for metric in (metrics.RMS, ROTATION_STD)
+        if any(len(known(run.cells[metric.key])) for run in runs)
+    ]
+
+
+def _describe(run: Run) -> str:
+    inputs = [Path(each).name for each in run.config.get("inputs", ())]
+    listed = ", ".join(inputs[:3]) + (f" and {len(inputs) - 3} more" if len(inputs) > 3 else "")
+    return f"on {run.total:,} observations of {listed}"
+
+
+class FitSpec(Spec):
+    """The specification, whose runs are `FitRun`."""
+
+    def open(self, path: Path, name: str | None = None) -> Run:
+        """Read a run."""
+        return FitRun.open(path, name)
+
+
+SPEC = FitSpec(
+    options=FitRunOptions,
+    plan=plan_fits,
+    results=TABLE_COLUMNS,
+    columns=_HEADLINE,
+    summarize=summarize,
+    plots=plots,
+    group=lambda run: replace(metrics.CATEGORY, label="model", head="model"),
+    title=lambda runs: "alignments",
+    describe=_describe,
+    metrics=_GALLERY,
+    about="Red is the estimate: its box, and the model warped to the estimated shape.",
+    note=(
+        "Medians over the observations that did not fail; of keypoints and warnings the mean. "
+        "Uncertainties are the stated standard deviations, those of the distance relative. No "
+        "truth is known here: a small residual alone does not tell that an alignment is right."
+    ),
+)

@@ -1,0 +1,316 @@
+"""`fit_many` and `stream_fits`: results, the table, resuming, workers, and bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import cadalign
+from cadalign import Alignment, CadalignError, Camera, Observation, Result, Results
+from cadalign.batch.fits import options_of, run_fits
+from cadalign.batch.options import FitRunOptions
+from cadalign.batch.table import COLUMNS
+from cadalign.errors import DataError, InputError
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.run import Progress
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
+
+CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
+POINTS = np.random.default_rng(1).uniform(-1, 1, (8, 3))
+
+
+def observations(count: int, *, noise: float = 1.0) -> Iterator[Observation]:
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        scale = np.array([1, *np.exp(rng.uniform(-0.3, 0.3, 2))])
+        pose = Alignment(cadalign_rotation(rng), [0.1, 0.2, 6.0], scale)
+        seen = CAMERA.project(pose.apply(POINTS)) + rng.normal(0, noise, (8, 2))
+        yield Observation(POINTS, seen, CAMERA, semantic_ids=np.arange(8))
+
+
+def cadalign_rotation(rng: np.random.Generator) -> Any:
+    return rotation_from_quat_wxyz(rng.normal(size=4))
+
+
+def lines(path: Path, count: int) -> Path:
+    texts = [json.dumps(each.to_dict(states_origins=True)) for each in observations(count)]
+    path.write_text("\n".join(texts) + "\n")
+    return path
+
+
+def test_a_generator_becomes_results_in_its_order(tmp_path: Path) -> None:
+    seen = list(observations(5))
+    results = cadalign.fit_many(iter(seen), out=tmp_path / "run", loss="cauchy")
+    again = Results.open(tmp_path / "run")
+    for found in (results, again):
+        assert len(found) == 5
+        for number, each in enumerate(seen):
+            expected = cadalign.fit(each.points_3d, each.points_2d, CAMERA, loss="cauchy")
+            single = found[number]
+            assert isinstance(single, Result)
+            np.testing.assert_array_equal(single.alignment.packed, expected.alignment.packed)
+            np.testing.assert_allclose(found.rotation[number], expected.alignment.rotation)
+            np.testing.assert_allclose(found.scale[number], expected.alignment.scale)
+            assert found.covariance is not None
+            assert expected.covariance is not None
+            np.testing.assert_allclose(found.covariance[number], expected.covariance)
+            np.testing.assert_allclose(found.rms[number], expected.rms)
+            assert single.warnings == expected.warnings
+    rows = slice(again.offsets[3], again.offsets[4])
+    np.testing.assert_allclose(again.residuals[rows], again[3].residuals)  # type: ignore[union-attr]
+    frame = again.to_dataframe()
+    assert frame["solved"].all()
+    assert frame["keypoints"].tolist() == [8] * 5
+
+
+def test_without_a_folder_results_stay_in_memory() -> None:
+    results = cadalign.fit_many(observations(3), method="aepnp")
+    assert [type(each) for each in results] == [Result] * 3
+
+
+def test_the_table_has_the_documented_columns(tmp_path: Path) -> None:
+    cadalign.fit_many(lines(tmp_path / "o.jsonl", 3), out=tmp_path / "run")
+    table = pq.read_table(tmp_path / "run" / "results.parquet")
+    assert table.column_names == [name for name, _ in COLUMNS]
+    assert cadalign.batch.table.__doc__ is not None
+    for name in table.column_names:
+        assert name in cadalign.batch.table.__doc__, name
+    row = table.to_pylist()[1]
+    found = Results.open(tmp_path / "run")[1]
+    assert isinstance(found, Result)
+    assert found.std is not None
+    quaternion = np.array([row[f"q{axis}"] for axis in "wxyz"])
+    np.testing.assert_allclose(
+        rotation_from_quat_wxyz(quaternion), found.alignment.rotation, atol=1e-12
+    )
+    assert row["ty_std"] == found.std.translation[1]
+    assert row["scale_z_std"] == found.std.scale[2]
+    assert row["source"].endswith("o.jsonl, line 2")
+    head = (tmp_path / "run" / "results.csv").read_text().splitlines()[0]
+    assert '"qw","qx","qy","qz","tx","ty","tz"' in head
+    assert "covariance" not in head
+
+
+def test_a_stream_is_read_only_as_fast_as_it_is_aligned() -> None:
+    asked = []
+
+    def camera_feed() -> Iterator[Observation]:
+        for number, each in enumerate(observations(10**9)):
+            asked.append(number)
+            yield each
+
+    found = cadalign.stream_fits(camera_feed(), method="aepnp")
+    numbers = [next(found)[0] for _ in range(3)]
+    assert numbers == [0, 1, 2]
+    assert len(asked) <= 4
+
+
+@pytest.mark.slow
+def test_workers_and_processes_leave_the_bytes_as_they_are(tmp_path: Path) -> None:
+    source = lines(tmp_path / "o.jsonl", 150)
+    for name, workers in (("none", 0), ("two", 2)):
+        cadalign.fit_many(source, out=tmp_path / name, workers=workers, method="aepnp")
+    for table in ("results.parquet", "exhibits.parquet", "results.csv"):
+        assert (tmp_path / "none" / table).read_bytes() == (tmp_path / "two" / table).read_bytes()
+
+
+_KILLED = """
+import sys, cadalign
+cadalign.fit_many(sys.argv[1], out=sys.argv[2], workers=0)
+"""
+
+
+@pytest.mark.long
+def test_killed_five_times_it_gives_the_same_bytes(tmp_path: Path) -> None:
+    source = lines(tmp_path / "o.jsonl", 400)
+    cadalign.fit_many(source, out=tmp_path / "calm", workers=0)
+    hit = RunFolder(tmp_path / "hit")
+    done = 0
+    for _ in range(5):
+        command = [sys.executable, "-c", _KILLED, str(source), str(hit.path)]
+        process = subprocess.Popen(command)
+        wanted, end = done + 4, time.monotonic() + 120
+        while len(list(hit.parts.glob("???????.parquet"))) < wanted and time.monotonic() < end:
+            assert process.poll() is None, "it ended before it was killed"
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        done = len(list(hit.parts.glob("???????.parquet")))
+    assert not hit.is_finished
+    seen: list[Progress] = []
+    cadalign.fit_many(source, out=hit.path, workers=0, on_progress=seen.append)
+    assert seen[0].done >= 5 * 4
+    for name in ("results.parquet", "exhibits.parquet", "results.csv", "run.json"):
+        assert (hit.path / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+
+
+@pytest.mark.long
+def test_a_dask_worker_killed_in_between_loses_nothing(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed", reason="pip install 'cadalign[dask]'")
+    source = lines(tmp_path / "o.jsonl", 400)
+    cadalign.fit_many(source, out=tmp_path / "calm", workers=0)
+    killed: list[int] = []
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+
+        def kill_one(progress: Progress) -> None:
+            if progress.done >= 60 and not killed:
+                worker = next(iter(cluster.workers.values()))
+                killed.append(worker.pid)
+                os.kill(worker.pid, signal.SIGKILL)
+
+        address = cluster.scheduler_address
+        cadalign.fit_many(source, out=tmp_path / "hit", dask=address, on_progress=kill_one)
+    assert killed
+    for name in ("results.parquet", "exhibits.parquet"):
+        assert (tmp_path / "hit" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+
+
+def test_bad_observations_are_rows_and_stop_nothing(tmp_path: Path) -> None:
+    good = next(observations(1)).to_dict(states_origins=True)
+    without_camera = {name: value for name, value in good.items() if name != "camera"}
+    bad: list[Any] = [
+        good,
+        without_camera,
+        {**good, "keypoints": good["keypoints"][:2]},
+        {**good, "keypoints": []},
+        {**good, "kamera": 1},
+        [1, 2],
+        {**good, "object": "car"},
+        {**good, "object": "car"},
+        {**good, "fit": {"method": "epnp", "sigma": -1}},
+    ]
+    source = tmp_path / "o.jsonl"
+    source.write_text("\n".join([*map(json.dumps, bad), "{", ""]), encoding="utf-8")
+    results = cadalign.fit_many(source, out=tmp_path / "run", robust=False)
+    assert [isinstance(each, CadalignError) for each in results] == [
+        *(False, True, True, True, True, True, False, False, True, True)
+    ]
+    assert "line 2: camera: missing" in str(results[1])
+    assert "line 10: not valid JSON: " in str(results[9])
+    table = pq.read_table(tmp_path / "run" / "results.parquet").to_pylist()
+    assert [row["object"] for row in table[6:8]] == ["car", "car"]
+    assert table[1]["status"] == "failed"
+    assert table[1]["qw"] is None
+
+
+def test_another_input_or_option_is_refused(tmp_path: Path) -> None:
+    source = lines(tmp_path / "o.jsonl", 3)
+    cadalign.fit_many(source, out=tmp_path / "run", method="aepnp")
+    with pytest.raises(DataError, match="another configuration: fitting is"):
+        cadalign.fit_many(source, out=tmp_path / "run")
+    lines(source, 4)
+    with pytest.raises(DataError, match="another configuration: contents is"):
+        cadalign.fit_many(source, out=tmp_path / "run", method="aepnp")
+
+
+@pytest.mark.parametrize(
+    ("options", "where"),
+    [({"colour": 1}, "colour"), ({"method": "magic"}, "method"), ({"pictures": -1}, "pictures")],
+)
+def test_wrong_options_are_refused_before_the_run(
+    tmp_path: Path, options: dict[str, Any], where: str
+) -> None:
+    source = lines(tmp_path / "o.jsonl", 1)
+    with pytest.raises(InputError) as caught:
+        cadalign.fit_many(source, out=tmp_path / "run", **options)
+    assert caught.value.where == where
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_is_no_observation_is_refused() -> None:
+    with pytest.raises(InputError, match=r"observations\[1\]: expected a cadalign.Observation"):
+        cadalign.fit_many([next(observations(1)), 5])  # type: ignore[list-item]
+    with pytest.raises(InputError, match="observations: there are none"):
+        cadalign.fit_many([])
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="not the folder of a run of fits; give a folder"):
+        Results.open(tmp_path)
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(DataError, match="not finished; start the command"):
+        Results.open(tmp_path)
+
+
+def test_a_full_disk_is_one_clear_line_and_keeps_what_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = lines(tmp_path / "o.jsonl", 20)
+    import cadalign.evaluation.runs.run as engine
+
+    write, written = engine.write_rows, []
+
+    def write_until_full(path: Path, *rest: Any) -> None:
+        if len(written) > 30:
+            from cadalign.io.files import writing
+
+            with writing(path):
+                raise OSError(28, "No space left on device")
+        written.append(path)
+        write(path, *rest)
+
+    monkeypatch.setattr(engine, "write_rows", write_until_full)
+    with pytest.raises(DataError, match=r"No space left on device.*make room"):
+        cadalign.fit_many(source, out=tmp_path / "run", workers=0, method="aepnp")
+    monkeypatch.undo()
+    seen: list[Progress] = []
+    cadalign.fit_many(
+        source, out=tmp_path / "run", workers=0, method="aepnp", on_progress=seen.append
+    )
+    assert seen[0].done == 10
+
+
+def test_the_configuration_says_what_is_not_at_its_default() -> None:
+    assert FitRunOptions(inputs=(Path("a"),)).as_config() == {
+        "seed": 0,
+        "inputs": [str(Path("a").absolute())],
+        "pictures": 0,
+    }
+    chosen = options_of({"similar": True, "loss": "cauchy", "camera": "K.txt"})
+    config = chosen.as_config()
+    assert config["similar"] is True
+    assert config["fitting"]["loss"] == "cauchy"
+    assert config["camera"] == str(Path("K.txt").absolute())
+
+
+def test_failures_are_counted_by_reason(tmp_path: Path) -> None:
+    source = lines(tmp_path / "o.jsonl", 3)
+    with source.open("a") as file:
+        file.write("{}\n{}\n[]\n")
+    options = FitRunOptions(inputs=(source,))
+    tally = run_fits(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
+    assert (tally.total, tally.failed) == (6, 3)
+    assert [count for _, count in tally.reasons] == [2, 1]
+    assert "line" not in tally.reasons[0][0]
+
+
+def test_the_how_to_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = Path(__file__).parents[2] / "docs" / "how_to" / "many_photos.md"
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(block, names)
+    assert len(names["results"]) == 3
+
+
+def test_the_how_to_names_every_column() -> None:
+    page = Path(__file__).parents[2] / "docs" / "how_to" / "many_photos.md"
+    told = page.read_text(encoding="utf-8")
+    endings = ("y_std", "z_std")  # named by their first
+    missing = [name for name, _ in COLUMNS if f"`{name}`" not in told]
+    assert [name for name in missing if not name.endswith(endings)] == []

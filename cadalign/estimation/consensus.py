@@ -27,6 +27,7 @@ from cadalign.estimation.support import (
     Support,
     area_of,
     check_support,
+    disagreeing,
     find_mistake,
 )
 from cadalign.geometry.alignment import Alignment
@@ -70,8 +71,12 @@ class RobustSearch:
     @property
     def area(self) -> float:
         """The area [px^2] over which outliers are scattered."""
-        error = self.ransac.max_reproj_error
-        return area_of(self.problems.points_2d, self.problems.cameras[0], error)
+        return area_of(self.problems.points_2d, self.problems.cameras[0], self.threshold)
+
+    @property
+    def threshold(self) -> float:
+        """Largest reprojection error of an inlier [px]."""
+        return self.ransac.threshold(self.options.sigma)
 
     def without(self, mistake: Mistake) -> RobustSearch:
         """The search with a mistake undone."""
@@ -98,16 +103,17 @@ class RobustSearch:
         check_support(
             [Support(errors, len(best.inliers), self.area)],
             size + (self.options.focal == "estimate"),  # which half a keypoint determines
-            max_reproj_error=self.ransac.max_reproj_error,
+            max_reproj_error=self.threshold,
             score=best.score,
             where="points_2d",
             solutions=_SOLUTIONS,
             chance=_CHANCE,
+            disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
         )
 
     def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:
         """What an alignment with residuals (n, 2) [px] explains: an outlier lies anywhere."""
-        sigma, limit = self.options.sigma, self.ransac.max_reproj_error
+        sigma, limit = self.options.sigma, self.threshold
         if sigma is None:
             sigma = limit / _SIGMAS
         information = pixel_information(sigma, len(residuals))
@@ -190,7 +196,7 @@ def find_consensus(search: RobustSearch) -> Consensus:
         LogFocalPrior(*log_focal_range(camera, options.focal_prior)),
         ranked,
         Settings(
-            threshold=float(ransac.max_reproj_error),
+            threshold=search.threshold,
             minimal=minimal,
             size=size,
             max_iterations=_MOST_EXHAUSTIVE if exhaustive else int(ransac.max_iterations),

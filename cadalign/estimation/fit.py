@@ -313,9 +313,12 @@ def _fit_one(
         result = result_of_solution(problems, solutions, options, time.perf_counter() - start)
     else:
         # Only here: most programs never search for outliers, and its kernels take time to import.
-        from cadalign.estimation.robust import fit_robustly
+        if options.sigma is None and ransac.max_reproj_error is None:
+            from cadalign.estimation.robust_similar import fit_similar_robustly as search
+        else:
+            from cadalign.estimation.robust import fit_robustly as search
 
-        result = fit_robustly(problems, options, ransac, confidences, start)
+        result = search(problems, options, ransac, confidences, start)
     return result if symmetry is None else canonical_result(result, symmetry)
 
 

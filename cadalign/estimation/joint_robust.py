@@ -21,6 +21,8 @@ from cadalign.solvers.optimal import optimal_batch
 
 OUTLIER_COST = 5.0
 """Cost of a keypoint that is left out, beyond the square of its threshold."""
+_WIDENING = 3.0  # standard deviations of a displacement that a threshold allows for
+_NEAREST = 1e-9  # depth
 _INLIER_RATIO = 0.5
 _LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
 _REFINED = 8
@@ -68,7 +70,7 @@ def robust_starts(
 
 
 def robust_minima(
-    evidence: Evidence, starts: Starts, threshold: FloatArray, *, settles: bool
+    evidence: Evidence, starts: Starts, threshold: FloatArray, *, settles: bool, projects: bool
 ) -> tuple[list[JointConsensus], int]:
     """Estimates that most keypoints support, the best first, with the iterations they took.
 
@@ -84,11 +86,15 @@ def robust_minima(
         Largest whitened residual of an inlier.
     settles : bool
         Refine on the inliers until these don't change any more, and not only once.
+    projects : bool
+        Widen thresholds by what each point's own displacement projects to: the residual of one that
+        is left out has all of it.
     """
     minima, iterations = search_joint(with_loss(evidence, CAUCHY), *starts)
     found = []
     for state in minima.states[:_KEPT]:
-        refined = _settle(evidence, state, threshold, _ROUNDS if settles else 1)
+        limits = np.hypot(threshold, _WIDENING * _projected(evidence, state) * projects)
+        refined = _settle(evidence, state, limits, _ROUNDS if settles else 1)
         if refined is not None:
             found.append(refined)
     found.sort(key=lambda consensus: consensus.score)
@@ -131,6 +137,16 @@ def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     a, b, c = sightings.whitening.T
     lengths = np.hypot(a * error[:, 0] + b * error[:, 1], c * error[:, 1])
     return np.where(seen[:, 2] > 0, lengths, np.inf)
+
+
+def _projected(evidence: Evidence, state: State) -> FloatArray:
+    """Whitened standard deviations (N,) that the points' displacements project to."""
+    sightings, shape = evidence.sightings, evidence.shape
+    points = points_of(shape, state)[sightings.point]
+    depths = seen_in_cameras(evidence, state, points, sightings.image)[:, 2]
+    root = np.sqrt(sightings.whitening[:, 0] * sightings.whitening[:, 2])
+    scale = np.exp(state.log_scales.mean())
+    return np.asarray(root * scale * shape.spread[sightings.point] / np.maximum(depths, _NEAREST))
 
 
 def with_loss(evidence: Evidence, loss: int) -> Evidence:

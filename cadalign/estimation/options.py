@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,9 @@ keypoints determine as it is, and proper, so that what they leave open has an op
 volume."""
 LOSSES = {"linear": LINEAR, "huber": HUBER, "cauchy": CAUCHY}
 MINIMAL_SOLVERS = {"ap4p": AP4P, "aepnp": AEPNP}
+
+INLIER_SIGMAS = 4.0
+"""Standard deviations of a keypoint within which the robust search takes it for an inlier."""
 
 Sigma = float | npt.ArrayLike
 
@@ -218,8 +221,9 @@ class RansacOptions:
         If a value is out of range or unknown.
     """
 
-    max_reproj_error: float = 4.0
-    """Largest reprojection error of an inlier [px]."""
+    max_reproj_error: float | None = None
+    """Largest reprojection error of an inlier [px]: by default 4 sigma and as much as the model's
+    own uncertainty projects to; where sigma is estimated, what the residuals suggest."""
     max_iterations: int = 10_000
     """Largest number of samples. With few points all subsets are tried once instead."""
     min_iterations: int = 100
@@ -236,8 +240,9 @@ class RansacOptions:
     the best hypothesis as the minimal solver left it."""
 
     def __post_init__(self) -> None:
-        error = as_positive(self.max_reproj_error, name="max_reproj_error")
-        object.__setattr__(self, "max_reproj_error", error)
+        if self.max_reproj_error is not None:
+            error = as_positive(self.max_reproj_error, name="max_reproj_error")
+            object.__setattr__(self, "max_reproj_error", error)
         for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
             value = getattr(self, name)
             if not is_whole(value) or not least <= value < 2**63:
@@ -249,6 +254,16 @@ class RansacOptions:
             what = f"{quote(self.success_prob)} is not between 0 and 1"
             raise InputError(what, where="success_prob")
         _check_known("minimal", self.minimal, MINIMAL_SOLVERS)
+
+    def threshold(self, sigma: Sigma | None) -> float:
+        """Largest reprojection error [px] of an inlier, for keypoints of this sigma."""
+        if self.max_reproj_error is not None:
+            return self.max_reproj_error
+        if sigma is None or np.ndim(sigma) == 0:
+            return INLIER_SIGMAS * (1.0 if sigma is None else float(cast(float, sigma)))
+        spread = np.asarray(sigma, dtype=np.float64)
+        variances = spread**2 if spread.ndim == 1 else spread.trace(axis1=-2, axis2=-1) / 2
+        return INLIER_SIGMAS * float(np.sqrt(variances.mean()))
 
 
 def _check_known(name: str, value: object, known: Collection[str]) -> None:

@@ -94,7 +94,7 @@ def _refined(search: RobustSearch, best: Consensus, start: float) -> tuple[Conse
     for last in range(_INLIER_ROUNDS + 1):
         result = _fit_inliers(search.problems, search.options, inliers, start)
         residuals = search.residuals_of(result.alignment, result.camera)
-        kept = np.linalg.norm(residuals, axis=1) < search.ransac.max_reproj_error
+        kept = np.linalg.norm(residuals, axis=1) < search.threshold
         if (kept == inliers).all() or kept.sum() < inliers.sum() or last == _INLIER_ROUNDS:
             break
         inliers = kept

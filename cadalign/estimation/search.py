@@ -72,6 +72,13 @@ class JointProblem(NamedTuple):
         """True if the keypoints' noise is to be estimated."""
         return any(view.sigma is None and len(view.keypoint_ids) for view in self.views)
 
+    def threshold(self, ransac: RansacOptions) -> float:
+        """Largest reprojection error of an inlier [px], by the noise alone."""
+        seen = [view for view in self.views if len(view.keypoint_ids)]
+        sigmas = [self.noise if view.sigma is None else view.sigma for view in seen]
+        limits = [ransac.threshold(sigma) for sigma in sigmas] or [ransac.threshold(None)]
+        return float(np.sqrt(np.mean(np.square(limits))))
+
     def evidence(self, shape: Shape, lenses: Lenses) -> Evidence:
         """The evidence about one component of the shape, with rays of ``lenses``."""
         everything = evidence_of(
@@ -147,8 +154,14 @@ def _find_minima(
         if ransac is None:
             found, used = _search(evidence, starts)
         else:
-            threshold = _thresholds(evidence, problem.lenses, ransac.max_reproj_error)
-            found, used = robust_minima(evidence, starts, threshold, settles=ransac.refine)
+            threshold = _thresholds(evidence, problem.lenses, problem.threshold(ransac))
+            found, used = robust_minima(
+                evidence,
+                starts,
+                threshold,
+                settles=ransac.refine,
+                projects=ransac.max_reproj_error is None,
+            )
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
@@ -156,7 +169,8 @@ def _find_minima(
             for each in found
         )
     if ransac is not None and minima:
-        _check_support(problem, min(minima, key=lambda each: each.score), ransac.max_reproj_error)
+        best = min(minima, key=lambda each: each.score)
+        _check_support(problem, best, problem.threshold(ransac))
     if problem.lenses.have_distortion:
         minima = [_relinearised(problem, each) for each in minima]
     minima.sort(key=lambda minimum: minimum.score)
@@ -271,7 +285,7 @@ def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions) -
 
 def _explained(problem: JointProblem, minimum: Minimum, ransac: RansacOptions) -> Explained:
     """What a minimum explains: an outlier lies anywhere, whatever its threshold is."""
-    rejected, error = ~minimum.inliers, ransac.max_reproj_error
+    rejected, error = ~minimum.inliers, problem.threshold(ransac)
     evidence = problem.evidence(minimum.evidence.shape, minimum.lenses)
     squares = _thresholds(evidence, minimum.lenses, error)[rejected] ** 2
     areas = _areas(problem.views, error)[evidence.sightings.image[rejected]]

@@ -8,12 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import NoConsensusError
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 
-_LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
+LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
+_MOST_NAMED = 5  # keypoints, in a message
 _LEAST_GAIN = 2.0  # of -2 log likelihood, by which corrected data must explain more
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
@@ -143,32 +144,49 @@ def check_support(
     where: str,
     solutions: float = MAX_SOLUTIONS,
     chance: float = 0.1,
+    disagreeing: str = "",
 ) -> None:
     """Refuse an estimate whose poses have no more support together than chance gives.
 
     ``size`` keypoints determine a pose, with so many ``solutions``; ``score`` is the truncated sum
-    of squares [px^2]. ``chance`` bounds the expected number of models with as much support.
+    of squares [px^2]. ``chance`` bounds the expected number of models with as much support;
+    ``disagreeing`` are words about keypoints that disagree.
 
     Raises
     ------
     NoConsensusError
         It carries the score.
     """
-    logarithm = sum(min(0.0, _log_expected_by_chance(each, size, solutions)) for each in supports)
+    logarithm = sum(min(0.0, log_expected_by_chance(each, size, solutions)) for each in supports)
     if np.isfinite(score) and logarithm <= math.log(chance):
         return
     inliers, count = sum(len(each.errors) for each in supports), sum(n for _, n, _ in supports)
     raise NoConsensusError(
         f"no alignment is supported: the best has {inliers} of {count} keypoints within "
-        f"{max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)",
+        f"{max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)"
+        + (f"; {disagreeing}" if disagreeing else ""),
         where=where,
-        fix="check the correspondences and the camera, or raise max_reproj_error or max_iterations",
+        fix="check the correspondences and the camera, raise max_reproj_error or max_iterations, "
+        'or use loss="cauchy" for a model that is only similar',
         score=score,
         inliers=inliers,
     )
 
 
-def _log_expected_by_chance(support: Support, size: int, solutions: float) -> float:
+def disagreeing(errors: FloatArray, kept: BoolArray) -> str:
+    """Words about the keypoints with the largest errors (n,) [px] of those that are not kept."""
+    rows = [row for row in np.argsort(-errors).tolist() if not kept[row]]
+    if not rows:
+        return ""
+    listed = ", ".join(
+        f"{row} ({errors[row]:.3g} px)" if np.isfinite(errors[row]) else f"{row}"
+        for row in rows[:_MOST_NAMED]
+    )
+    more = f" and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else ""
+    return f"keypoints that disagree: {listed}{more}"
+
+
+def log_expected_by_chance(support: Support, size: int, solutions: float) -> float:
     """Log of the expected number of models as well supported among keypoints scattered at random.
 
     Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
@@ -180,7 +198,7 @@ def _log_expected_by_chance(support: Support, size: int, solutions: float) -> fl
     errors, count, area = support
     if len(errors) <= size:
         return math.inf
-    radii = np.maximum(np.sort(errors), _LEAST_ERROR)
+    radii = np.maximum(np.sort(errors), LEAST_ERROR)
     logarithms = [
         math.log(solutions * (count - size))
         + _log_choose(count, k)

@@ -97,13 +97,17 @@ class ManyFits:
         return Rows([row], [timing], [_record(task.row, seen, result)])
 
     def observation(self, task: ObservationTask) -> Observation:
-        """The observation of a task.
+        """The observation of a task, with the shape that is to be fitted.
 
         Raises
         ------
         CadalignError
             If it cannot be read.
         """
+        seen, shape = self._read(task), self.options.estimate.shape
+        return seen if shape is None else replace(seen, shape=shape.absolute())
+
+    def _read(self, task: ObservationTask) -> Observation:
         options = self.options
         if isinstance(task.content, ImageKeypoints):
             return self._detected(task.content, Path(task.folder))

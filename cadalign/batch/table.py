@@ -89,7 +89,7 @@ def naming_row(row: int, source: str, observation: Observation | None) -> Row:
     image = model = name = ""
     if observation is not None:
         image = "" if observation.image is None else str(observation.image)
-        known = observation.model or observation.shape
+        known = observation.shape or observation.model
         model = "" if known is None else str(known)
         name = observation.object_name or ""
     return {"row": row, "source": source, "image": image, "object": name, "model": model}

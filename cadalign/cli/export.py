@@ -22,6 +22,9 @@ class _Options(ExportOptions):
             super().__post_init__()
 
 
+_MOST_LISTED = 10
+
+
 @dataclass(frozen=True)
 class Export:
     """Write a fit for another tool.
@@ -30,17 +33,22 @@ class Export:
     they open in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh,
     .lines.ply the box and cameras for Open3D, .csv and scene_gt.json poses for BOP with the
     stretched mesh beside them, transforms.json and COLMAP's text files the cameras.
+    A run of many fits becomes GLBs (a folder of one each, or one file), COCO's keypoints with
+    poses, BOP's results, cameras for COLMAP or nerfstudio, or a data set in the form of BOP, KITTI,
+    Pix3D, Scan2CAD or Objectron.
     """
 
-    fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON")]
-    """Result of `cadalign fit` or `cadalign annotate`."""
+    fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
+    """Result of `cadalign fit` or `cadalign annotate`; or the folder of a run of many fits."""
     to: Path
-    """File to write, or folder of a format of several files."""
+    """File to write, or folder of a format of several files. Of a run, a format's name is a folder
+    of that name: glb, coco, bop-results, colmap, nerfstudio, bop, kitti, pix3d, scan2cad,
+    objectron."""
     format: str | None = None
     """Format, by default what the name's ending tells: glb, usd, obj, ply, lines, bop-results, bop,
     scan2cad, nerfstudio, colmap, open3d-camera, coco."""
     observation: Path | None = None
-    """Observation that was fitted; by default photo.json of photo_fit/fit.json."""
+    """Observation that was fitted; by default the one that the fit's file names."""
     shape: Path | None = None
     """Learned shape that was fitted; by default the observation's."""
     metres: float = 1.0
@@ -54,8 +62,10 @@ class Export:
 
     def run(self) -> int:
         """Write the file; returns the exit code."""
-        from cadalign.cli.exported import read_exported
+        from cadalign.batch.exported import read_exported
 
+        if self.fit.is_dir():
+            return self._export_run()
         with named_as_flags(self, self.options):
             name = self.format or format_of(self.to)
             exported = read_exported(
@@ -68,3 +78,16 @@ class Export:
             path = export_object(self.to, exported, format=name, options=self.options)
         new_console().print(f"{path}: {FORMATS[name].about}", markup=False)
         return 0
+
+    def _export_run(self) -> int:
+        """Write a run; returns the exit code, 3 where some objects are left out."""
+        from cadalign.batch.exports import export_run
+
+        with named_as_flags(self, self.options):
+            found = export_run(self.fit, self.to, format=self.format, metres=self.metres)
+        console = new_console()
+        for error in found.left_out[:_MOST_LISTED]:
+            console.print(f"left out: {error}", markup=False)
+        rest = len(found.left_out)
+        console.print(f"{found.path}: {found.objects:,} objects, {rest:,} left out", markup=False)
+        return 3 if rest else 0

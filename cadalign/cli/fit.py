@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,7 +17,7 @@ from cadalign.cli.fit_options import EstimateOptions
 from cadalign.cli.options import UsageError, make_folder, named_as_flags, say, waiting
 from cadalign.errors import InputError
 from cadalign.estimation.observation_fit import refuse_photo
-from cadalign.io.documents import read_json
+from cadalign.io.documents import read_json, written_path
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 class FittedFile:
     """Result of a fit of one file, its JSON form, a table, and pictures of each view.
 
+    ``sources`` are the files of the observation and of the learned shape, which fit.json states;
     ``overlays`` are those of the model that were asked for.
     """
 
     result: Result
     data: dict[str, Any]
     table: str
+    sources: dict[str, Path] = field(default_factory=dict)
     pictures: tuple[ByteImage, ...] = ()
     overlays: tuple[ByteImage, ...] = ()
 
@@ -55,7 +57,11 @@ class FittedFile:
         from cadalign.io.files import write_text
 
         make_folder(out)
-        write_text(out / "fit.json", self.text)
+        found = {
+            name: written_path(path.absolute(), folder=out.absolute())
+            for name, path in self.sources.items()
+        }
+        write_text(out / "fit.json", json.dumps(self.data | found, indent=2) + "\n")
         paths = _write_pictures(out / "overlay.png", self.pictures)
         return paths if overlay is None else paths + _write_pictures(overlay, self.overlays)
 
@@ -250,4 +256,6 @@ class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
         pictures, overlays = draw(
             observation, result, views=views, picture=self.picture, style=style
         )
-        return replace(found, pictures=pictures, overlays=overlays)
+        shape = self.shape_of(observation)
+        sources = {"observation": path} | ({} if shape is None else {"shape": shape})
+        return replace(found, sources=sources, pictures=pictures, overlays=overlays)

@@ -36,7 +36,9 @@ from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, Imag
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import DataError, InputError, quote
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.conventions import PIXEL_CENTRE
+from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.documents import Finite, ForeignDocument, Text, convert, in_file, read_json
 from cadalign.io.files import write_json
 
@@ -249,6 +251,8 @@ class CocoObject:
         count.
     rectangle : (4,) float
         Left, top, right and bottom.
+    pose : Alignment, optional
+        From the model's axes to the camera's, with the model's scale [m].
     """
 
     image: int
@@ -256,13 +260,16 @@ class CocoObject:
     points_2d: FloatArray
     flags: IntArray
     rectangle: FloatArray
+    pose: Alignment | None = None
 
     def annotation(self, number: int) -> dict[str, Any]:
         """The annotation of a number."""
         left, top, right, bottom = self.rectangle.tolist()
         pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
         rows = zip(pixels, self.flags.tolist(), strict=True)
+        pose = {} if self.pose is None else {"pose": _written_pose(self.pose)}
         return {
+            **pose,
             "id": number,
             "image_id": self.image,
             "category_id": 1 + self.category,
@@ -272,6 +279,14 @@ class CocoObject:
             "area": (right - left) * (bottom - top),
             "iscrowd": 0,
         }
+
+
+def _written_pose(pose: Alignment) -> dict[str, Any]:
+    return {
+        "quat_wxyz": quat_wxyz_from_rotation(pose.rotation).tolist(),
+        "translation": pose.translation.tolist(),
+        "scale": pose.scale.tolist(),
+    }
 
 
 def coco_document(
@@ -307,7 +322,9 @@ def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
 
     All keypoints of a model are projected. The visibility flag is 2 for those that are marked in
     the photo, 1 for those that the alignment adds, and 0, with the coordinates 0, for those outside
-    the image. ``bbox`` is that of the mesh, or else of the keypoints, in the image.
+    the image. ``bbox`` is that of the mesh, or else of the keypoints, in the image. ``pose`` is a
+    field of its own: ``quat_wxyz`` and ``translation`` [m] from the model's axes to the camera's,
+    and ``scale`` along the model's axes [m per model unit].
 
     Raises
     ------
@@ -337,4 +354,5 @@ def _projected(placed: PlacedObject, image: int, category: int) -> CocoObject:
         rectangle = placed.bbox + PIXEL_CENTRE
     except InputError:  # an object behind the camera
         rectangle = np.zeros(4)
-    return CocoObject(image, category, np.round(pixels, 4), flags, rectangle)
+    pose = Alignment(placed.pose.rotation, placed.pose.translation, placed.scale)
+    return CocoObject(image, category, np.round(pixels, 4), flags, rectangle, pose)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -57,21 +58,40 @@ def read_exported(
     data = read_json(fit)
     if not isinstance(data, Mapping):
         raise DataError("is not a fit's result", where=str(fit), fix="give a fit.json")
-    path = observation or _observation_of(fit)
+    path = observation or _observation_of(fit, data)
     seen = Observation.load(path, needs_xyz=False)
+    with in_file(fit):
+        result = Result.from_dict(data)
+    shape = shape or _stored(fit, data, "shape")
+    return exported_object(
+        result, seen, path, shape=shape, world_from_cam=world_from_cam, metres=metres
+    )
+
+
+def exported_object(
+    result: Result,
+    seen: Observation,
+    path: Path,
+    *,
+    shape: Path | None = None,
+    world_from_cam: FloatArray | None = None,
+    metres: float = 1.0,
+) -> AlignedObject:
+    """The aligned object of a result and its observation, which errors call ``path``.
+
+    ``shape``, ``world_from_cam`` and ``metres`` are as for `read_exported`.
+    """
     known: dict[str, Any] = {
         "world_from_cam": world_from_cam,
         "metres": metres,
         "name": "model" if seen.model is None else seen.model.stem,
     }
-    with in_file(fit):
-        result = Result.from_dict(data)
     _require_same(len(result.views), len(seen.views), path, "views")
     for view, image in zip(result.views, seen.views, strict=True):
         _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
     images = [view.image for view in seen.views]
     if result.method != "align":
-        mesh = None if seen.model is None else load_mesh(seen.model)
+        mesh = None if seen.model is None else _loaded(seen.model)
         return object_of(result, mesh=mesh, images=images, **known)
     opened = _shape(result, seen, shape)
     with in_file(path):
@@ -80,8 +100,24 @@ def read_exported(
     return object_of(result, mesh=mesh, images=images, **known)
 
 
-def _observation_of(fit: Path) -> Path:
-    """The observation whose fit lies where `cadalign fit` and `cadalign annotate` write it."""
+@lru_cache(maxsize=8)
+def _loaded(path: Path) -> Mesh:
+    """Load a mesh that many objects of a run may share."""
+    return load_mesh(path)
+
+
+def _stored(fit: Path, data: Mapping[str, Any], name: str) -> Path | None:
+    """A path that the fit's file states relative to itself; None where there is no such file."""
+    text = data.get(name)
+    path = fit.parent / text if isinstance(text, str) and text else None
+    return path if path is not None and path.is_file() else None
+
+
+def _observation_of(fit: Path, data: Mapping[str, Any]) -> Path:
+    """The observation that a fit's file states, or else by where the file lies."""
+    stated = _stored(fit, data, "observation")
+    if stated is not None:
+        return stated
     folder = fit.resolve().parent
     if folder.name.endswith(_FOLDER_ENDING):
         path = folder.with_name(f"{folder.name.removesuffix(_FOLDER_ENDING)}.json")

@@ -1,0 +1,269 @@
+"""The alignments of a run in the formats of other tools."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from cadalign.batch.exported import exported_object
+from cadalign.batch.table import RECORD_COLUMNS
+from cadalign.datasets.detections.coco import write_coco_keypoints
+from cadalign.datasets.photos import bop_files
+from cadalign.datasets.photos.formats import write_photos
+from cadalign.datasets.photos.photo import Photo
+from cadalign.datasets.photos.poses import PoseEstimate
+from cadalign.datasets.sfm.colmap import write_colmap
+from cadalign.datasets.sfm.correspondences import CameraView
+from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.estimation.result import Result
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.tables import read_groups
+from cadalign.export.aligned_object import AlignedObject, ExportView, photos_of
+from cadalign.export.camera_files import write_nerf
+from cadalign.export.formats import export_object, format_of
+from cadalign.export.photo_sets import FORMS
+from cadalign.geometry.alignment import Alignment
+from cadalign.io.documents import parse_json
+from cadalign.io.files import writing
+from cadalign.io.meshes.join import join
+from cadalign.io.observation import Observation
+
+_MILLIMETRES = 1e-3
+_SAME = 1e-9
+_SCENE = "1"
+
+
+@dataclass(frozen=True, eq=False)
+class RunObject:
+    """An aligned object of a run: its row, its observation's model and category, and itself."""
+
+    row: int
+    category: str
+    exported: AlignedObject
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written: the number of objects, and why others were left out."""
+
+    path: Path
+    objects: int
+    left_out: tuple[CadalignError, ...]
+
+
+def export_run(run: Path, to: Path, *, format: str | None = None, metres: float = 1.0) -> Exported:
+    """Write the alignments of a finished run for another tool.
+
+    Parameters
+    ----------
+    run : Path
+        The run's folder.
+    to : Path
+        The file or folder to write.
+    format : str, optional
+        By default the name ``to`` itself where that is a format's, or else what its ending means:
+
+        - ``glb``: one file of each object, in a folder; or all in one, in the camera's frame;
+        - ``coco``: keypoints and poses as COCO's annotations;
+        - ``bop-results``: poses as BOP's CSV, each object's stretched mesh beside it;
+        - ``colmap``, ``nerfstudio``: the cameras in the frame of the object that each sees;
+        - ``bop``, ``kitti``, ``pix3d``, ``scan2cad``, ``objectron``: a data set with its photos.
+    metres : float
+        Length of one unit of the model [m].
+
+    Raises
+    ------
+    InputError
+        If the format is not known, or the run has no object that it can hold.
+    DataError
+        If the run cannot be read, or the files cannot be written.
+    """
+    name = format or (str(to) if str(to) in RUN_FORMATS else format_of(to))
+    if name not in RUN_FORMATS:
+        fix = f"of a run, give one of {', '.join(RUN_FORMATS)}"
+        raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
+    left_out: list[CadalignError] = []
+    objects = run_objects(RunFolder(run), metres, left_out)
+    with writing(to.parent):
+        to.parent.mkdir(parents=True, exist_ok=True)
+    count = RUN_FORMATS[name](to, objects, left_out)
+    if not count:
+        if left_out:
+            raise left_out[0]
+        raise InputError("no observation of the run is aligned", where=str(run))
+    return Exported(to, count, tuple(left_out))
+
+
+def run_objects(
+    folder: RunFolder, metres: float, left_out: list[CadalignError]
+) -> Iterator[RunObject]:
+    """The aligned objects of a run, one at a time; those that lack something are left out."""
+    if not folder.is_finished:
+        fix = "start the command that made it again: it goes on"
+        raise DataError("not a finished run of fits", where=str(folder.path), fix=fix)
+    for table in read_groups(folder.records, fix="do the run again"):
+        if table.column_names != [name for name, _ in RECORD_COLUMNS]:
+            raise DataError("not a run of fits", where=str(folder.path))
+        for record in table.to_pylist():
+            if not record["result"]:
+                continue
+            where = Path(f"{folder.path}, row {record['row']}")
+            seen = Observation.from_dict(parse_json(record["observation"], str(where)))
+            try:
+                result = Result.from_json(record["result"])
+                exported = exported_object(result, seen, where, metres=metres)
+            except CadalignError as error:
+                left_out.append(error)
+                continue
+            category = seen.shape.stem if seen.shape is not None else exported.name
+            yield RunObject(record["row"], category, exported)
+
+
+_Writer = Callable[[Path, Iterator[RunObject], list[CadalignError]], int]
+
+
+def _write_glb(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+    if path.suffix.lower() != ".glb":
+        return _write_each(path, objects, left_out)
+    placed, view = [], None
+    for each in objects:
+        try:
+            placed.append(each.exported.placed_mesh("camera").stretched(each.exported.metres))
+        except InputError as error:
+            left_out.append(error)
+        else:
+            view = view or ExportView(each.exported.views[0].camera, _NOT_MOVED)
+    if view is not None:
+        export_object(path, AlignedObject((view,), mesh=join(placed, path), name="objects"))
+    return len(placed)
+
+
+def _write_each(folder: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+    """One GLB of each object, named after its row."""
+    count = 0
+    for each in objects:
+        try:
+            export_object(folder / f"{each.row:06d}.glb", each.exported)
+        except InputError as error:
+            left_out.append(error)
+        else:
+            count += 1
+    return count
+
+
+def _write_coco(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+    photos: dict[tuple[str, object], Photo] = {}
+    count = 0
+    for photo in _photos(objects):
+        known = photos.setdefault((photo.name, photo.image), photo)
+        if known is not photo:
+            more = replace(known, objects=known.objects + photo.objects)
+            photos[photo.name, photo.image] = more
+        count += 1
+    file = path if path.suffix.lower() == ".json" else path / "keypoints.json"
+    with writing(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write_coco_keypoints(file, list(photos.values()))
+    return count
+
+
+def _photos(objects: Iterator[RunObject]) -> Iterator[Photo]:
+    """The photos of objects, each object named after its row."""
+    for each in objects:
+        for photo in photos_of(each.exported, category=each.category):
+            named = (replace(found, object_id=str(each.row)) for found in photo.objects)
+            name = photo.name if photo.image is not None else f"{each.row:06d}.png"
+            yield replace(photo, name=name, objects=tuple(named))
+
+
+def _write_bop_results(
+    path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]
+) -> int:
+    """Poses of the stretched meshes, which stand beside them as ``obj_<row + 1>.ply``."""
+    file = path if path.suffix.lower() == ".csv" else path / "results.csv"
+    with writing(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    poses, entries, numbers = [], {}, dict[str, int]()
+    for each in objects:
+        exported, number = each.exported, each.row + 1
+        scale = exported.views[0].cam_from_model.scale * exported.metres / _MILLIMETRES
+        if exported.mesh is not None:
+            entries[number] = bop_files.write_model(
+                file.parent, exported.mesh.stretched(scale), number
+            )
+        elif np.abs(scale - 1).max() > _SAME:
+            what = "BOP's poses have no stretch, and there is no mesh to stretch instead"
+            left_out.append(InputError(what, where=f"row {each.row}"))
+            continue
+        for view in exported.views:
+            stem = Path(view.image_name or "").stem
+            image = int(stem) if stem.isdecimal() else numbers.setdefault(stem, len(numbers))
+            pose = view.cam_from_model
+            shift = pose.translation * exported.metres / _MILLIMETRES
+            rigid = Alignment(pose.rotation, shift, np.ones(3))
+            poses.append(PoseEstimate(_SCENE, str(image), str(number), rigid))
+    if entries:
+        bop_files.write_models_info(file.parent, entries)
+    if poses:
+        bop_files.write_bop_results(file, poses)
+    return len({each.model_id for each in poses})
+
+
+def _cameras(objects: Iterator[RunObject]) -> list[CameraView]:
+    """The cameras in the frame of the object that each sees [m], with names of their own."""
+    found, names = [], set[str]()
+    for each in objects:
+        for number, view in enumerate(each.exported.views):
+            pose = view.cam_from_model
+            name = view.image_name or f"{each.row:06d}_{number}.png"
+            if name in names:
+                name = f"{each.row:06d}_{number}_{name}"
+            names.add(name)
+            shift = pose.translation * each.exported.metres
+            placed = Alignment(pose.rotation, shift, np.ones(3))
+            found.append(CameraView(view.camera, placed, name))
+    return found
+
+
+def _write_cameras(write: Callable[[Path, Sequence[CameraView]], None]) -> _Writer:
+    def written(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+        cameras = _cameras(objects)
+        if cameras:
+            write(path, cameras)
+        return len(cameras)
+
+    return written
+
+
+def _write_nerf(path: Path, cameras: Sequence[CameraView]) -> None:
+    file = path if path.suffix.lower() == ".json" else path / "transforms.json"
+    with writing(file.parent):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    write_nerf(file, cameras)
+
+
+def _write_data_set(form: str) -> _Writer:
+    def written(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+        photos = list(_photos(objects))
+        if not photos:
+            return 0
+        problems = write_photos(path, photos, form)
+        left_out.extend(problems)
+        return len(photos) - len(problems)
+
+    return written
+
+
+_NOT_MOVED = Alignment(np.eye(3), np.zeros(3), np.ones(3))
+RUN_FORMATS: dict[str, _Writer] = {
+    "glb": _write_glb,
+    "coco": _write_coco,
+    "colmap": _write_cameras(write_colmap),
+    "nerfstudio": _write_cameras(_write_nerf),
+    "bop-results": _write_bop_results,
+    **{form: _write_data_set(form) for form in FORMS},
+}
+"""The formats by name."""

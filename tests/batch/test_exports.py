@@ -1,0 +1,137 @@
+"""Runs in other tools' formats: what is written is read back as it was estimated."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import cadalign
+from cadalign import Alignment, Camera, Mesh, Observation, Result, Results
+from cadalign.batch.exports import export_run
+from cadalign.cli import main
+from cadalign.datasets import open as open_data
+from cadalign.datasets.photos.bop_files import RESULT_COLUMNS
+from cadalign.datasets.sfm.colmap import Colmap
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.write import write_obj_mesh
+
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+FACES = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+         [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
+
+
+def pose(turn: float) -> Alignment:
+    upright = np.diag([1.0, -1.0, -1.0])
+    c, s = np.cos(turn), np.sin(turn)
+    about_y = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    return Alignment(upright @ about_y, [-0.3, 0.3, 5.0], [1, 1.2, 0.8])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over three boxes in two photos, and an observation that fails."""
+    folder = tmp_path_factory.mktemp("boxes")
+    write_obj_mesh(folder / "box.obj", Mesh(CORNERS, FACES))
+    for name in ("000004.png", "000007.png"):
+        Image.new("RGB", (640, 480), (90, 120, 90)).save(folder / name)
+    seen = [
+        Observation(
+            CORNERS,
+            CAMERA.project(pose(0.3 + 0.5 * k).apply(CORNERS)),
+            CAMERA,
+            image=folder / ("000004.png" if k < 2 else "000007.png"),
+            model=folder / "box.obj",
+        )
+        for k in range(3)
+    ]
+    few = Observation(CORNERS[:2], seen[0].points_2d[:2], CAMERA)
+    cadalign.fit_many([*seen, few], out=folder / "run")
+    return folder / "run"
+
+
+def test_coco_has_every_object_with_its_pose(run: Path, tmp_path: Path) -> None:
+    found = export_run(run, tmp_path / "out", format="coco")
+    assert (found.objects, found.left_out) == (3, ())
+    data = json.loads((tmp_path / "out" / "keypoints.json").read_text())
+    assert [image["file_name"] for image in data["images"]] == ["000004.png", "000007.png"]
+    assert [each["image_id"] for each in data["annotations"]] == [0, 0, 1]
+    for result, each in zip(Results.open(run), data["annotations"], strict=False):
+        assert isinstance(result, Result)
+        rotation = rotation_from_quat_wxyz(np.array(each["pose"]["quat_wxyz"]))
+        np.testing.assert_allclose(rotation, result.alignment.rotation, atol=1e-9)
+        np.testing.assert_allclose(each["pose"]["translation"], result.alignment.translation)
+        np.testing.assert_allclose(each["pose"]["scale"], result.alignment.scale)
+
+
+def test_bop_results_are_poses_of_stretched_meshes(run: Path, tmp_path: Path) -> None:
+    export_run(run, tmp_path / "results.csv", metres=0.5)
+    head, *rows = (tmp_path / "results.csv").read_text().splitlines()
+    assert head == ",".join(RESULT_COLUMNS)
+    assert [row.split(",")[:3] for row in rows] == [
+        ["1", "4", "1"],
+        ["1", "4", "2"],
+        ["1", "7", "3"],
+    ]
+    sizes = np.ptp(load_mesh(tmp_path / "models" / "obj_000002.ply").vertices, axis=0)
+    np.testing.assert_allclose(sizes, np.array([1, 1.2, 0.8]) * 500, rtol=1e-4)
+
+
+def test_cameras_stand_around_the_object(run: Path, tmp_path: Path) -> None:
+    export_run(run, tmp_path / "out", format="colmap")
+    images = Colmap(tmp_path / "out")
+    results = Results.open(run)
+    rotations = [images[name].cam_from_world.rotation for name in images]
+    assert len(rotations) == 3
+    np.testing.assert_allclose(rotations[0], results.rotation[0], atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["kitti", "bop", "pix3d", "scan2cad", "objectron"])
+def test_data_sets_are_read_back(run: Path, tmp_path: Path, form: str) -> None:
+    assert export_run(run, tmp_path / form, format=form).objects == 3
+    photos = open_data(tmp_path / form)
+    objects = [found for photo in photos for found in photo.objects]
+    assert len(objects) == 3
+
+
+def test_glb_is_one_file_of_each_or_one_of_all(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["export", str(run), "--to", "glb"]) == 0
+    assert sorted(path.name for path in Path("glb").iterdir()) == [
+        "000000.glb",
+        "000001.glb",
+        "000002.glb",
+    ]
+    assert main(["export", str(run), "--to", "all.glb"]) == 0
+    assert len(load_mesh(Path("all.glb")).faces) == 3 * len(FACES)
+
+
+def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="format: the format 'usd' holds one fit; of a run, give"):
+        export_run(run, tmp_path / "out.usdz")
+    with pytest.raises(DataError, match="not a finished run of fits"):
+        export_run(tmp_path, tmp_path / "out.csv")
+
+
+def test_a_fit_remembers_its_observation(run: Path, tmp_path: Path) -> None:
+    seen = Observation(
+        CORNERS, CAMERA.project(pose(0.3).apply(CORNERS)), CAMERA, model=run.parent / "box.obj"
+    )
+    (tmp_path / "somewhere").mkdir()
+    seen.save(tmp_path / "somewhere" / "seen.json")
+    out = tmp_path / "elsewhere"
+    path = str(tmp_path / "somewhere" / "seen.json")
+    assert main(["fit", path, "--out", str(out), "--no-picture"]) == 0
+    data = json.loads((out / "fit.json").read_text())
+    assert data["observation"] == "../somewhere/seen.json"
+    assert main(["export", str(out / "fit.json"), "--to", str(tmp_path / "box.glb")]) == 0
+    assert (tmp_path / "box.glb").is_file()

@@ -21,6 +21,7 @@ from typing import Any
 import tyro
 from benchmarks.accuracy import Coverage, Solvers, UnknownFocal
 from benchmarks.annotator import Annotator
+from benchmarks.fits import Fits
 from benchmarks.masks import Masks
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
 from benchmarks.runs import Evaluation, Ransac
@@ -45,6 +46,7 @@ SECTIONS: dict[str, type[Section]] = {
     "align": Align,
     "retrieval": Retrieval,
     "evaluation": Evaluation,
+    "fits": Fits,
     "ransac": Ransac,
     "unseen_retrieval": UnseenRetrieval,
     "similar": Similar,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,18 +11,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 import poselib
-from common import COMMAND
 
 import cadalign
 from benchmarks.section import (
     BenchmarkData,
     RatioTable,
     Row,
+    Used,
     clocked,
     figure,
     processor_seconds,
     reference_seconds,
     seconds,
+    used_by_command,
 )
 from cadalign import Alignment, Camera, RansacOptions, metrics
 from cadalign.datasets import Bundler, Colmap, Correspondences, KeypointNet, write_sample_dataset
@@ -88,31 +87,11 @@ def _on_annotations(root: Path, count: int, method: str) -> Row:
     return figure(name, count / busy, "1/s", 1e3 * busy / count / reference)
 
 
-@dataclass(frozen=True)
-class _Used:
-    """Wall clock and processor time of a run [s], and its largest process [MB]."""
-
-    wall: float
-    processor: float
-    megabytes: float
-
-
-def _used_by_run(root: Path, *options: str, views: int) -> _Used:
+def _used_by_run(root: Path, *options: str, views: int) -> Used:
     """Run the command in a folder of its own, and measure it with its workers."""
     with tempfile.TemporaryDirectory() as folder:
         call = ["evaluate", "keypointnet", str(root), f"--views-per-model={views}", *options]
-        call += [f"--out={folder}/run", "--json"]
-
-        def wait() -> tuple[int, object]:
-            process = subprocess.Popen([*COMMAND, *call], stdout=subprocess.DEVNULL)
-            _, status, usage = os.wait4(process.pid, 0)
-            process.returncode = os.waitstatus_to_exitcode(status)
-            return process.returncode, usage
-
-        wall, _, (code, usage) = clocked(wait)
-    if code not in (0, 3):  # 3: some rows failed
-        raise subprocess.CalledProcessError(code, call)
-    return _Used(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+        return used_by_command([*call, f"--out={folder}/run", "--json"])
 
 
 def _whole_runs(name: str, root: Path, *options: str, views: tuple[int, int]) -> Iterator[Row]:

@@ -12,6 +12,7 @@ from resource import RUSAGE_CHILDREN, getrusage
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from common import COMMAND
 
 from cadalign.errors import CadalignError
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
@@ -111,6 +112,30 @@ def seconds_of_process(
     )
     after = getrusage(RUSAGE_CHILDREN)
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+@dataclass(frozen=True)
+class Used:
+    """Wall clock and processor time of a command [s], and its largest process [MB]."""
+
+    wall: float
+    processor: float
+    megabytes: float
+
+
+def used_by_command(call: list[str]) -> Used:
+    """Run a command of cadalign, and measure it with its workers; some of its rows may fail."""
+
+    def wait() -> tuple[int, Any]:
+        process = subprocess.Popen([*COMMAND, *call], stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        return process.returncode, usage
+
+    wall, _, (code, usage) = clocked(wait)
+    if code not in (0, 3):  # 3: some rows failed
+        raise subprocess.CalledProcessError(code, call)
+    return Used(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
 
 
 def medians_in_turns(

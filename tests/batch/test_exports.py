@@ -87,7 +87,7 @@ def test_cameras_stand_around_the_object(run: Path, tmp_path: Path) -> None:
     export_run(run, tmp_path / "out", format="colmap")
     images = Colmap(tmp_path / "out")
     results = Results.open(run)
-    rotations = [images[name].cam_from_world.rotation for name in images]
+    rotations = [each.cam_from_world.rotation for each in images]
     assert len(rotations) == 3
     np.testing.assert_allclose(rotations[0], results.rotation[0], atol=1e-9)
 

@@ -11,6 +11,7 @@ centroid, and the logarithms of scales and focal length. The draws are the same 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -275,12 +276,10 @@ def _sample(
     projected = chart.camera.project(result.alignment.apply(result.points_3d[kept]))
     observed = projected - result.residuals[kept]
     loss_weights = likelihood.weights(result.residuals[kept])
-    rng = np.random.default_rng(_SEED)
     deviations, costs, weights = np.zeros((1, 10)), np.zeros(1), np.ones(1)
-    for count in _DRAWS:
+    for round_, count in enumerate(_DRAWS):
         factor = np.linalg.cholesky(proposal)
-        normal = rng.standard_normal((count, len(free)))
-        draws = normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
+        draws = _draws(round_, len(free))
         steps = np.zeros((count, 10))
         steps[:, free] = mean + draws @ factor.T
         pixels, deviations, log_scales, log_focals = chart.evaluate(steps)
@@ -313,6 +312,16 @@ def _sample(
     prior = _prior_information(likelihood.options, size)[free]
     covariance[among] = _widened(first[among], prior, moved, weights, likely, limit)
     return covariance if np.isfinite(covariance).all() else None
+
+
+@lru_cache(maxsize=64)
+def _draws(round_: int, size: int) -> FloatArray:
+    """The standard Student draws (k, size) of a round, the same for every result."""
+    rng = np.random.default_rng(_SEED)
+    for count in _DRAWS[: round_ + 1]:
+        normal = rng.standard_normal((count, size))
+        draws = normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
+    return np.asarray(draws)
 
 
 def _widened(

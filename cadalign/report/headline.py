@@ -10,11 +10,15 @@ from typing import Any
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import HIGH, Metric
 from cadalign.evaluation.outcome import FAILED, SKIPPED
+from cadalign.evaluation.photos.options import TRUTH
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.summary import ALL, Summary, group_name
+from cadalign.evaluation.unseen.options import EXACT
 
 _MOST_REASONS = 200
+_REFERENCES = {LIMIT, EXACT, TRUTH}
+"""Methods that know what nobody does: the bound, the object's own model, the true pose."""
 OTHER_REASONS = "other reasons"
 
 
@@ -106,9 +110,9 @@ def _all_first(lines: Sequence[Summary]) -> list[Summary]:
 
 
 def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[HeadlineRow]:
-    """The rows with the best ones marked, among methods on the same, without the bound."""
+    """The rows with the best ones marked, among methods on the same that one could use."""
     best: dict[tuple[str, str], float] = {}
-    rivals = [row for row in rows if row.method != LIMIT]
+    rivals = [row for row in rows if row.method not in _REFERENCES]
     for column in columns:
         choose = max if column.better == HIGH else min
         for row in rivals:
@@ -119,7 +123,7 @@ def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[H
     counts = Counter(row.category for row in rivals)
 
     def marked(row: HeadlineRow) -> tuple[str, ...]:
-        if row.method == LIMIT or counts[row.category] < 2:
+        if row.method in _REFERENCES or counts[row.category] < 2:
             return ()
         return tuple(
             column.key

@@ -16,7 +16,8 @@ import msgspec
 import pyarrow.compute as pc
 
 from cadalign.batch.experiment import ManyFits, plan_fits
-from cadalign.batch.options import DetectorOptions, FitRunOptions
+from cadalign.batch.kinds import DetectorOptions
+from cadalign.batch.options import FitRunOptions
 from cadalign.batch.sources import ObservationTask
 from cadalign.batch.table import write_csv
 from cadalign.errors import CadalignError, DataError, InputError

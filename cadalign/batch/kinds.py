@@ -1,10 +1,11 @@
-"""Kinds of inputs: one observation, or many.
+"""Kinds of inputs, one observation or many, and what a detector's file lacks.
 
 A module that loads quickly: the command for a single observation asks it, too.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 LINES = (".jsonl", ".ndjson")
@@ -12,6 +13,21 @@ LINES = (".jsonl", ".ndjson")
 TABLE = ".csv"
 OBSERVATION, DETECTOR, OTHER = "observation", "detector", "other"
 _WILD = frozenset("*?[")
+
+
+@dataclass(frozen=True, kw_only=True)
+class DetectorOptions:
+    """What a detector's file of keypoints lacks, and which of its keypoints count."""
+
+    model: Path | None = None
+    """Keypoints of the model, NAME.keypoints.json, that those of a detector's file are paired with:
+    by name, otherwise by semantic id, otherwise by order. With --shape, the shape's by default."""
+    images: Path | None = None
+    """Folder of the photos that a detector's file names."""
+    min_score: float = 0.0
+    """Least score of a detector's keypoint that is kept."""
+    ignore_unknown: bool = False
+    """Leave out a detector's keypoints that the model does not have."""
 
 
 def is_of_many(path: Path, data: object = None) -> bool:

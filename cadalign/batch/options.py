@@ -8,24 +8,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from cadalign.batch.kinds import DetectorOptions
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.io.observation_changes import ObservationChanges
-
-
-@dataclass(frozen=True, kw_only=True)
-class DetectorOptions:
-    """What a detector's file of keypoints lacks, and which of its keypoints count."""
-
-    model: Path | None = None
-    """Keypoints of the model, NAME.keypoints.json, that those of a detector's file are paired with:
-    by name, otherwise by semantic id, otherwise by order. With --shape, the shape's by default."""
-    images: Path | None = None
-    """Folder of the photos that a detector's file names."""
-    min_score: float = 0.0
-    """Least score of a detector's keypoint that is kept."""
-    ignore_unknown: bool = False
-    """Leave out a detector's keypoints that the model does not have."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DataError, RenderError
 from cadalign.estimation.result import Result
-from cadalign.evaluation.instances.drawing import write_webp
-from cadalign.evaluation.instances.preview import write_preview
+from cadalign.evaluation.instances.pictures import write_preview, write_webp
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row

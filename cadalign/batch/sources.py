@@ -8,6 +8,7 @@ every line, ``.jsonl`` or ``.ndjson``), or a detector's file of keypoints
 from __future__ import annotations
 
 import hashlib
+from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -103,8 +104,8 @@ class Lines:
     @classmethod
     def of(cls, path: Path) -> Lines:
         """Find the lines of a file."""
-        digest, starts, place = hashlib.sha256(), [], 0
-        numbers: list[int] = []
+        digest, place = hashlib.sha256(), 0
+        starts, numbers = array("q"), array("q")  # of hundreds of thousands of lines
         with open_input(path) as file:
             for number, line in enumerate(file, start=1):
                 digest.update(line)

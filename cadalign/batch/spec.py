@@ -18,18 +18,17 @@ from cadalign.batch.table import COLUMNS as TABLE_COLUMNS
 from cadalign.batch.table import LISTS, RECORD_COLUMNS
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import Plot, cumulative
-from cadalign.evaluation.runs.opened import Cells, Run
+from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     Summary,
     by_category_and_method,
     known,
-    mean_of,
+    mean,
+    median,
     median_of,
-    where,
 )
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -157,22 +156,17 @@ def _extent(points: Sequence[Sequence[float]]) -> list[list[float]]:
     return [placed.min(axis=0).tolist(), placed.max(axis=0).tolist()]
 
 
+_STATISTICS = {
+    metrics.KEYPOINTS.key: mean(metrics.KEYPOINTS.key),
+    **{metric.key: median(metric.key) for metric in _GALLERY},
+    WARNINGS.key: mean(WARNINGS.key),
+    "milliseconds": lambda cells: 1e3 * median_of(cells["seconds"]),
+}
+
+
 def summarize(run: Run) -> list[Summary]:
     """Medians for every model, and for all together."""
-    return by_category_and_method(run, _summarize)
-
-
-def _summarize(category: str, method: str, cells: Cells) -> Summary:
-    solved = where(cells, cells["status"] == OK)
-    values = {
-        "instances": len(cells["status"]),
-        "failed": len(cells["status"]) - len(solved["status"]),
-        metrics.KEYPOINTS.key: mean_of(solved["keypoints"]),
-        **{metric.key: median_of(solved[metric.key]) for metric in _GALLERY},
-        WARNINGS.key: mean_of(solved[WARNINGS.key]),
-        "milliseconds": 1e3 * median_of(solved["seconds"]),
-    }
-    return Summary(category, {"category": category, "method": method}, values)
+    return by_category_and_method(run, _STATISTICS)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from cadalign.batch.kinds import is_of_many
-from cadalign.batch.options import DetectorOptions
+from cadalign.batch.kinds import DetectorOptions, is_of_many
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
 from cadalign.cli.fit_options import EstimateOptions
 from cadalign.cli.options import UsageError, make_folder, named_as_flags, say, waiting

@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
-from cadalign.estimation.result import Result
 from cadalign.io.documents import in_file, within
-from cadalign.io.observation import Observation
-from cadalign.io.observation_changes import ObservationChanges
-from cadalign.io.observation_file import fill_xyz
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
+    from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
+    from cadalign.io.observation import Observation
+    from cadalign.io.observation_changes import ObservationChanges
     from cadalign.shapes.model import ShapeModel
 
 _OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a learned shape lacks
@@ -223,6 +222,9 @@ class ObservationFit:
 
         Keypoints need no ``xyz`` where a learned shape is fitted.
         """
+        from cadalign.io.observation import Observation
+        from cadalign.io.observation_file import fill_xyz
+
         has_shape = isinstance(data, dict) and data.get("shape") is not None
         if self.shape is not None or (has_shape and self.takes_stored_shape):
             data = fill_xyz(data)

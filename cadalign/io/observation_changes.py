@@ -11,7 +11,6 @@ from typing import Any
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
-from cadalign.io.camera_file import read_camera
 from cadalign.io.evidence import ImageEvidence, Size, as_arguments
 from cadalign.io.observation import Observation
 
@@ -71,4 +70,6 @@ def _read_camera(
     path: Path, size: tuple[int, int] | None, pixel_origin: PixelOrigin | None
 ) -> Camera:
     """Read a camera, which runs over many observations use again and again."""
+    from cadalign.io.camera_file import read_camera
+
     return read_camera(path, size=size, pixel_origin=pixel_origin)

@@ -10,14 +10,13 @@ from typing import Any
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import HIGH, Metric
 from cadalign.evaluation.outcome import FAILED, SKIPPED
-from cadalign.evaluation.photos.options import TRUTH
+from cadalign.evaluation.photos.protocols import TRUTH
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.summary import ALL, Summary, group_name
-from cadalign.evaluation.unseen.options import EXACT
 
 _MOST_REASONS = 200
-_REFERENCES = {LIMIT, EXACT, TRUTH}
+_REFERENCES = {LIMIT, TRUTH, "exact"}
 """Methods that know what nobody does: the bound, the object's own model, the true pose."""
 OTHER_REASONS = "other reasons"
 

@@ -20,7 +20,7 @@ Columns = tuple[tuple[str, Any], ...]
 
 DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
 # A table's row groups must not show in which pieces its rows came.
-ROW_GROUP = 1 << 14
+ROW_GROUP = 1 << 12
 _TYPES = {
     str: pa.string(),
     int: pa.int64(),

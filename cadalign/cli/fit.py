@@ -43,10 +43,13 @@ class FittedFile:
     pictures: tuple[ByteImage, ...] = ()
     overlays: tuple[ByteImage, ...] = ()
 
-    @property
-    def text(self) -> str:
-        """The result as JSON text."""
-        return json.dumps(self.data, indent=2) + "\n"
+    def text(self, out: Path) -> str:
+        """The result as JSON text for a file in a folder, which its sources are relative to."""
+        sources = {
+            name: written_path(path.absolute(), folder=out.absolute())
+            for name, path in self.sources.items()
+        }
+        return json.dumps(self.data | sources, indent=2) + "\n"
 
     def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
         """Write fit.json and the pictures to a folder; returns the pictures' paths.
@@ -56,11 +59,7 @@ class FittedFile:
         from cadalign.io.files import write_text
 
         make_folder(out)
-        found = {
-            name: written_path(path.absolute(), folder=out.absolute())
-            for name, path in self.sources.items()
-        }
-        write_text(out / "fit.json", json.dumps(self.data | found, indent=2) + "\n")
+        write_text(out / "fit.json", self.text(out))
         paths = _write_pictures(out / "overlay.png", self.pictures)
         return paths if overlay is None else paths + _write_pictures(overlay, self.overlays)
 
@@ -215,9 +214,10 @@ class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
 
             return fit_many(self)
         fitted = self._fit_file(path, data)
-        paths = fitted.write(self.out or path.with_name(f"{path.stem}_fit"), overlay=self.overlay)
+        out = self.out or path.with_name(f"{path.stem}_fit")
+        paths = fitted.write(out, overlay=self.overlay)
         if self.json:
-            sys.stdout.write(fitted.text)
+            sys.stdout.write(fitted.text(out))
             return 0
         sys.stdout.write(f"{fitted.result}{fitted.table}\n")
         if paths:

@@ -87,9 +87,9 @@ def test_cameras_stand_around_the_object(run: Path, tmp_path: Path) -> None:
     export_run(run, tmp_path / "out", format="colmap")
     images = Colmap(tmp_path / "out")
     results = Results.open(run)
-    rotations = [each.cam_from_world.rotation for each in images]
-    assert len(rotations) == 3
-    np.testing.assert_allclose(rotations[0], results.rotation[0], atol=1e-9)
+    rotations = {each.id: each.cam_from_world.rotation for each in images}
+    assert sorted(rotations) == ["000001_0_000004.png", "000004.png", "000007.png"]
+    np.testing.assert_allclose(rotations["000007.png"], results.rotation[2], atol=1e-9)
 
 
 @pytest.mark.slow

@@ -72,6 +72,10 @@ def test_the_command_says_what_is_missing(
     assert main(["fit", str(observed), "--out", str(tmp_path / "elsewhere")]) == 0
     result = tmp_path / "elsewhere" / "fit.json"
     to = ("--to", tmp_path / "a.glb")
+    assert main(["export", str(result), *map(str, to)]) == 0
+    data = json.loads(result.read_text())
+    del data["observation"]  # as older files are
+    result.write_text(json.dumps(data))
     assert "--observation: " in refusal(capsys, result, *to)
     given = ("--observation", observed)
     assert main(["export", str(result), *map(str, (*to, *given))]) == 0

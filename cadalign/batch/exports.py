@@ -47,7 +47,7 @@ class RunObject:
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: the number of objects, and why others were left out."""
+    """Written files: the number of objects, and why others were left out."""
 
     path: Path
     objects: int

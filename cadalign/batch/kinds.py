@@ -17,7 +17,7 @@ _WILD = frozenset("*?[")
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorOptions:
-    """What a detector's file of keypoints lacks, and which of its keypoints count."""
+    """Complements of a detector's file of keypoints, and which of its keypoints count."""
 
     model: Path | None = None
     """Keypoints of the model, NAME.keypoints.json, that those of a detector's file are paired with:
@@ -43,7 +43,7 @@ def is_pattern(path: Path) -> bool:
 
 
 def kind_of(data: object) -> str:
-    """What the content of a JSON file is meant as."""
+    """Kind of a JSON file, by its content."""
     if isinstance(data, list):
         return DETECTOR
     if not isinstance(data, dict):

@@ -158,7 +158,7 @@ class Detections:
         return hashlib.sha256(read_bytes(self.path)).hexdigest()[:16]
 
 
-class Tasks(Sequence[ObservationTask]):
+class ObservationTasks(Sequence[ObservationTask]):
     """The observations of all inputs."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
@@ -197,7 +197,7 @@ class Tasks(Sequence[ObservationTask]):
         return hashlib.sha256(texts.encode()).hexdigest()[:16]
 
 
-def read_sources(inputs: Iterable[Path]) -> Tasks:
+def read_sources(inputs: Iterable[Path]) -> ObservationTasks:
     """Find the observations of inputs.
 
     Raises
@@ -208,7 +208,7 @@ def read_sources(inputs: Iterable[Path]) -> Tasks:
     sources: list[Source] = []
     for path in inputs:
         sources += _sources_of(path)
-    return Tasks(_files_joined(sources))
+    return ObservationTasks(_files_joined(sources))
 
 
 def _sources_of(path: Path) -> list[Source]:

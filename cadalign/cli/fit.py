@@ -227,7 +227,7 @@ class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
 
     @property
     def changes(self) -> ObservationChanges:
-        """What the options put in the place of an observation's own."""
+        """Values of the options in the place of an observation's own."""
         return replace(self.of_camera, evidence=self.given, size=self.known_size)
 
     def _fit_file(self, path: Path, data: Any) -> FittedFile:

@@ -34,7 +34,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
-from cadalign.solvers.evidence import Keypoints, LogFocalPrior, Views
+from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, Views
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
@@ -112,7 +112,7 @@ class RobustSearch:
         )
 
     def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:
-        """What an alignment with residuals (n, 2) [px] explains: an outlier lies anywhere."""
+        """Likelihood of all keypoints with residuals (n, 2) [px]: an outlier lies anywhere."""
         sigma, limit = self.options.sigma, self.threshold
         if sigma is None:
             sigma = limit / _SIGMAS
@@ -186,7 +186,7 @@ def find_consensus(search: RobustSearch) -> Consensus:
     score, log_focal, iterations, hypotheses = ransac_kernel(
         Objective(
             options.free,
-            Keypoints(
+            KeypointEvidence(
                 np.ascontiguousarray(points[order]), views.rays[0], views.whitening[0], LINEAR, 1.0
             ),
             options.scale_prior,

@@ -29,7 +29,7 @@ from cadalign.solvers.constants import (
     UNKNOWNS,
     ScalePrior,
 )
-from cadalign.solvers.evidence import Keypoints, LogFocalPrior, Views
+from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, Views
 from cadalign.solvers.focal import FocalObjective, focal_covariance, linear_focal, refine_focal
 from cadalign.solvers.optimal import MAX_MINIMA, optimal_batch
 from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima, search
@@ -65,7 +65,7 @@ class _Task:
         return FocalObjective(
             Objective(
                 self.options.free,
-                Keypoints(self.points, rays, whitening, loss, bend),
+                KeypointEvidence(self.points, rays, whitening, loss, bend),
                 self.scale_prior,
             ),
             focal_slopes(self.points_2d, self.camera.with_focal(focal), rays),

@@ -46,7 +46,7 @@ def refuse_photo(path: Path) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class ObservationFit:
-    """How an observation is aligned: model, noise, focal length and robust search."""
+    """Settings of an observation's alignment: model, noise, focal length and robust search."""
 
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""

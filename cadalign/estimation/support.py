@@ -33,7 +33,7 @@ class Support(NamedTuple):
 
 
 class Explained(NamedTuple):
-    """What an estimate explains: -2 log likelihood of all keypoints, and how many agree with it.
+    """Agreement of keypoints with an estimate: -2 log likelihood of all, and number of inliers.
 
     ``up`` is the cosine between the model's y axis and the photo's upwards.
     """

@@ -1,4 +1,4 @@
-"""What takes the place of an observation's own camera, evidence and size."""
+"""Replacements of an observation's own camera, evidence and size."""
 
 from __future__ import annotations
 

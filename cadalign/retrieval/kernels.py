@@ -21,7 +21,7 @@ from cadalign.solvers.alignment import (
     solve_damped,
 )
 from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, ScalePrior
-from cadalign.solvers.evidence import Keypoints
+from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.search import refine
@@ -50,7 +50,7 @@ class Query(NamedTuple):
 
     ids: IntArray  # (n,), ascending
     rays: FloatArray  # (n, 2), normalised image coordinates
-    whitening: FloatArray  # (1 or n, 3); see `cadalign.solvers.evidence.Keypoints`, as the next
+    whitening: FloatArray  # (1 or n, 3); as of solvers.evidence.KeypointEvidence, as the next
     loss: int
     loss_scale: float
     prior_weight: float
@@ -146,7 +146,7 @@ def _centred_objective(
         rays[i] = query.rays[seen[i]]
         if each:
             whitening[i] = query.whitening[seen[i]]
-    keypoints = Keypoints(centred, rays, whitening, query.loss, query.loss_scale)
+    keypoints = KeypointEvidence(centred, rays, whitening, query.loss, query.loss_scale)
     return Objective(query.free, keypoints, ScalePrior(query.prior_weight, 0.0))
 
 

@@ -15,7 +15,7 @@ from cadalign.compile import borrowing, inlined, kernel
 from cadalign.solvers.constants import LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import (
     BLOCK,
-    Keypoints,
+    KeypointEvidence,
     add_keypoints,
     add_scale_prior,
     keypoint_cost,
@@ -41,7 +41,7 @@ class Objective(NamedTuple):
     """Evidence of one problem; ``free`` (8,) is 0 for an unknown that keeps its value, else 1."""
 
     free: FloatArray
-    keypoints: Keypoints
+    keypoints: KeypointEvidence
     scale_prior: ScalePrior
 
 
@@ -76,7 +76,7 @@ def room_for_two(unknowns: int) -> tuple[Equations, Equations]:
 def keypoint_objective(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> Objective:
     """The plain objective: keypoints with squared errors, all unknowns free, no prior."""
     points = np.require(points, np.float64, ["C", "W"])
-    keypoints = Keypoints(points, rays, whitening, LINEAR, 1.0)
+    keypoints = KeypointEvidence(points, rays, whitening, LINEAR, 1.0)
     return Objective(np.ones(UNKNOWNS), keypoints, ScalePrior(0.0, 0.0))
 
 
@@ -178,7 +178,7 @@ def are_same_poses(objective: Objective, first: FloatArray, second: FloatArray) 
 
 
 @kernel
-def with_keypoints(objective: Objective, keypoints: Keypoints) -> Objective:
+def with_keypoints(objective: Objective, keypoints: KeypointEvidence) -> Objective:
     """The same objective for other keypoints."""
     return Objective(objective.free, keypoints, objective.scale_prior)
 
@@ -188,5 +188,5 @@ def with_points(objective: Objective, points: FloatArray) -> Objective:
     """The same objective for other model points."""
     old = objective.keypoints
     return with_keypoints(
-        objective, Keypoints(points, old.rays, old.whitening, old.loss, old.loss_scale)
+        objective, KeypointEvidence(points, old.rays, old.whitening, old.loss, old.loss_scale)
     )

@@ -26,7 +26,7 @@ BLOCK = 32
 """Points whose derivatives are written before their products are summed."""
 
 
-class Keypoints(NamedTuple):
+class KeypointEvidence(NamedTuple):
     """Model points (n, 3), their observed rays (n, 2), and the loss on their whitened residuals.
 
     A row (a, b, c) of ``whitening`` (1 or n, 3) is such that (a du + b dv, c dv) has unit
@@ -59,7 +59,7 @@ class Views(NamedTuple):
 
 @inlined
 def add_keypoints(
-    keypoints: Keypoints,
+    keypoints: KeypointEvidence,
     pose: FloatArray,
     rows: FloatArray,
     hessian: FloatArray,
@@ -81,7 +81,7 @@ def add_keypoints(
 
 @borrowing
 def keypoint_rows(
-    keypoints: Keypoints, pose: FloatArray, start: int, size: int, rows: FloatArray
+    keypoints: KeypointEvidence, pose: FloatArray, start: int, size: int, rows: FloatArray
 ) -> float:
     """Write whitened, loss-weighted derivatives and residuals of a block of points.
 
@@ -151,7 +151,7 @@ def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: 
 
 
 @borrowing
-def keypoint_cost(keypoints: Keypoints, pose: FloatArray) -> float:
+def keypoint_cost(keypoints: KeypointEvidence, pose: FloatArray) -> float:
     """The keypoints' cost; infinite if a point lies behind the camera."""
     points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
     scalars = scalars_of(pose)
@@ -171,7 +171,7 @@ def keypoint_cost(keypoints: Keypoints, pose: FloatArray) -> float:
 
 
 @inlined
-def squared_error(keypoints: Keypoints, pose: Scalars, i: int) -> float:
+def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
     """Squared whitened residual of keypoint i; infinite behind the camera."""
     points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
     w = i if whitening.shape[0] > 1 else 0
@@ -182,7 +182,7 @@ def squared_error(keypoints: Keypoints, pose: Scalars, i: int) -> float:
 
 
 @kernel
-def take_keypoints(keypoints: Keypoints, chosen: IntArray) -> Keypoints:
+def take_keypoints(keypoints: KeypointEvidence, chosen: IntArray) -> KeypointEvidence:
     """The keypoints with the numbers ``chosen`` (k,)."""
     count = chosen.shape[0]
     each = keypoints.whitening.shape[0] > 1
@@ -194,7 +194,7 @@ def take_keypoints(keypoints: Keypoints, chosen: IntArray) -> Keypoints:
         copy_into(rays[k], keypoints.rays[chosen[k]])
     for k in range(whitening.shape[0]):
         copy_into(whitening[k], keypoints.whitening[chosen[k] if each else 0])
-    return Keypoints(points, rays, whitening, keypoints.loss, keypoints.loss_scale)
+    return KeypointEvidence(points, rays, whitening, keypoints.loss, keypoints.loss_scale)
 
 
 @inlined

@@ -30,7 +30,7 @@ from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, UNOBSERVABLE
 from cadalign.solvers.covariance import center_and_unit, centered, invert, uncenter_covariance
 from cadalign.solvers.evidence import (
     BLOCK,
-    Keypoints,
+    KeypointEvidence,
     LogFocalPrior,
     add_products,
     add_scale_prior,
@@ -103,7 +103,7 @@ def at_focal(objective: Objective, slopes: FloatArray, log_ratio: float) -> Obje
     rays = old.rays / ratio
     if slopes.shape[0] > 0:
         rays += slopes * (log_ratio / ratio)
-    keypoints = Keypoints(old.points, rays, old.whitening * ratio, old.loss, old.loss_scale)
+    keypoints = KeypointEvidence(old.points, rays, old.whitening * ratio, old.loss, old.loss_scale)
     return with_keypoints(objective, keypoints)
 
 

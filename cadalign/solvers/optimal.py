@@ -18,7 +18,7 @@ from cadalign.solvers.constants import (
     ScalePrior,
 )
 from cadalign.solvers.covariance import center_and_unit, covariance_of
-from cadalign.solvers.evidence import Keypoints, take_keypoints
+from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
@@ -68,7 +68,7 @@ def optimal_batch(
         if end - start < min_points:
             statuses[b] = TOO_FEW
             continue
-        keypoints = Keypoints(
+        keypoints = KeypointEvidence(
             points[start:end],
             rays[start:end],
             whitening[start:end] if whitening.shape[0] > 1 else whitening,

@@ -18,7 +18,7 @@ from cadalign.compile import kernel
 from cadalign.solvers.alignment import Objective, with_keypoints
 from cadalign.solvers.constants import AP4P, OK, POSE_SIZE
 from cadalign.solvers.evidence import (
-    Keypoints,
+    KeypointEvidence,
     LogFocalPrior,
     Views,
     relative_to,
@@ -175,7 +175,9 @@ def ransac_kernel(
 def _view(objective: Objective, views: Views, f: int) -> Objective:
     """The objective with the rays and weights of one focal length."""
     old = objective.keypoints
-    keypoints = Keypoints(old.points, views.rays[f], views.whitening[f], old.loss, old.loss_scale)
+    keypoints = KeypointEvidence(
+        old.points, views.rays[f], views.whitening[f], old.loss, old.loss_scale
+    )
     return with_keypoints(objective, keypoints)
 
 
@@ -193,7 +195,7 @@ def _needed_samples(inlier_ratio: float, settings: Settings) -> float:
 
 @kernel
 def _solve_sample(
-    keypoints: Keypoints,
+    keypoints: KeypointEvidence,
     minimal: int,
     chosen: IntArray,
     memory: FloatArray,
@@ -208,7 +210,7 @@ def _solve_sample(
 
 @kernel
 def _score_pose(
-    keypoints: Keypoints,
+    keypoints: KeypointEvidence,
     pose: FloatArray,
     limit: float,
     best: float,

@@ -98,7 +98,7 @@ def _volume(points: FloatArray, chosen: IntArray) -> float:
 
 @kernel
 def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float:
-    """How far points (n, 3) leave a plane, in standard deviations of the noise in their image.
+    """Distance of points (n, 3) from their plane, in standard deviations of their image's noise.
 
     The root mean square distance from the plane that fits best, about: for small ones, the least
     eigenvalue of a covariance is its determinant over the sum of its principal minors.

@@ -13,7 +13,7 @@ from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.geometry.projection import perspective
 from cadalign.solvers.alignment import Objective, evaluate_alignment, evaluate_cost, room_for
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
-from cadalign.solvers.evidence import Keypoints, LogFocalPrior, ScalePrior
+from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, ScalePrior
 from cadalign.solvers.focal import FocalObjective
 from cadalign.solvers.projection import project_point, ray_derivatives, scalars_of
 from cadalign.solvers.search import cost_at, evaluate, move, room_of
@@ -116,7 +116,7 @@ def test_gradient_of_all_evidence_is_that_of_the_cost(
     free = np.array([1.0, 1, 1, 1, 1, 1, 1, rng.integers(2)])
     objective = Objective(
         free,
-        Keypoints(
+        KeypointEvidence(
             points,
             perspective(alignment.apply(points)) + rng.normal(scale=0.02, size=(len(points), 2)),
             np.abs(rng.normal(100, 10, (count, 3))),
@@ -149,7 +149,7 @@ def test_gradient_with_the_focal_length_is_that_of_the_cost(
     alignment, points = pose_and_points(seed, 40)
     rng = np.random.default_rng(seed)
     rays = perspective(alignment.apply(points)) + rng.normal(scale=0.02, size=(len(points), 2))
-    keypoints = Keypoints(points, rays, np.array([[100.0, 3.0, 90.0]]), CAUCHY, 2.0)
+    keypoints = KeypointEvidence(points, rays, np.array([[100.0, 3.0, 90.0]]), CAUCHY, 2.0)
     slopes = rng.normal(scale=0.02, size=(len(points) if lens else 0, 2))
     prior = LogFocalPrior(-2.0, 2.0, 0.1, weight)
     system = FocalObjective(

@@ -85,7 +85,7 @@ class Place(NamedTuple):
         return Place(moved, self.own + own.reshape(self.own.shape))
 
 
-class Look(NamedTuple):
+class PlacedRims(NamedTuple):
     """Rims at a place: of every contour, with its camera and the bias of its extraction."""
 
     posed: PosedSurface
@@ -103,7 +103,7 @@ class Stacked(NamedTuple):
     """
 
     place: Place
-    look: Look
+    look: PlacedRims
     evidence: Evidence
     state: State
     cost: float
@@ -116,7 +116,7 @@ class Stacked(NamedTuple):
         return state_with_points(place.state, keypoints, total, place.own.ravel())
 
 
-def look_at(masked: Masked, place: Place, reach: float, *, is_fine: bool) -> Look:
+def rims_at(masked: Masked, place: Place, reach: float, *, is_fine: bool) -> PlacedRims:
     """Find the rims at a place; ``is_fine`` measures the bias of their extraction, too."""
     evidence, (state, own) = masked.evidence, place
     posed, poses = masked.surface.at(evidence.shape, state), poses_of(evidence, state)
@@ -130,11 +130,11 @@ def look_at(masked: Masked, place: Place, reach: float, *, is_fine: bool) -> Loo
         cameras.append(camera)
         rims.append(found)
         biases.append(bias)
-    return Look(posed, poses, cameras, rims, biases)
+    return PlacedRims(posed, poses, cameras, rims, biases)
 
 
 def stack(
-    masked: Masked, place: Place, look: Look, noises: list[Noise], reach: float
+    masked: Masked, place: Place, look: PlacedRims, noises: list[Noise], reach: float
 ) -> Stacked | None:
     """The rims of a place as evidence; None where there are none."""
     rows = [
@@ -175,7 +175,7 @@ class Descent(NamedTuple):
 
     def at(self, place: Place) -> Stacked | None:
         """The rims of a place as evidence; None where there are none."""
-        look = look_at(self.masked, place, self.reach, is_fine=self.masked.surface.is_exact)
+        look = rims_at(self.masked, place, self.reach, is_fine=self.masked.surface.is_exact)
         return stack(self.masked, place, look, self.noises, self.reach)
 
     def run(self, here: Stacked) -> tuple[Stacked, int]:

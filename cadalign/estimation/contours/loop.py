@@ -14,11 +14,11 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.estimation.contours.descent import (
     Descent,
-    Look,
     Masked,
     Place,
+    PlacedRims,
     Stacked,
-    look_at,
+    rims_at,
     stack,
     step_of,
 )
@@ -90,7 +90,7 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
     place, noises, reach, rounds = approached
     is_exact, here = masked.surface.is_exact, None
     for _ in range(_MOST_NOISES):
-        look = look_at(masked, place, reach, is_fine=is_exact) if here is None else here.look
+        look = rims_at(masked, place, reach, is_fine=is_exact) if here is None else here.look
         learned = _learned(masked, place, look, noises, reach, correlated=True)
         if here is not None and is_exact:
             learned, own = with_learned_offsets(here.evidence, here.state, learned, place.own)
@@ -139,7 +139,7 @@ def _approach(
     last: list[Rims] = []
     rounds = 0
     while rounds < _MOST_ROUNDS:
-        look = look_at(masked, place, reach, is_fine=False)
+        look = rims_at(masked, place, reach, is_fine=False)
         widest = max(noise.sigma for noise in noises)
         if _change(last, look.rims) < _SETTLED * max(1.0, widest):
             break
@@ -172,7 +172,7 @@ def _change(last: list[Rims], rims: list[Rims]) -> float:
 def _learned(
     masked: Masked,
     place: Place,
-    look: Look,
+    look: PlacedRims,
     noises: list[Noise],
     reach: float,
     *,

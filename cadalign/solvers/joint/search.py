@@ -82,7 +82,7 @@ def refine_joint(
 
 
 def objective_of(evidence: Evidence, state: State) -> float:
-    """What `refine_joint` lowers: the cost, with the log determinant of what is integrated out."""
+    """Objective of `refine_joint`: the cost, with the log determinant of what is integrated out."""
     reduction = reduce_modes(evidence)
     row = packed(reduced_state(reduction, evidence.shape, state))
     return float(joint_cost(Joint(reduction.evidence, has_latent(reduction.evidence)), row))

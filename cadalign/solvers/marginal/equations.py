@@ -32,7 +32,7 @@ from cadalign.compile import borrowing, fast_sums, inlined, kernel
 from cadalign.solvers.alignment import Equations, room_for, solve_damped
 from cadalign.solvers.constants import HUBER, LINEAR, POSE_SIZE
 from cadalign.solvers.evidence import (
-    Keypoints,
+    KeypointEvidence,
     keypoint_cost,
     loss_and_root,
     score_of_distance,
@@ -326,7 +326,7 @@ def posed_cost(system: Posed, state: FloatArray) -> float:
         prior += state[POSE + k] * state[POSE + size + k]
     pose = np.ones(POSE_SIZE)
     copy_into(pose[:POSE], state[:POSE])
-    keypoints = Keypoints(points, seen.rays, seen.whitening, seen.loss, seen.loss_scale)
+    keypoints = KeypointEvidence(points, seen.rays, seen.whitening, seen.loss, seen.loss_scale)
     return keypoint_cost(keypoints, pose) + prior
 
 

@@ -30,7 +30,7 @@ class Mixture(NamedTuple):
 class Seen(NamedTuple):
     """Keypoints of a view: their ``points`` (n,), rays (n, 2), whitening (n, 3), and the loss.
 
-    Whitening and loss are as in `cadalign.solvers.evidence.Keypoints`.
+    Whitening and loss are as in `cadalign.solvers.evidence.KeypointEvidence`.
     """
 
     points: IntArray

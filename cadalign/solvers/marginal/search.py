@@ -13,7 +13,7 @@ from cadalign.compile import kernel
 from cadalign.solvers.alignment import Objective, evaluate_cost
 from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.covariance import center_and_unit
-from cadalign.solvers.evidence import Keypoints
+from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
 from cadalign.solvers.marginal.equations import Posed, state_at
 from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, target_of
@@ -122,7 +122,7 @@ def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
     whitening = _widened(target, seen)
-    keypoints = Keypoints(points, seen.rays, whitening, seen.loss, seen.loss_scale)
+    keypoints = KeypointEvidence(points, seen.rays, whitening, seen.loss, seen.loss_scale)
     objective = Objective(free, keypoints, ScalePrior(0.0, 0.0))
     grid = np.empty((_ROTATIONS, POSE_SIZE))
     count = rotation_starts(points, seen.rays, grid)

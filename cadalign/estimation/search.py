@@ -284,7 +284,7 @@ def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions) -
 
 
 def _explained(problem: JointProblem, minimum: Minimum, ransac: RansacOptions) -> Explained:
-    """Likelihood of all keypoints at a minimum: outliers, whatever their threshold, lie anywhere."""
+    """Likelihood of all keypoints at a minimum: outliers of any threshold lie anywhere."""
     rejected, error = ~minimum.inliers, problem.threshold(ransac)
     evidence = problem.evidence(minimum.evidence.shape, minimum.lenses)
     squares = _thresholds(evidence, minimum.lenses, error)[rejected] ** 2

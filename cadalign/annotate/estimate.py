@@ -23,8 +23,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.misfit import find_outliers
-from cadalign.estimation.uncertainty.tested import Rows
+from cadalign.estimation.uncertainty.outliers import Rows, find_outliers
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh

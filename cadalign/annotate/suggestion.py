@@ -17,7 +17,6 @@ from cadalign.errors import CadalignError
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
-from cadalign.estimation.uncertainty.prediction import predicted_covariances, projection_jacobian
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -25,6 +24,7 @@ from cadalign.geometry.conventions import rescaled_pixels, resized_camera
 from cadalign.geometry.projection import projected_covariances
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.views.visibility import visible_keypoints
+from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
 _BENEATH = 0.02  # depth of visible keypoints beneath the warped surface [diagonals]
 _APART = 0.02  # least distance of a corner from marked points [diagonals]

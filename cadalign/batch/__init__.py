@@ -6,8 +6,8 @@ from cadalign.lazy import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.batch.fits import fit_many, run_fits, stream_fits
-    from cadalign.batch.kinds import DetectorOptions
     from cadalign.batch.options import FitRunOptions
+    from cadalign.io.input_kinds import DetectorOptions
 
 __all__ = ["DetectorOptions", "FitRunOptions", "fit_many", "run_fits", "stream_fits"]
 

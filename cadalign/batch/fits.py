@@ -16,7 +16,6 @@ import msgspec
 import pyarrow.compute as pc
 
 from cadalign.batch.experiment import ManyFits, plan_fits
-from cadalign.batch.kinds import DetectorOptions
 from cadalign.batch.options import FitRunOptions
 from cadalign.batch.sources import ObservationTask
 from cadalign.batch.table import write_csv
@@ -31,8 +30,8 @@ from cadalign.evaluation.runs.parallel import Chunk
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.io.files import write_whole
-from cadalign.io.observation import Observation
-from cadalign.io.observation_changes import ObservationChanges
+from cadalign.io.input_kinds import DetectorOptions
+from cadalign.io.observation import Observation, ObservationChanges
 
 _FEW = 200  # observations, which are aligned sooner than processes start
 _STREAMED = 16  # observations that a worker gets at a time

@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from cadalign.batch.kinds import DetectorOptions
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.io.observation_changes import ObservationChanges
+from cadalign.io.input_kinds import DetectorOptions
+from cadalign.io.observation import ObservationChanges
 
 
 @dataclass(frozen=True, kw_only=True)

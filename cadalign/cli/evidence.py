@@ -13,8 +13,7 @@ from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
 from cadalign.io.evidence import Size, evidence_fields
-from cadalign.io.observation import Observation
-from cadalign.io.observation_changes import ObservationChanges
+from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.io.observation_file import SizeFields, read_size
 
 

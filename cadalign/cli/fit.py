@@ -4,28 +4,82 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from cadalign.batch.kinds import DetectorOptions, is_of_many
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
-from cadalign.cli.fit_options import EstimateOptions
-from cadalign.cli.options import UsageError, make_folder, named_as_flags, say, waiting
+from cadalign.cli.options import (
+    ObservationCommand,
+    OptionError,
+    UsageError,
+    flag_of,
+    make_folder,
+    named_as_flags,
+    say,
+    waiting,
+)
 from cadalign.errors import InputError
-from cadalign.estimation.observation_fit import refuse_photo
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.observation_fit import ObservationFit, refuse_photo
+from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import read_json, written_path
+from cadalign.io.input_kinds import DetectorOptions, is_of_many
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
-    from cadalign.io.observation import Observation
-    from cadalign.io.observation_changes import ObservationChanges
+    from cadalign.io.observation import Observation, ObservationChanges
     from cadalign.render import OverlayStyle
     from cadalign.render.drawing.color import ByteImage
+
+
+@dataclass(frozen=True)
+class _FitOptions(FitOptions):
+    """Method and model; the observation file supplies the other options."""
+
+    sigma: tyro.conf.Suppress[Sigma | None] = FitOptions.sigma
+    focal: tyro.conf.Suppress[str] = FitOptions.focal
+    focal_prior: tyro.conf.Suppress[FocalPrior | None] = FitOptions.focal_prior
+
+    def __post_init__(self) -> None:
+        with named_as_flags(self, kind=OptionError):
+            super().__post_init__()
+
+
+@dataclass(frozen=True)
+class _RansacOptions(RansacOptions):
+    """Search for outliers (LO-RANSAC), with --robust."""
+
+    def __post_init__(self) -> None:
+        with named_as_flags(self, kind=OptionError):
+            super().__post_init__()
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateOptions(ObservationFit, ObservationCommand):
+    """Model, noise, focal length and robust search of a fit."""
+
+    # A group's own text: without it, tyro reads the documentation of all options for every fit.
+    fitting: Annotated[
+        _FitOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_FitOptions.__doc__)
+    ] = _FitOptions()
+    ransac: Annotated[
+        _RansacOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RansacOptions.__doc__)
+    ] = _RansacOptions()
+
+    named = staticmethod(flag_of)
+
+    @property
+    def estimate(self) -> ObservationFit:
+        """The options of the estimate alone, without those of the command."""
+        given = {field.name: getattr(self, field.name) for field in fields(ObservationFit)}
+        given["fitting"] = FitOptions(**vars(self.fitting))
+        given["ransac"] = RansacOptions(**vars(self.ransac))
+        return ObservationFit(**given)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cadalign.batch.fits import Tally, run_fits
-from cadalign.batch.kinds import DetectorOptions
 from cadalign.batch.options import FitRunOptions
 from cadalign.batch.table import read_rows
 from cadalign.cli.options import named_as_flags, new_console
 from cadalign.cli.runs import NOTHING_WORKED, SOME_FAILED, SUCCESS, print_json, run_progress
 from cadalign.errors import InputError
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.io.input_kinds import DetectorOptions
 
 if TYPE_CHECKING:
     from cadalign.cli.fit import Fit

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
-    from cadalign.io.observation import Observation
-    from cadalign.io.observation_changes import ObservationChanges
+    from cadalign.io.observation import Observation, ObservationChanges
     from cadalign.shapes.model import ShapeModel
 
 _OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a learned shape lacks

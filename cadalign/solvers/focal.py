@@ -19,15 +19,18 @@ from cadalign.solvers.alignment import (
     Equations,
     Objective,
     are_same_poses,
+    center_and_unit,
+    centered,
     evaluate_cost,
+    invert,
     room_for,
     room_for_two,
     solve_damped,
+    uncenter_covariance,
     with_keypoints,
     with_points,
 )
 from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, UNOBSERVABLE
-from cadalign.solvers.covariance import center_and_unit, centered, invert, uncenter_covariance
 from cadalign.solvers.evidence import (
     BLOCK,
     KeypointEvidence,

@@ -6,7 +6,13 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.alignment import Objective, with_keypoints, with_points
+from cadalign.solvers.alignment import (
+    Objective,
+    center_and_unit,
+    covariance_of,
+    with_keypoints,
+    with_points,
+)
 from cadalign.solvers.constants import (
     DEGENERATE,
     NOT_FOUND,
@@ -17,7 +23,6 @@ from cadalign.solvers.constants import (
     UNKNOWNS,
     ScalePrior,
 )
-from cadalign.solvers.covariance import center_and_unit, covariance_of
 from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel

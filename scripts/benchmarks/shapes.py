@@ -20,7 +20,6 @@ from cadalign import Alignment, Box, Camera, Result, ShapeModel, View, align, al
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import CadalignError
-from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -29,6 +28,7 @@ from cadalign.geometry.metrics import box_iou, rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.render import look_at
 from cadalign.seeding import instance_rng
+from cadalign.solvers.projection import projection_jacobian
 
 _SECOND_VIEW = rotation_from_vector(np.array([0.0, np.radians(25.0), 0.0]))
 _KNOWN = Camera(width=640, height=480, fx=520.0, fy=520.0, cx=319.5, cy=239.5)

@@ -21,10 +21,10 @@ from cadalign.annotate.result_text import UNKNOWNS, facts_of, next_best_text, no
 from cadalign.annotate.suggestion import NextBest, find_next_best, updated_variances
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.uncertainty.prediction import projection_jacobian
 from cadalign.evaluation.simulation.problems import Problem
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.observation import Observation
+from cadalign.solvers.projection import projection_jacobian
 
 KNOWN = FocalChoice(known=True)
 UNKNOWN = FocalChoice(known=False)

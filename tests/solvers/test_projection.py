@@ -9,13 +9,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera
-from cadalign.estimation.uncertainty.misfit import projection_jacobian
 from cadalign.geometry.projection import perspective
 from cadalign.solvers.alignment import Objective, evaluate_alignment, evaluate_cost, room_for
 from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, UNKNOWNS
 from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, ScalePrior
 from cadalign.solvers.focal import FocalObjective
-from cadalign.solvers.projection import project_point, ray_derivatives, scalars_of
+from cadalign.solvers.projection import (
+    project_point,
+    projection_jacobian,
+    ray_derivatives,
+    scalars_of,
+)
 from cadalign.solvers.search import cost_at, evaluate, move, room_of
 from cadalign.solvers.unknowns import move_pose
 

@@ -26,7 +26,8 @@ from cadalign.estimation.uncertainty.evidence import (
     plane_distances,
     without,
 )
-from cadalign.estimation.uncertainty.summary import misfits, name_of
+from cadalign.estimation.uncertainty.held_out import misfits
+from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, packed
 from cadalign.solvers.joint.reduction import reduced

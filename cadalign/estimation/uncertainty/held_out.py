@@ -14,7 +14,6 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import quote
-from cadalign.estimation.uncertainty.summary import misfits
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.projection import perspective
 from cadalign.shapes.tails import probability_within
@@ -102,6 +101,32 @@ def keypoint_misfits(
             "learned shapes predict it: a wrong keypoint, or a part that the shapes do not have",
         )
     return misfits(total, redundancy, degrees_of_freedom=freedom)
+
+
+def misfits(
+    cost: float,
+    redundancy: int,
+    *,
+    inflation: float = 1.0,
+    degrees_of_freedom: float | None = None,
+) -> tuple[str, ...]:
+    """Report residuals that are too large for their standard deviations.
+
+    At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
+    prior adds one equation, every other takes one away. Of a learned shape it is distributed as
+    errors of held-out objects are: wider by ``inflation`` and with the tails of so many
+    ``degrees_of_freedom``.
+    """
+    if redundancy <= 0 or cost < redundancy:
+        return ()
+    squares = cost / inflation**2
+    if 1 - probability_within(squares, redundancy, degrees_of_freedom) >= _FALSE_ALARMS:
+        return ()
+    ratio = np.sqrt(squares / redundancy)
+    return (
+        f"the residuals are {ratio:.2g} times as large as sigma and the spread of shapes allow: "
+        "a keypoint, a sigma or the model is wrong",
+    )
 
 
 def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArray]:

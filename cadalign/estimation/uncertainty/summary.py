@@ -13,7 +13,6 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import angle_between
-from cadalign.shapes.tails import probability_within
 
 UNDETERMINED = 1.0
 """Relative standard deviation beyond which a length, distance or focal length is undetermined."""
@@ -24,7 +23,6 @@ _THIN = 0.1  # spread along an axis over the largest that counts as nearly a pla
 _END_ON_DEG = 15.0
 _ANOTHER_DEG = 10.0
 _LIKELY = 0.1  # probability of an alternative that is worth a warning
-_LEAST_PROBABILITY = 0.005  # of residuals as large as these by chance
 _MOST_NAMED = 5  # outliers, in a sentence
 
 
@@ -179,32 +177,6 @@ def another_pose(
     return (
         f"another pose, {angle:.0f} deg away, has a probability of {100 * share:.0f} %: "
         "see `alternatives`",
-    )
-
-
-def misfits(
-    cost: float,
-    redundancy: int,
-    *,
-    inflation: float = 1.0,
-    degrees_of_freedom: float | None = None,
-) -> tuple[str, ...]:
-    """Report residuals that are too large for their standard deviations.
-
-    At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
-    prior adds one equation, every other takes one away. Of a learned shape it is distributed as
-    errors of held-out objects are: wider by ``inflation`` and with the tails of so many
-    ``degrees_of_freedom``.
-    """
-    if redundancy <= 0 or cost < redundancy:
-        return ()
-    squares = cost / inflation**2
-    if 1 - probability_within(squares, redundancy, degrees_of_freedom) >= _LEAST_PROBABILITY:
-        return ()
-    ratio = np.sqrt(squares / redundancy)
-    return (
-        f"the residuals are {ratio:.2g} times as large as sigma and the spread of shapes allow: "
-        "a keypoint, a sigma or the model is wrong",
     )
 
 

@@ -8,16 +8,15 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import Sigma
 from cadalign.estimation.problems import focal_slopes, full_covariance, whitening_of
-from cadalign.estimation.uncertainty.prediction import projection_jacobian
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import perspective
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.solvers.alignment import keypoint_objective
+from cadalign.solvers.alignment import covariance_of, keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
-from cadalign.solvers.covariance import covariance_of
 from cadalign.solvers.evidence import LogFocalPrior
 from cadalign.solvers.focal import FocalObjective, focal_covariance
+from cadalign.solvers.projection import projection_jacobian
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0

@@ -36,8 +36,8 @@ class Sightings(NamedTuple):
     ``point`` and ``image`` (N,) number point and view; ``rays`` (N, 2) are normalised, with
     ``whitening`` (N, 3) as in `cadalign.solvers.evidence.KeypointEvidence`; ``depths`` (N, 2) holds
     depths and their inverse standard deviations, 0 where there is none. ``loss`` (N,) and
-    ``loss_scale`` (N,) say how the length of each residual counts. ``slopes`` (N, 2) are the changes
-    of undistorted pixels, over the focal length, by its logarithm.
+    ``loss_scale`` (N,) say how the length of each residual counts. ``slopes`` (N, 2) are changes of
+    undistorted pixels, over the focal length, by its logarithm.
     """
 
     point: IntArray

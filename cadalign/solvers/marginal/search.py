@@ -10,9 +10,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.alignment import Objective, evaluate_cost
+from cadalign.solvers.alignment import Objective, center_and_unit, evaluate_cost
 from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, ScalePrior
-from cadalign.solvers.covariance import center_and_unit
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
 from cadalign.solvers.marginal.equations import Posed, state_at

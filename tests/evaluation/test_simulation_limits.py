@@ -58,9 +58,10 @@ def simulated_row(points: int, noise_px: float, *, seed: int = 0) -> list[Proble
 def linearized(
     row: Row, rotation: np.ndarray, translation: np.ndarray, scale: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (B, 2n) [px] and their Jacobian (B, 2n, 8) by central differences.
+    """Residuals (B, 2n + 2) [px] and their Jacobian (B, 2n + 2, 8) by central differences.
 
-    The unknowns are a rotation vector in the camera frame, the translation, log s_y, log s_z.
+    The unknowns are a rotation vector in the camera frame, the translation, log s_y, log s_z. The
+    last two residuals are those of the prior on the stretch, for a noise of 1 px.
     """
     step = 1e-6
 
@@ -75,12 +76,19 @@ def linearized(
         inside = (row.points_3d * stretched[:, None]) @ turned.transpose(0, 2, 1) + moved[:, None]
         image = inside[..., :2] / inside[..., 2:]
         pixels = image * [row.camera.fx, row.camera.fy] + [row.camera.cx, row.camera.cy]
-        return pixels.reshape(len(pixels), -1)
+        return np.hstack([pixels.reshape(len(pixels), -1), of_prior(stretched)])
 
     jacobian = np.stack(
         [(project(k, step) - project(k, -step)) / (2 * step) for k in range(8)], axis=2
     )
-    return project(0, 0.0) - row.points_2d.reshape(len(jacobian), -1), jacobian
+    observed = row.points_2d.reshape(len(jacobian), -1)
+    return project(0, 0.0) - np.hstack([observed, np.zeros((len(observed), 2))]), jacobian
+
+
+def of_prior(scale: np.ndarray) -> np.ndarray:
+    """Residuals (B, 2) of scales (B, 3): 0 from 1/5 to 5, with flanks of 0.5 in the logarithm."""
+    logs = np.log(scale[:, 1:])
+    return np.sign(logs) * np.maximum(np.abs(logs) - np.log(5), 0) / 0.5
 
 
 def bound_covariances(row: Row, noise_px: float) -> np.ndarray:
@@ -261,6 +269,7 @@ def test_optimum_is_hardly_ever_missed(points: int, allowed: float) -> None:
         [p.points_3d for p in problems], [p.points_2d for p in problems], problems[0].camera
     )
     reached = np.array([(r**2).sum() for r in np.split(batch.residuals, batch.offsets[1:-1])])
+    reached += (of_prior(batch.scale) ** 2).sum(axis=1)
     missed = ~(reached <= modes.cost * (1 + 1e-4) + 1e-6) & are_modes(modes)
     assert missed.mean() < allowed, f"missed in problems {np.flatnonzero(missed).tolist()}"
 

@@ -228,7 +228,8 @@ class ObservationFit:
         if self.shape is not None or (has_shape and self.takes_stored_shape):
             data = fill_xyz(data)
         with in_file(where):
-            return changes.applied_to(Observation.from_dict(data, folder=folder))
+            seen = Observation.from_dict(data, folder=folder)
+        return changes.applied_to(seen, where)  # whose errors name options
 
     def fit(
         self,

@@ -258,8 +258,8 @@ class ObservationChanges:
             return None
         return _read_camera(self.camera, size, self.pixel_origin)
 
-    def applied_to(self, observation: Observation) -> Observation:
-        """The observation with all of this in the place of its own.
+    def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
+        """The observation with all of this in the place of its own; ``where`` is its file.
 
         Raises
         ------
@@ -277,6 +277,7 @@ class ObservationChanges:
         if changes and observation.others:
             raise InputError(
                 f"the file has {len(observation.views)} views, the options are for one",
+                where=where,
                 fix="write camera, masks and other evidence into its `views`",
             )
         return replace(observation, **changes) if changes else observation

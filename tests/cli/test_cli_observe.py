@@ -312,7 +312,7 @@ def test_options_give_depth_gravity_and_size(masked: Path) -> None:
         (["--mask", "{folder}/small.png"], "{folder}/small.png: the image has 8 x 6 pixels, "),
         (["--size", "height", "-1"], "--size.height: -1.0 is not a positive number"),
         (["--size", "depth", "1"], "--size: unknown field 'depth'; known are height, length, "),
-        (["--size", "sigma", "1"], "size: no length is given; give width, height or length"),
+        (["--size", "sigma", "1"], "--size: no length is given; give width, height or length"),
     ],
 )
 def test_evidence_that_cannot_be_used_is_refused(

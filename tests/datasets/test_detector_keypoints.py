@@ -147,4 +147,4 @@ def test_focal_length_of_a_shape_that_is_only_similar_is_not_claimed(car: Path) 
     assert result.std is not None
     off = abs(np.log(result.camera.fx / camera.fx))
     assert off < 3 * result.std.focal
-    assert any(text.startswith("the focal length is known only to") for text in result.warnings)
+    assert result.std.focal > 0.05

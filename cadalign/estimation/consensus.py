@@ -111,6 +111,7 @@ class RobustSearch:
             disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
         )
 
+    @np.errstate(all="ignore")  # residuals that overflow are outliers'
     def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:
         """Likelihood of all keypoints with residuals (n, 2) [px]: an outlier lies anywhere."""
         sigma, limit = self.options.sigma, self.threshold

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import AlignResult, FitResult, Result
     from cadalign.estimation.results import BatchResult, Results, to_dataframe
+    from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
@@ -36,6 +37,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AlignResult",
+    "AlignedScene",
     "Alignment",
     "BatchResult",
     "Box",
@@ -55,12 +57,14 @@ __all__ = [
     "RansacOptions",
     "Result",
     "Results",
+    "SceneObject",
     "ShapeModel",
     "Size",
     "Symmetry",
     "View",
     "align",
     "align_batch",
+    "align_scene",
     "datasets",
     "errors",
     "evaluate",

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterable
 from typing import Any
 
 _QUOTED_LENGTH = 200
+_NEAR = 0.7  # similarity of names from which one may be meant by the other
 
 
 class CadalignError(Exception):
@@ -94,6 +96,25 @@ class RenderError(CadalignError):
 
 class TooFewVisibleError(DegenerateError, RenderError):
     """No view of an object shows as many keypoints as are asked for."""
+
+
+def unknown(
+    kind: str, value: object, known: Iterable[str], *, where: str | None = None
+) -> InputError:
+    """The error of a value that is none of the known ones, of which it names the nearest.
+
+    Examples
+    --------
+    >>> print(unknown("style", "lnes", ["shaded", "lines"]))
+    style: unknown style 'lnes', did you mean 'lines'?; known are shaded, lines
+    """
+    from difflib import get_close_matches
+
+    names = list(known)
+    nearest = get_close_matches(value, names, n=1, cutoff=_NEAR) if isinstance(value, str) else []
+    hint = f", did you mean {nearest[0]!r}?" if nearest else ""
+    fix = f"known are {', '.join(names)}" if names else "there are none here"
+    return InputError(f"unknown {kind} {quote(value)}{hint}", where=where or kind, fix=fix)
 
 
 def quote(value: Any) -> str:

@@ -11,9 +11,7 @@ from pathlib import Path
 
 from cadalign.compile.files import SHIPPED, can_write, kernel_folder, usable_target
 from cadalign.datasets import PhotoSummary, open_photos
-from cadalign.render.probe import RENDERERS, Probe, probe_renderer
-from cadalign.render.remedy import remedy
-from cadalign.render.select import best_renderer
+from cadalign.render.probe import RENDERERS, Probe, best_renderer, probe_renderer, remedy
 
 
 @dataclass(frozen=True)

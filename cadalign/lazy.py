@@ -18,6 +18,8 @@ _NAME = re.compile(r"(\w+)(?: as (\w+))?")
 def lazy_names(package: str) -> Callable[[str], Any]:
     """The ``__getattr__`` of a package: imports what its block ``if TYPE_CHECKING`` imports.
 
+    The package's ``dir`` lists its ``__all__``.
+
     That block is the only list: type checkers and editors read it as it stands. A name is imported
     when it is first asked for, and so are the package's modules, so that a program does not wait
     for what it does not use.
@@ -34,6 +36,8 @@ def lazy_names(package: str) -> Callable[[str], Any]:
         for origin, many, one in _IMPORT.findall(text)
         for name, alias in _NAME.findall(many or one)
     }
+
+    module.__dict__["__dir__"] = lambda: sorted(module.__all__)
 
     def load(name: str) -> Any:
         origin, original = origins.get(name, (package, name))

@@ -18,14 +18,12 @@ if TYPE_CHECKING:
     )
     from cadalign.render.drawing.stills import Angles, draw_still, pose_in_view, turntable
     from cadalign.render.frame import Frame, Geometry, Renderer
-    from cadalign.render.probe import Probe, probe_renderer
+    from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
     from cadalign.render.raycast.shading import Studio
     from cadalign.render.scene import Scene
-    from cadalign.render.select import make_renderer
-    from cadalign.render.views.silhouette import silhouette_iou
     from cadalign.render.views.viewpoints import Viewpoint, frame_object, look_at, sample_view
-    from cadalign.render.views.visibility import visible_keypoints
+    from cadalign.render.views.visibility import silhouette_iou, visible_keypoints
 
 __all__ = [
     "Angles",
@@ -63,7 +61,3 @@ __all__ = [
 ]
 
 __getattr__ = lazy_names(__name__)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)

@@ -22,22 +22,15 @@ MAX_PIXELS = 100_000_000
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """The hit of the ray through the centre of each pixel: exact, not antialiased.
-
-    Parameters
-    ----------
-    depth : (h, w) float
-        The camera's z [model units]; 0 where nothing is.
-    face_id : (h, w) int32
-        The number of the mesh's triangle; -1 where nothing is.
-    normal : (h, w, 3) float32
-        The triangle's unit normal in the camera frame, on the side that is seen; 0 where nothing
-        is.
-    """
+    """The hit of the ray through the centre of each pixel: exact, not antialiased."""
 
     depth: FloatArray
+    """(h, w), the camera's z, of a wide lens the distance from it [model units]; 0 for nothing."""
     face_id: npt.NDArray[np.int32]
+    """(h, w) int32, the number of the mesh's triangle; -1 where nothing is."""
     normal: npt.NDArray[np.float32]
+    """(h, w, 3) float32, the triangle's unit normal in the camera frame, on the side that is seen;
+    0 where nothing is."""
 
     @property
     def mask(self) -> npt.NDArray[np.bool_]:

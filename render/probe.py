@@ -1,8 +1,11 @@
-"""Trying a renderer in a process of its own: broken graphics libraries kill the process."""
+"""Renderers by name: tried in a process of their own, chosen, and remedies for broken ones."""
 
 from __future__ import annotations
 
+import ctypes
 import json
+import logging
+import re
 import subprocess
 import sys
 import time
@@ -10,10 +13,11 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 
 import numpy as np
 
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError, RenderError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -45,26 +49,17 @@ _CHILD = (
 
 @dataclass(frozen=True)
 class Probe:
-    """Result of trying a renderer.
-
-    Parameters
-    ----------
-    name : str
-        The renderer.
-    works : bool
-    detail : str
-        Device that draws, or the reason of the failure.
-    versions : str
-        Versions of the packages that it needs.
-    milliseconds : float, optional
-        The median time of a frame, 640 x 480 px with 20,480 triangles.
-    """
+    """Result of trying a renderer."""
 
     name: str
+    """The renderer."""
     works: bool
     detail: str
+    """Device that draws, or the reason of the failure."""
     versions: str
+    """Versions of the packages that it needs."""
     milliseconds: float | None = None
+    """The median time of a frame, 640 x 480 px with 20,480 triangles."""
 
 
 def probe_renderer(name: str, *, timed: bool = False) -> Probe:
@@ -83,9 +78,7 @@ def probe_renderer(name: str, *, timed: bool = False) -> Probe:
         If there is no such renderer.
     """
     if name not in RENDERERS:
-        raise InputError(
-            f"unknown renderer {name!r}", where="renderer", fix=f"known are {', '.join(RENDERERS)}"
-        )
+        raise unknown("renderer", name, RENDERERS)
     return _probe(name, timed)
 
 
@@ -170,3 +163,140 @@ def _versions(name: str) -> str:
         except PackageNotFoundError:
             found.append(f"{package} missing")
     return ", ".join(found)
+
+
+logger = logging.getLogger("cadalign")
+
+AUTO = "auto"
+
+_IMITATIONS = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
+
+
+def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer:
+    """Make a renderer.
+
+    Renderers other than ``raycast`` are tried in a process of their own first, once in the life of
+    this one, since broken graphics libraries would take this process down.
+
+    Parameters
+    ----------
+    name : str
+        ``raycast`` works everywhere; ``pyrender`` draws the colour with OpenGL; ``open3d`` casts
+        rays with Open3D. ``auto`` takes pyrender where it works on a graphics card, and raycast
+        elsewhere: OpenGL imitated on the processor takes as long and smooths edges less, and
+        Open3D casts no faster. It says which (logger "cadalign", level info; the renderer's
+        ``name``).
+    studio : Studio, optional
+        The lights.
+
+    Returns
+    -------
+    Renderer
+
+    Raises
+    ------
+    InputError
+        If there is no renderer of that name.
+    RenderError
+        If the one asked for does not work here.
+
+    Examples
+    --------
+    >>> make_renderer("raycast").name
+    'raycast'
+    """
+    if name == AUTO:
+        return load_renderer(best_renderer(), studio)
+    if name not in RENDERERS:
+        raise unknown("renderer", name, [AUTO, *RENDERERS])
+    if name != "raycast":
+        found = probe_renderer(name)
+        if not found.works:
+            raise RenderError(
+                f"the renderer does not work here: {found.detail}",
+                where=name,
+                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
+            )
+    return load_renderer(name, studio)
+
+
+def best_renderer() -> str:
+    """The renderer that "auto" takes here, by name; ray casting needs no proof."""
+    found = probe_renderer("pyrender")
+    if found.works and not _is_imitation(found.detail):
+        logger.info("renderer: pyrender (%s)", found.detail)
+        return "pyrender"
+    if found.works:
+        reason = f"OpenGL has no graphics card here but {found.detail}"
+    else:
+        reason = f"pyrender does not work here: {found.detail}"
+    logger.info("renderer: raycast (%s)", reason)
+    return "raycast"
+
+
+def _is_imitation(device: str) -> bool:
+    """OpenGL's device is a program that runs on the processor."""
+    return any(name in device.lower() for name in _IMITATIONS)
+
+
+# Remedies -----------------------------------------------------------------------------------------
+
+
+# Shared libraries and the Debian packages that hold them.
+_DEBIAN_PACKAGES = {
+    "libEGL.so.1": "libegl1",
+    "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+    "libusb-1.0.so.0": "libusb-1.0-0",
+}
+_NEEDED = {
+    "pyrender": ("libEGL.so.1", "libGL.so.1"),
+    "open3d": ("libX11.so.6", "libGL.so.1", "libgomp.so.1"),
+    "raycast": (),
+}
+_MODULES = {"pyrender": ("pyrender", "pyrender2"), "open3d": ("open3d", "'cadalign[open3d]'")}
+
+
+def remedy(probe: Probe) -> str:
+    """The command that would enable a renderer; empty where it works or none is known.
+
+    Examples
+    --------
+    >>> remedy(Probe("raycast", True, "processor", ""))
+    ''
+    """
+    if probe.works:
+        return ""
+    if probe.name in _MODULES:
+        module, package = _MODULES[probe.name]
+        if find_spec(module) is None:
+            return f"{sys.executable} -m pip install {package}"
+    named = re.findall(r"lib[\w.+-]+\.so[.\d]*", probe.detail)
+    absent = [*missing_libraries(probe.name), *(name for name in named if not _loads(name))]
+    packages = dict.fromkeys(
+        _DEBIAN_PACKAGES[library] for library in absent if library in _DEBIAN_PACKAGES
+    )
+    if packages:
+        return f"sudo apt-get install {' '.join(packages)}"
+    if probe.name == "pyrender":
+        # The libraries are there; what is missing is a driver that needs no display.
+        return "sudo apt-get install libegl-mesa0 libgl1-mesa-dri"
+    if probe.name == "raycast":
+        return f"{sys.executable} -m pip install --force-reinstall embreex trimesh"
+    return ""
+
+
+def missing_libraries(name: str) -> list[str]:
+    """The shared libraries that a renderer needs and that cannot be loaded (Linux only)."""
+    if not sys.platform.startswith("linux"):
+        return []
+    return [library for library in _NEEDED[name] if not _loads(library)]
+
+
+def _loads(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True

@@ -63,7 +63,3 @@ __all__ = [
 ]
 
 __getattr__ = lazy_names(__name__)
-
-
-def __dir__() -> list[str]:
-    return __all__

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_points, is_masked, is_number
+from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points, is_masked, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
-from cadalign.geometry.camera_form import read_form, read_matrix, write_form
-from cadalign.geometry.pixels import PixelOrigin, distort, perspective, rescaled_pixels, undistort
+from cadalign.geometry.camera_form import CameraForm, read_form, read_matrix, write_form
+from cadalign.geometry.pixels import (
+    FOCAL_FIX,
+    LensKind,
+    PixelOrigin,
+    checked_coefficients,
+    distort,
+    image_of,
+    largest_angle,
+    perspective,
+    rays_of_image,
+    rescaled_pixels,
+    undistort,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with optional lens distortion.
+    """A calibrated camera: a pinhole, with lens distortion or without, or a wide lens.
 
     Camera axes are OpenCV's: x right, y down, z forward. Integer pixel coordinates are pixel
     centres: the top-left pixel's centre is (0, 0), the image spans [-0.5, width - 0.5].
@@ -35,8 +47,13 @@ class Camera:
     cx, cy : float
         Principal point [px].
     distortion : tuple of float, optional
-        OpenCV's coefficients in OpenCV's order: (k1, k2, p1, p2), or with k3, or with
-        k3, k4, k5, k6. Empty for a lens without distortion.
+        Of a perspective lens OpenCV's coefficients in OpenCV's order: (k1, k2, p1, p2), or with
+        k3, or with k3, k4, k5, k6; empty for none. Of a fisheye (k1, k2, k3, k4) as in
+        ``cv2.fisheye``, 0 by default, or (k1, k2, p1, p2, k3, k4, sx1, sy1) as in COLMAP's
+        THIN_PRISM_FISHEYE. Of a fov lens (omega,) as in COLMAP's FOV.
+    lens : {"perspective", "fisheye", "fov"}
+        Kind of lens. A fisheye or fov lens may see points beside and behind the camera's plane;
+        its focal length has to be known.
     focal_known : bool
         False for a camera whose focal lengths are placeholders; see `without_focal`.
 
@@ -44,13 +61,16 @@ class Camera:
     ------
     InputError
         If a size is not a positive integer, a focal length is missing or not positive, a value is
-        not finite, or the number of coefficients is none of 0, 4, 5, 8.
+        not finite, or the coefficients are not those of the lens.
 
     Examples
     --------
     >>> camera = Camera(width=640, height=480, fx=500, fy=500, cx=319.5, cy=239.5)
     >>> camera.project([[0.0, 0.0, 2.0], [0.2, 0.0, 2.0]]).tolist()
     [[319.5, 239.5], [369.5, 239.5]]
+    >>> fisheye = Camera(640, 640, fx=200, fy=200, cx=319.5, cy=319.5, lens="fisheye")
+    >>> fisheye.project([[1.0, 0.0, 0.0]]).round(2).tolist()  # 90 degrees off the axis
+    [[633.66, 319.5]]
     """
 
     width: int
@@ -60,7 +80,10 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
+    lens: LensKind = field(default="perspective", kw_only=True)
     focal_known: bool = field(default=True, kw_only=True, repr=False)
+    turn: tuple[float, ...] = field(default=(), kw_only=True, repr=False)
+    """Rotation by rows from the frame that `turned` gave to the lens's own; empty for none."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -91,13 +114,11 @@ class Camera:
             coefficients = tuple(float(value) for value in self.distortion)
         except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
             raise InputError("not a sequence of numbers", where="camera.distortion") from None
-        if len(coefficients) not in (0, 4, 5, 8) or not np.isfinite(coefficients).all():
-            raise InputError(
-                f"{quote(coefficients)} are not distortion coefficients",
-                where="camera.distortion",
-                fix="give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6",
-            )
-        object.__setattr__(self, "distortion", coefficients if any(coefficients) else ())
+        coefficients = checked_coefficients(self.lens, coefficients)
+        object.__setattr__(self, "distortion", coefficients)
+        if self.is_wide and not self.focal_known:
+            what = f"the focal length of a {self.lens} lens is unknown"
+            raise InputError(what, where="camera.lens", fix=FOCAL_FIX)
 
     @classmethod
     def from_fov(cls, width: int, height: int, *, fov_x: float) -> Camera:
@@ -134,6 +155,7 @@ class Camera:
         *,
         pixel_origin: PixelOrigin = "center",
         distortion: tuple[float, ...] = (),
+        lens: LensKind = "perspective",
     ) -> Camera:
         """Make a camera from its calibration matrix K.
 
@@ -147,7 +169,7 @@ class Camera:
             Where (0, 0) lies for the principal point: at the centre of the top-left pixel (OpenCV,
             Kalibr, BOP), or at the top-left corner of the image (COLMAP, PyTorch3D, many
             renderers), half a pixel away.
-        distortion : tuple of float, optional
+        distortion, lens
             As for `Camera`.
 
         Raises
@@ -161,7 +183,7 @@ class Camera:
         >>> Camera.from_matrix(K, 640, 480, pixel_origin="corner").cx
         319.5
         """
-        return cls(width, height, *read_matrix(matrix, pixel_origin), distortion)
+        return cls(width, height, *read_matrix(matrix, pixel_origin), distortion, lens=lens)
 
     @classmethod
     def without_focal(
@@ -255,6 +277,49 @@ class Camera:
         """The calibration matrix K, (3, 3) float, of pixels whose centres are integers."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=float)
 
+    def turned(self, rotation: npt.ArrayLike) -> Camera:
+        """The same camera of a wide lens, its points in a frame that is turned about its centre.
+
+        Parameters
+        ----------
+        rotation : (3, 3) float
+            From this camera's frame to the new one. Image and lens stay where they are: the new
+            frame's z axis is not the optical axis.
+
+        Examples
+        --------
+        >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5, lens="fisheye")
+        >>> aside = camera.turned([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # z is the former x
+        >>> bool(np.allclose(aside.project([[0, 0, 1]]), camera.project([[1, 0, 0]])))
+        True
+        """
+        if not self.is_wide:
+            raise InputError("the frame of a pinhole is its own", where="camera.lens")
+        rows = as_floats(rotation, name="rotation", shape=(3, 3))
+        return replace(self, turn=tuple((self.lens_from_camera @ rows.T).ravel().tolist()))
+
+    @property
+    def lens_from_camera(self) -> FloatArray:
+        """Rotation (3, 3) from the camera's frame to the lens's; see `turned`."""
+        return np.array(self.turn).reshape(3, 3) if self.turn else np.eye(3)
+
+    @property
+    def is_wide(self) -> bool:
+        """True for a lens that may see points beside and behind its plane."""
+        return self.lens != "perspective"
+
+    def sees(self, points_cam: FloatArray) -> BoolArray:
+        """Say which points (n, 3) of the camera frame have a projection, in the image or not.
+
+        Of a pinhole those in front of its plane; of a wide lens those up to the angle from the axis
+        at which the image of farther directions would turn back.
+        """
+        points = points_cam @ self.lens_from_camera.T if self.turn else points_cam
+        if not self.is_wide:
+            return np.asarray(points[:, 2] > 0)
+        angle = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
+        return np.asarray((angle < largest_angle(self.lens, self.distortion)) & points.any(axis=1))
+
     def require_focal(self) -> None:
         """Refuse a camera `without_focal`.
 
@@ -276,7 +341,7 @@ class Camera:
         Parameters
         ----------
         points_cam : (n, 3) float
-            Points in the camera frame, in front of it.
+            Points in the camera frame, in front of it; for a wide lens, in its field.
 
         Returns
         -------
@@ -286,27 +351,88 @@ class Camera:
         Raises
         ------
         InputError
-            If a point lies in or behind the camera's plane (z <= 0), or the focal length is
-            unknown.
+            If a point lies in or behind the camera's plane (z <= 0), or outside the field of a
+            wide lens, or the focal length is unknown.
         """
         self.require_focal()
         points = as_points(points_cam, name="points_cam", dimension=3)
-        behind = np.flatnonzero(points[:, 2] <= 0)
-        if len(behind):
-            raise InputError(
-                f"{len(behind)} of {len(points)} points lie behind the camera, "
-                f"the first is point {behind[0]} with z = {points[behind[0], 2]:g}",
-                where="points_cam",
-                fix="only points with z > 0 have a projection",
-            )
-        return self.pixels_from_normalized(perspective(points))
+        unseen = np.flatnonzero(~self.sees(points))
+        if len(unseen):
+            what, first = f"{len(unseen)} of {len(points)} points lie", unseen[0]
+            if self.is_wide:
+                limit = np.degrees(largest_angle(self.lens, self.distortion))
+                what += f" outside the lens's field, the first is point {first}"
+                fix = f"less than {limit:.4g} degrees off the axis"
+            else:
+                z = points[first, 2]
+                what += f" behind the camera, the first is point {first} with z = {z:g}"
+                fix = "with z > 0"
+            raise InputError(what, where="points_cam", fix=f"only points {fix} have a projection")
+        return self.pixels_of_rays(points)
 
     def project_where_ahead(self, points_cam: FloatArray) -> FloatArray:
-        """Project points (n, 3) of the camera frame; pixels (n, 2), infinite behind the camera."""
+        """Project points (n, 3) of the camera frame; infinite pixels (n, 2) where not seen."""
         pixels = np.full((len(points_cam), 2), np.inf)
-        ahead = points_cam[:, 2] > 0
-        pixels[ahead] = self.pixels_from_normalized(perspective(points_cam[ahead]))
+        ahead = self.sees(points_cam)
+        pixels[ahead] = self.pixels_of_rays(points_cam[ahead])
         return pixels
+
+    def pixels_of_rays(self, rays: FloatArray) -> FloatArray:
+        """Pixels (n, 2) of directions (n, 3) that the camera `sees`, of any length."""
+        if not self.is_wide:
+            return self.pixels_from_normalized(perspective(rays))
+        with np.errstate(over="ignore", invalid="ignore"):  # lens polynomials
+            image, _ = image_of(rays @ self.lens_from_camera.T, self.lens, self.distortion)
+            return image * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def projection_slopes(self, points_cam: FloatArray) -> FloatArray:
+        """Derivatives (n, 2, 3) of pixels by points (n, 3) that the camera `sees`."""
+        lens_from_camera = self.lens_from_camera
+        slopes = image_of(points_cam @ lens_from_camera.T, self.lens, self.distortion)[1]
+        return np.asarray(np.array([[self.fx], [self.fy]]) * (slopes @ lens_from_camera))
+
+    def unproject(self, points_2d: npt.ArrayLike) -> FloatArray:
+        """Directions of the rays of pixels, in the camera frame.
+
+        Parameters
+        ----------
+        points_2d : (n, 2) float
+            Pixels.
+
+        Returns
+        -------
+        (n, 3) float
+            Unit vectors; for a wide lens, z may be 0 or negative.
+
+        Raises
+        ------
+        InputError
+            If the lens model cannot be inverted at a pixel, or the focal length is unknown.
+
+        Examples
+        --------
+        >>> camera = Camera(640, 640, fx=200, fy=200, cx=319.5, cy=319.5, lens="fisheye")
+        >>> camera.unproject([[319.5 + 200 * np.pi / 4, 319.5]]).round(3).tolist()
+        [[0.707, 0.0, 0.707]]
+        """
+        self.require_focal()
+        rays, valid = self.rays_where_valid(points_2d)
+        _check_undone(valid)
+        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+    def rays_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
+        """Directions (n, 3) of pixels (n, 2), and where they exist (n,): elsewhere without meaning.
+
+        They have z = 1 for a pinhole and the length 1 for a wide lens.
+        """
+        if not self.is_wide:
+            normalized, valid = self.normalize_where_valid(points_2d)
+            return _homogeneous(normalized), valid
+        points = as_points(points_2d, name="points_2d", dimension=2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            image = (points - (self.cx, self.cy)) / (self.fx, self.fy)
+            rays, valid = rays_of_image(image, self.lens, self.distortion)
+        return np.asarray(rays @ self.lens_from_camera), valid
 
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:
         """Turn pixels into normalised image coordinates, the lens distortion removed.
@@ -324,24 +450,25 @@ class Camera:
         Raises
         ------
         InputError
-            If the lens model cannot be inverted at a pixel (far outside the calibrated image), or
-            the focal length is unknown.
+            If the lens model cannot be inverted at a pixel (far outside the calibrated image), if
+            its ray is 90 degrees or more off the z axis (see `unproject`), or the focal length is
+            unknown.
         """
         self.require_focal()
         normalized, valid = self.normalize_where_valid(points_2d)
-        failed = np.flatnonzero(~valid)
-        if len(failed):
+        if self.is_wide and not valid.all():
+            _check_undone(self.rays_where_valid(points_2d)[1])
+            behind = np.flatnonzero(~valid)
             raise InputError(
-                f"the lens distortion cannot be undone at {len(failed)} of {len(valid)} "
-                f"pixels, the first is point {failed[0]}",
+                f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off the "
+                f"z axis, the first is point {behind[0]}",
                 where="points_2d",
-                fix="these lie outside the area in which the lens model is valid; drop them",
+                fix="these have no normalised coordinates; use unproject",
             )
+        _check_undone(valid)
         return normalized
 
-    def normalize_where_valid(
-        self, points_2d: npt.ArrayLike
-    ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    def normalize_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
         """Turn pixels into normalised image coordinates wherever the lens model can be inverted.
 
         Parameters
@@ -355,27 +482,37 @@ class Camera:
             As `normalize` gives them; meaningless, but finite, where not valid.
         valid : (n,) bool
         """
+        if self.is_wide:
+            rays, valid = self.rays_where_valid(points_2d)
+            ahead = valid & (rays[:, 2] > 0)
+            rays[~ahead] = (0.0, 0.0, 1.0)
+            return perspective(rays), ahead
         points = as_points(points_2d, name="points_2d", dimension=2)
         with np.errstate(over="ignore", invalid="ignore"):  # lens polynomials
             distorted = (points - (self.cx, self.cy)) / (self.fx, self.fy)
             if not self.distortion:
                 return distorted, np.ones(len(points), dtype=bool)
-            return undistort(distorted, self.distortion)
+            return undistort(distorted, self.lens, self.distortion)
 
     def pixels_from_normalized(self, normalized: FloatArray) -> FloatArray:
         """Apply lens and calibration matrix to (n, 2) normalised coordinates; gives pixels."""
         with np.errstate(over="ignore", invalid="ignore"):  # far outside the lens model's field
+            if self.is_wide:
+                return self.pixels_of_rays(_homogeneous(normalized))
             if self.distortion:
-                normalized, _ = distort(normalized, self.distortion)
+                normalized, _ = distort(normalized, self.lens, self.distortion)
             return normalized * (self.fx, self.fy) + (self.cx, self.cy)
 
     def distortion_jacobian(self, normalized: FloatArray) -> FloatArray:
-        """Derivatives (n, 2, 2) of distorted by normalised image coordinates (n, 2)."""
+        """Derivatives (n, 2, 2) of pixels, over focal lengths, by normalised coordinates (n, 2)."""
         if not self.distortion:
             return np.broadcast_to(np.eye(2), (len(normalized), 2, 2))
-        return distort(normalized, self.distortion)[1]
+        if self.is_wide:
+            slopes = self.projection_slopes(_homogeneous(normalized))[:, :, :2]
+            return np.asarray(slopes / np.array([[self.fx], [self.fy]]))
+        return distort(normalized, self.lens, self.distortion)[1]
 
-    def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> npt.NDArray[np.bool_]:
+    def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> BoolArray:
         """Say which pixels (n, 2) lie inside the image by at least ``margin`` [px]; (n,) bool."""
         low = -0.5 + margin
         high = np.array([self.width, self.height]) - 0.5 - margin
@@ -384,9 +521,11 @@ class Camera:
     def _repr_html_(self) -> str:
         focal, angle = "unknown", "unknown"
         if self.focal_known:
-            angles = np.degrees(2 * np.arctan(0.5 * np.array([self.width, self.height])
-                                              / (self.fx, self.fy)))  # fmt: skip
-            focal, angle = f"{self.fx:.5g}, {self.fy:.5g} px", "{:.3g}° x {:.3g}°".format(*angles)
+            half = 0.5 * np.diag([self.width, self.height]) + (self.cx, self.cy)
+            rays, valid = replace(self, turn=()).rays_where_valid(half)
+            angles = 2 * np.degrees(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
+            focal = f"{self.fx:.5g}, {self.fy:.5g} px"
+            angle = "{:.3g}° x {:.3g}°".format(*angles) if valid.all() else "the lens's whole"
         lens = ", ".join(f"{value:.3g}" for value in self.distortion)
         from cadalign.notebook.axes import photo_axes
         from cadalign.notebook.html import card, draw_picture
@@ -396,6 +535,7 @@ class Camera:
             ("focal length", focal),
             ("field of view", angle),
             ("principal point", f"{self.cx:.5g}, {self.cy:.5g} px (pixel centres are integers)"),
+            ("lens", self.lens),
             ("distortion", lens or "none"),
         ]
 
@@ -430,9 +570,18 @@ class Camera:
         >>> camera.to_dict(pixel_origin="center")["params"]
         [500.0, 500.0, 319.5, 239.5]
         """
-        focals = (self.fx, self.fy) if self.focal_known else (None, None)
+        if self.turn:
+            what = "a camera in a turned frame has no form in files"
+            raise InputError(what, where="camera", fix="write the camera that was turned")
         form = write_form(
-            (self.width, self.height), focals, (self.cx, self.cy), self.distortion, pixel_origin
+            CameraForm(
+                (self.width, self.height),
+                (self.fx, self.fy) if self.focal_known else None,
+                (self.cx, self.cy),
+                self.distortion,
+                self.lens,
+            ),
+            pixel_origin,
         )
         return form if pixel_origin is None else {**form, "pixel_origin": pixel_origin}
 
@@ -443,12 +592,13 @@ class Camera:
         Parameters
         ----------
         data : mapping
-            ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV or FULL_OPENCV),
+            ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
+            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE or FOV),
             ``width``, ``height``, and ``params`` in COLMAP's order and pixel convention. None in
             the place of the focal lengths, or ``width`` and ``height`` alone, give a camera
             `without_focal`. Or ``matrix`` (3, 3), ``width``, ``height`` and optionally
-            ``distortion``, as for `from_matrix`. ``pixel_origin`` states where (0, 0) lies: by
-            default ``"corner"`` for ``params`` and ``"center"`` for ``matrix``.
+            ``distortion`` and ``lens``, as for `from_matrix`. ``pixel_origin`` states where (0, 0)
+            lies: by default ``"corner"`` for ``params`` and ``"center"`` for ``matrix``.
 
         Raises
         ------
@@ -471,11 +621,35 @@ class Camera:
                 *form.size,
                 pixel_origin=form.pixel_origin,
                 distortion=form.distortion,
+                lens=form.lens,
             )
         if form.focals is None:
             cx, cy = form.center
+            if form.lens != "perspective":
+                what = f"the focal length of a {form.lens} lens is unknown"
+                raise InputError(what, where="camera.params", fix=FOCAL_FIX)
             return cls.without_focal(*form.size, cx=cx, cy=cy, distortion=form.distortion)
-        return cls(*form.size, *form.focals, *form.center, form.distortion)
+        return cls(*form.size, *form.focals, *form.center, form.distortion, lens=form.lens)
+
+
+def needs_facing(cameras: Sequence[Camera]) -> bool:
+    """True if any of the cameras has a wide lens whose frame faces nothing yet."""
+    return True in [camera.is_wide and not camera.turn for camera in cameras]
+
+
+def _homogeneous(normalized: FloatArray) -> FloatArray:
+    return np.column_stack([normalized, np.ones(len(normalized))])
+
+
+def _check_undone(valid: BoolArray) -> None:
+    failed = np.flatnonzero(~valid)
+    if len(failed):
+        raise InputError(
+            f"the lens distortion cannot be undone at {len(failed)} of {len(valid)} "
+            f"pixels, the first is point {failed[0]}",
+            where="points_2d",
+            fix="these lie outside the area in which the lens model is valid; drop them",
+        )
 
 
 _SIZE_FIX = "give the image size in whole pixels"

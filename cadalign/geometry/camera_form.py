@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import as_floats, is_number
 from cadalign.errors import InputError, quote
-from cadalign.geometry.pixels import PixelOrigin, shift_of
+from cadalign.geometry.pixels import LensKind, PixelOrigin, shift_of
 
 # COLMAP's camera models: the names of their parameters, in COLMAP's order.
 COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
@@ -19,8 +19,23 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     "RADIAL": ("f", "cx", "cy", "k1", "k2"),
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "THIN_PRISM_FISHEYE": (
+        *("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    ),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
 }
 _DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+# Written models of lenses, by kind and number of coefficients.
+_WRITTEN: dict[tuple[LensKind, int], str] = {
+    ("perspective", 0): "PINHOLE",
+    ("perspective", 4): "OPENCV",
+    ("fisheye", 4): "OPENCV_FISHEYE",
+    ("fisheye", 8): "THIN_PRISM_FISHEYE",
+    ("fov", 1): "FOV",
+}
 _NO_SKEW = 1e-9  # relative to the focal length
 _FORM_FIX = 'give {"model", "width", "height", "params"} as COLMAP does'
 
@@ -36,28 +51,24 @@ class CameraForm(NamedTuple):
     focals: tuple[float, float] | None = None
     center: tuple[Any, Any] = (None, None)
     distortion: tuple[float, ...] = ()
+    lens: LensKind = "perspective"
     matrix: Any = None
     pixel_origin: PixelOrigin = "center"
 
 
-def write_form(
-    size: tuple[int, int],
-    focals: Sequence[float | None],
-    center: tuple[float, float],
-    distortion: tuple[float, ...],
-    pixel_origin: PixelOrigin | None,
-) -> dict[str, Any]:
+def write_form(form: CameraForm, pixel_origin: PixelOrigin | None) -> dict[str, Any]:
     """A camera in COLMAP's form; see `Camera.to_dict`."""
-    model = {0: "PINHOLE", 4: "OPENCV"}.get(len(distortion), "FULL_OPENCV")
+    model = _WRITTEN.get((form.lens, len(form.distortion)), "FULL_OPENCV")
     shift = shift_of(pixel_origin or "corner")
+    names = COLMAP_PARAMS[model][4:] if form.lens != "perspective" else _DISTORTION_NAMES
     values: dict[str, float | None]
-    values = dict(zip(_DISTORTION_NAMES, distortion, strict=False))
-    values |= dict(zip(("fx", "fy"), focals, strict=True))
-    values |= {"cx": center[0] + shift, "cy": center[1] + shift}
+    values = dict(zip(names, form.distortion, strict=False))
+    values |= dict(zip(("fx", "fy"), form.focals or (None, None), strict=True))
+    values |= {"cx": form.center[0] + shift, "cy": form.center[1] + shift}
     return {
         "model": model,
-        "width": size[0],
-        "height": size[1],
+        "width": form.size[0],
+        "height": form.size[1],
         "params": [values.get(name, 0.0) for name in COLMAP_PARAMS[model]],
     }
 
@@ -97,6 +108,7 @@ def read_form(data: Any) -> CameraForm:
             size,
             matrix=data["matrix"],
             distortion=data.get("distortion", ()),
+            lens=data.get("lens", "perspective"),
             pixel_origin=cast(PixelOrigin, origin),
         )
     return _read_params(data["model"], data["params"], size, shift)
@@ -124,10 +136,23 @@ def _read_params(model: Any, params: Any, size: tuple[Any, Any], shift: float) -
         if not is_number(value) and (is_known or name not in focals):
             what = f"{name} is {quote(value)}, not a finite number"
             raise InputError(what, where="camera.params")
-    coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
+    lens, distortion = _lens_of(model, values)
     return CameraForm(
         size,
         focals=(values[focals[0]], values[focals[-1]]) if is_known else None,
         center=(values["cx"] - shift, values["cy"] - shift),
-        distortion=coefficients if any(coefficients[4:]) else coefficients[:4],
+        distortion=distortion,
+        lens=lens,
     )
+
+
+def _lens_of(model: str, values: Mapping[str, float]) -> tuple[LensKind, tuple[float, ...]]:
+    """Kind and coefficients of a model's lens."""
+    if model == "FOV":
+        return "fov", (values["omega"],)
+    if model == "THIN_PRISM_FISHEYE":
+        return "fisheye", tuple(values[name] for name in COLMAP_PARAMS[model][4:])
+    if model.endswith("FISHEYE"):
+        return "fisheye", tuple(values.get(name, 0.0) for name in ("k1", "k2", "k3", "k4"))
+    coefficients = tuple(values.get(name, 0.0) for name in _DISTORTION_NAMES)
+    return "perspective", coefficients if any(coefficients[4:]) else coefficients[:4]

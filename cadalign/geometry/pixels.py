@@ -1,17 +1,32 @@
-"""Places of pixels, and normalised image coordinates by OpenCV's lens model with its inverse."""
+"""Pixels, their conventions, and lenses: places of directions in the image, and the inverse.
+
+The place of a direction is in focal lengths, from the principal point. With theta the angle between
+a direction and the optical axis and n its unit vector across the axis, a lens first maps
+
+- ``perspective``: to tan(theta) n, for theta below 90 degrees,
+- ``fisheye``: to theta n (Kannala, Brandt, "A generic camera model and calibration method", 2006),
+- ``fov``: to atan(2 tan(omega / 2) tan(theta)) / omega n (Devernay, Faugeras, "Straight lines have
+  to be straight", 2001), continued beyond 90 degrees,
+
+and then adds distortion, for the first two: OpenCV's model with k1, k2, p1, p2, k3 to k6, its
+``cv2.fisheye`` model, and COLMAP's THIN_PRISM_FISHEYE, which has tangential terms in addition.
+"""
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+import math
+from functools import lru_cache
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError, quote
 
 PIXEL_CENTRE = 0.5
 """The centre of the top-left pixel, in x and y, in OpenGL, COLMAP and NeRF programs."""
+_NORMALISED = 1.5  # beyond all normalised coordinates of what is guessed outside of an image [px]
+_LEAST_SIZE = 16  # of an image in which so small an object is a mistake [px]
 
 PixelOrigin = Literal["center", "corner"]
 """Place of pixel (0, 0): the centre of the top-left pixel, or the image's top-left corner."""
@@ -39,37 +54,249 @@ def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArra
     return np.asarray((pixels + PIXEL_CENTRE) * factor - PIXEL_CENTRE)
 
 
+def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) -> None:
+    """Refuse normalised coordinates (n, 2) in the place of the pixels of an image of that size.
+
+    Raises
+    ------
+    InputError
+        If all lie within a pixel or so of the image's corner, but not in one place.
+
+    Examples
+    --------
+    >>> check_pixels(np.array([[0.2, 0.9], [0.7, 0.4]]), 640, 480, where="points_2d")
+    Traceback (most recent call last):
+    cadalign.errors.InputError: points_2d: all 2 keypoints ... give pixels: multiply fractions ...
+    """
+    if not len(points_2d) or abs(points_2d.item(0)) > _NORMALISED:  # in a fraction of a microsecond
+        return
+    if min(width, height) < _LEAST_SIZE or not np.ptp(points_2d, axis=0).any():
+        return
+    if np.abs(points_2d).max() <= _NORMALISED:
+        raise InputError(
+            f"all {len(points_2d)} keypoints lie within {_NORMALISED:g} px of pixel (0, 0), as "
+            "normalised coordinates (0 to 1) do",
+            where=where,
+            fix=f"give pixels: multiply fractions by the image's width {width} and height {height}",
+        )
+
+
 def perspective(points_cam: FloatArray) -> FloatArray:
     """Normalised image coordinates (n, 2) of points (n, 3); not finite at depth 0."""
     return points_cam[:, :2] / points_cam[:, 2:]
 
 
-def distort(
-    normalized: FloatArray, coefficients: tuple[float, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Distorted coordinates (n, 2) of normalised ones (n, 2), and their derivatives (n, 2, 2)."""
+# Lenses ------------------------------------------------------------------------------------------
+
+LensKind = Literal["perspective", "fisheye", "fov"]
+"""The kind of a lens, by the curve that its radius in the image follows."""
+
+FOCAL_FIX = "calibrate the camera; only a perspective lens's focal length is estimated"
+
+# Numbers of coefficients that a lens of each kind may have, and how to give them.
+_COEFFICIENTS = {
+    "perspective": (
+        (0, 4, 5, 8),
+        "give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6",
+    ),
+    "fisheye": ((0, 4, 8), "give (k1, k2, k3, k4), or (k1, k2, p1, p2, k3, k4, sx1, sy1)"),
+    "fov": ((1,), "give (omega,), an angle in rad between 0 and pi"),
+}
+_NEWTON_STEPS = 50
+_TABLE = 257  # angles at which a fisheye's radius is tabulated
+_ROUNDS = 6  # of such tables, each within a step of the one before
+
+
+def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    """The coefficients of a lens; none of a pinhole, and of a wide lens always all.
+
+    Raises
+    ------
+    InputError
+        If the kind is unknown, or has no such coefficients.
+    """
+    if not isinstance(kind, str) or kind not in _COEFFICIENTS:
+        what, fix = f"{quote(kind)} is not a kind of lens", f"known are {', '.join(_COEFFICIENTS)}"
+        raise InputError(what, where="camera.lens", fix=fix)
+    counts, fix = _COEFFICIENTS[kind]
+    is_right = len(coefficients) in counts and bool(np.isfinite(coefficients).all())
+    if not is_right or (kind == "fov" and not 0 < coefficients[0] < math.pi):
+        what = f"{quote(coefficients)} are not distortion coefficients"
+        raise InputError(what, where="camera.distortion", fix=fix)
+    if kind == "perspective" and not any(coefficients):
+        return ()
+    return (0.0,) * 4 if kind == "fisheye" and not coefficients else coefficients
+
+
+class _Terms(NamedTuple):
+    """Terms of a distortion: radial n over d, tangential p, and thin prism s."""
+
+    n1: float
+    n2: float
+    n3: float
+    n4: float
+    d1: float
+    d2: float
+    d3: float
+    p1: float
+    p2: float
+    s1: float
+    s2: float
+
+
+@lru_cache(maxsize=64)
+def _terms(kind: LensKind, coefficients: tuple[float, ...]) -> _Terms:
+    """The terms of the coefficients, missing ones 0."""
+    if kind == "fisheye" and len(coefficients) == 4:
+        return _Terms(*coefficients, *(0.0,) * 7)
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients + (0.0,) * (8 - len(coefficients))
+    if kind == "fisheye":
+        return _Terms(k1, k2, k3, k4, 0.0, 0.0, 0.0, p1, p2, k5, k6)
+    return _Terms(k1, k2, k3, 0.0, k4, k5, k6, p1, p2, 0.0, 0.0)
+
+
+@lru_cache(maxsize=64)
+def largest_angle(kind: LensKind, coefficients: tuple[float, ...]) -> float:
+    """Angle off the axis [rad] up to which a wide lens maps outer directions farther out.
+
+    Examples
+    --------
+    >>> round(largest_angle("fisheye", (-0.1, 0.0, 0.0, 0.0)), 6)  # 1 = 3 * 0.1 * theta^2
+    1.825742
+    """
+    if kind == "fov":
+        return math.pi
+    n1, n2, n3, n4, *_ = _terms(kind, coefficients)
+
+    def grows(theta: FloatArray) -> BoolArray:
+        """Say where theta (1 + n1 theta^2 + n2 theta^4 + ...) has a positive slope."""
+        s = theta * theta
+        return np.asarray(1 + s * (3 * n1 + s * (5 * n2 + s * (7 * n3 + s * 9 * n4))) > 0)
+
+    low, high = 0.0, math.pi
+    with np.errstate(all="ignore"):
+        for _ in range(_ROUNDS):
+            angles = np.linspace(low, high, _TABLE)
+            ends = np.flatnonzero(~grows(angles))
+            if not len(ends):
+                break
+            low, high = angles[[max(ends[0] - 1, 0), ends[0]]].tolist()
+    return high
+
+
+def image_of(
+    points: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Place (n, 2) of points (n, 3) in the image, and its derivatives (n, 2, 3) by the points.
+
+    Examples
+    --------
+    >>> image_of(np.array([[1.0, 0.0, 0.0]]), "fisheye", (0.0,) * 4)[0].round(6).tolist()
+    [[1.570796, 0.0]]
+    """
+    plane, by_point = _plane_of(points, kind, coefficients)
+    if kind == "fov":
+        return plane, by_point
+    distorted, by_plane = distort(plane, kind, coefficients)
+    return distorted, by_plane @ by_point
+
+
+def _plane_of(
+    points: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Place (n, 2) before distortion, and its derivatives (n, 2, 3)."""
+    z = points[:, 2]
+    if kind == "perspective":
+        plane = perspective(points)
+        ones = np.broadcast_to(np.eye(2), (len(plane), 2, 2))
+        return plane, np.concatenate([ones, -plane[:, :, None]], axis=2) / z[:, None, None]
+    r = np.hypot(points[:, 0], points[:, 1])
+    theta = np.arctan2(r, z)
+    if kind == "fov":
+        (omega,) = coefficients
+        factor = 2 * math.tan(omega / 2)
+        radius = np.arctan2(factor * np.sin(theta), np.cos(theta)) / omega
+        slope = factor / (np.cos(theta) ** 2 + (factor * np.sin(theta)) ** 2) / omega
+    else:
+        radius, slope = theta, np.ones(len(points))
+    on_axis = r == 0
+    safe = np.where(on_axis, 1.0, r)
+    across = np.where(on_axis[:, None], (1.0, 0.0), points[:, :2] / safe[:, None])
+    stretch = np.where(on_axis, slope, radius) / np.where(on_axis, z, safe)
+    outwards = (
+        slope[:, None] * np.column_stack([across * z[:, None], -r]) / (r * r + z * z)[:, None]
+    )
+    by_point = across[:, :, None] * outwards[:, None]
+    by_point[:, :, :2] += stretch[:, None, None] * (
+        np.eye(2) - across[:, :, None] * across[:, None]
+    )
+    return radius[:, None] * across, by_point
+
+
+def rays_of_image(
+    image: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, BoolArray]:
+    """Unit directions (n, 3) of places (n, 2) in the image of a wide lens, and where they exist."""
+    if kind == "fov":
+        (omega,) = coefficients
+        radius = np.hypot(image[:, 0], image[:, 1])
+        angle = radius * omega
+        valid = angle < math.pi
+        theta = np.arctan2(np.sin(angle), 2 * math.tan(omega / 2) * np.cos(angle))
+    else:
+        plane, valid = _undistort_fisheye(image, coefficients)
+        theta = radius = np.hypot(plane[:, 0], plane[:, 1])
+        valid &= theta < largest_angle(kind, coefficients)
+        image = plane
+    theta = np.where(valid, theta, 0.0)
+    across = image / np.where(radius == 0, 1.0, radius)[:, None]
+    return np.column_stack([np.sin(theta)[:, None] * across, np.cos(theta)]), valid
+
+
+def _undistort_fisheye(
+    image: FloatArray, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, BoolArray]:
+    """Undo a fisheye's distortion, from a table of the radial part."""
+    terms = _terms("fisheye", coefficients)
+    angles = np.linspace(0.0, largest_angle("fisheye", coefficients), _TABLE)
+    squares = angles * angles
+    factors = 1 + squares * (
+        terms.n1 + squares * (terms.n2 + squares * (terms.n3 + squares * terms.n4))
+    )
+    radius = np.hypot(image[:, 0], image[:, 1])
+    theta = np.interp(radius, angles * factors, angles)
+    start = image * (theta / np.where(radius == 0, 1.0, radius))[:, None]
+    return undistort(image, "fisheye", coefficients, start=start)
+
+
+def distort(
+    normalized: FloatArray, kind: LensKind, coefficients: tuple[float, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Distorted coordinates (n, 2) of undistorted ones (n, 2), and their derivatives (n, 2, 2)."""
+    n1, n2, n3, n4, d1, d2, d3, p1, p2, s1, s2 = _terms(kind, coefficients)
     x, y = normalized[:, 0], normalized[:, 1]
     r2 = x * x + y * y
-    numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    numerator = 1 + r2 * (n1 + r2 * (n2 + r2 * (n3 + r2 * n4)))
+    denominator = 1 + r2 * (d1 + r2 * (d2 + r2 * d3))
     radial = numerator / denominator
     # d radial / d r2
-    slope = (k1 + r2 * (2 * k2 + 3 * k3 * r2)) / denominator - radial * (
-        k4 + r2 * (2 * k5 + 3 * k6 * r2)
+    slope = (n1 + r2 * (2 * n2 + r2 * (3 * n3 + r2 * 4 * n4))) / denominator - radial * (
+        d1 + r2 * (2 * d2 + 3 * d3 * r2)
     ) / denominator
     distorted = np.stack(
         [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2,
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s2 * r2,
         ],
         axis=1,
     )
     mixed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    of_x = radial + 2 * x * x * slope + 2 * p1 * y + (6 * p2 + 2 * s1) * x
+    of_y = radial + 2 * y * y * slope + (6 * p1 + 2 * s2) * y + 2 * p2 * x
     jacobian = np.stack(
         [
-            np.stack([radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x, mixed], axis=1),
-            np.stack([mixed, radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x], axis=1),
+            np.stack([of_x, mixed + 2 * s1 * y], axis=1),
+            np.stack([mixed + 2 * s2 * x, of_y], axis=1),
         ],
         axis=1,
     )
@@ -77,13 +304,17 @@ def distort(
 
 
 def undistort(
-    distorted: FloatArray, coefficients: tuple[float, ...]
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Invert the lens model by Newton's method, and say where that succeeded."""
-    normalized = distorted.copy()
+    distorted: FloatArray,
+    kind: LensKind,
+    coefficients: tuple[float, ...],
+    *,
+    start: FloatArray | None = None,
+) -> tuple[FloatArray, BoolArray]:
+    """Invert `distort` by Newton's method from ``start`` (n, 2), and say where that succeeded."""
+    normalized = distorted.copy() if start is None else start
     active = np.arange(len(distorted))
-    for _ in range(50):
-        value, jacobian = distort(normalized[active], coefficients)
+    for _ in range(_NEWTON_STEPS):
+        value, jacobian = distort(normalized[active], kind, coefficients)
         error = value - distorted[active]
         (a, b), (c, d) = jacobian.transpose(1, 2, 0)
         determinant = a * d - b * c
@@ -99,5 +330,5 @@ def undistort(
         normalized[active] -= step
     lost = ~np.isfinite(normalized).all(axis=1)
     normalized[lost] = distorted[lost]
-    error = np.abs(distort(normalized, coefficients)[0] - distorted).max(axis=1, initial=0.0)
+    error = np.abs(distort(normalized, kind, coefficients)[0] - distorted).max(axis=1, initial=0.0)
     return normalized, np.asarray((error < 1e-9) & ~lost)

@@ -98,8 +98,7 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
     across = (np.arange(width) + 0.5) * camera.width / width - 0.5
     down = (np.arange(height) + 0.5) * camera.height / height - 0.5
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
-    normalized, valid = camera.normalize_where_valid(pixels)
-    rays = np.column_stack([normalized, np.ones(len(normalized))])
+    rays, valid = camera.rays_where_valid(pixels)
     # depth * ray = R (scale * x) + t, in the model's own coordinates
     directions = rays @ alignment.rotation / alignment.scale
     origin = -(alignment.translation @ alignment.rotation) / alignment.scale

@@ -20,7 +20,7 @@ def projected_covariances(
     Parameters
     ----------
     points_cam : (n, 3) float
-        In front of the camera, in its frame.
+        In the camera's frame, where it sees them.
     covariances : (n, 3, 3) float
         Covariances of these points.
     camera : Camera
@@ -31,12 +31,7 @@ def projected_covariances(
     >>> projected_covariances(np.array([[0.0, 0.0, 5.0]]), np.eye(3)[None], camera).tolist()
     [[[10000.0, 0.0], [0.0, 10000.0]]]
     """
-    rays = perspective(points_cam)
-    by_point = np.concatenate(
-        [np.broadcast_to(np.eye(2), (len(rays), 2, 2)), -rays[:, :, None]], axis=2
-    )
-    by_point /= points_cam[:, 2, None, None]
-    jacobian = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays) @ by_point
+    jacobian = camera.projection_slopes(points_cam)
     return np.asarray(jacobian @ covariances @ jacobian.swapaxes(1, 2))
 
 

@@ -59,12 +59,24 @@ def rotations_from_vectors(vectors: FloatArray) -> FloatArray:
     """
     angles = np.linalg.norm(vectors, axis=1)
     axes = vectors / np.where(angles > 0, angles, 1.0)[:, None]
-    x, y, z = axes.T
-    cross = np.zeros((len(axes), 3, 3))  # np.cross takes longer than all the rest
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -z, y, -x
-    cross[:, 1, 0], cross[:, 2, 0], cross[:, 2, 1] = z, -y, x
+    cross = -by_rotation(axes)
     squares = 2 * np.sin(angles / 2)[:, None, None] ** 2 * (cross @ cross)
     return np.asarray(np.eye(3) + np.sin(angles)[:, None, None] * cross + squares)
+
+
+def by_rotation(points: FloatArray) -> FloatArray:
+    """Derivatives (..., 3, 3) of points (..., 3) by a rotation vector: columns are axis x point.
+
+    Examples
+    --------
+    >>> by_rotation(np.array([1.0, 2.0, 3.0])).tolist()
+    [[0.0, 3.0, -2.0], [-3.0, 0.0, 1.0], [2.0, -1.0, 0.0]]
+    """
+    x, y, z = np.moveaxis(points, -1, 0)
+    found = np.zeros((*points.shape, 3))  # np.cross takes several times as long
+    found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = z, -y, x
+    found[..., 1, 0], found[..., 2, 0], found[..., 2, 1] = -z, y, -x
+    return found
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ import operator
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -53,6 +53,16 @@ class Labelled(Document, kw_only=True):
     """Base of what may name a keypoint by its semantic id."""
 
     semantic_id: Index | None = None
+
+
+def require_unique(keypoints: Sequence[Any], field: str) -> None:
+    """Refuse a field's value, other than None, that two of the keypoints have."""
+    first: dict[Any, int] = {}
+    for row, keypoint in enumerate(keypoints):
+        value = getattr(keypoint, field)
+        if value is not None and first.setdefault(value, row) != row:
+            what = f"{value!r} occurs twice, first in keypoints[{first[value]}]"
+            raise InputError(what, where=f"keypoints[{row}].{field}")
 
 
 class ForeignDocument(Struct):

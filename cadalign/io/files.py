@@ -148,8 +148,10 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        # The text of other libraries' errors names the system's only among much else.
+        reason = os.strerror(error.errno) if error.errno else error
         raise DataError(
-            f"cannot be written ({error.strerror or error})",
+            f"cannot be written ({reason})",
             where=str(path),
             fix="make room or choose another folder; what was written before is kept",
         ) from None

@@ -27,12 +27,16 @@ optional, each given for all keypoints or for none. ``image`` and ``model`` are 
 relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
 ``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis``, ``focal`` and
-``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``null`` for none, by default that of
-the first photo's EXIF data, unless another photo's differ); and ``shape_sigma`` of
+``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``"usual"`` for that of usual lenses,
+``null`` for none; by default that of the first photo's EXIF data, unless another photo's differ,
+and otherwise the usual one); and ``shape_sigma`` of
 `cadalign.Model`, for a model that is only similar.
 
 ``object`` is the object's name, to tell the objects of a photo apart. ``unfinished`` has what an
 annotator has marked and a fit cannot use, such as a point of the photo without one of the model.
+
+``up_axis`` is the model's axis that points up, ``"y"`` by default, for ``up`` and
+``camera_height``; ``null`` for none.
 
 ``symmetry`` says what takes the model to itself, in any form of `cadalign.Symmetry.from_dict`:
 ``"__SYM_ROTATE_UP_4"``, ``{"axis": [0, 1, 0], "fold": null}``, or BOP's lists.
@@ -75,7 +79,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -122,6 +126,8 @@ class Observation(ObservedImage):
         Where to start, as for `cadalign.align`.
     object_name : str, optional
         Name of the object.
+    up_axis : {"y", "x", "z"} or None
+        The model's axis that points up, as for `cadalign.Model`.
     unfinished : mapping, optional
         What is marked and cannot be used yet, for the annotator.
     """
@@ -134,6 +140,7 @@ class Observation(ObservedImage):
     symmetry: Symmetry | None = field(default=None, kw_only=True)
     init: Alignment | None = field(default=None, kw_only=True)
     object_name: str | None = field(default=None, kw_only=True)
+    up_axis: Literal["x", "y", "z"] | None = field(default="y", kw_only=True)
     unfinished: Mapping[str, Any] | None = field(default=None, kw_only=True)
 
     @property
@@ -145,6 +152,20 @@ class Observation(ObservedImage):
     def is_plain(self) -> bool:
         """True where nothing but keypoints in one image is known."""
         return not (self.others or self.size or self.init or self.has_more)
+
+    def with_lens(self, focal: float | None = None, *, fov: float | None = None) -> Observation:
+        """The observation with a known focal length or field of view of all its cameras.
+
+        As `with_lens`; options of the fit about it are left out.
+        """
+        if focal is None and fov is None:
+            return self
+        kept = {key: self.fit_options[key] for key in self.fit_options if "focal" not in key}
+        others = tuple(
+            replace(view, camera=with_lens(view.camera, focal, fov=fov)) for view in self.others
+        )
+        camera = with_lens(self.camera, focal, fov=fov)
+        return replace(self, camera=camera, others=others, fit_options=kept)
 
     def __repr__(self) -> str:
         counts = ", ".join(str(len(view.points_2d)) for view in self.views)
@@ -196,6 +217,7 @@ class Observation(ObservedImage):
             symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
             init=read_start(read.init),
             object_name=read.object,
+            up_axis=read.up_axis,
             unfinished=read.unfinished,
         )
 
@@ -217,6 +239,8 @@ class Observation(ObservedImage):
             data["object"] = self.object_name
         if self.size is not None:
             data["size"] = self.size.given
+        if self.up_axis != "y":
+            data["up_axis"] = self.up_axis
         if self.symmetry is not None:
             data["symmetry"] = self.symmetry.to_dict()
         if self.init is not None:
@@ -232,6 +256,21 @@ class Observation(ObservedImage):
         write_json(Path(path), self.to_dict(folder=Path(path).parent, states_origins=True))
 
 
+def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None = None) -> Camera:
+    """The camera with a known focal length [px] or horizontal field of view [degrees], if given.
+
+    Raises
+    ------
+    InputError
+        If both are given, or one is not possible.
+    """
+    if fov is None:
+        return camera if focal is None else camera.with_focal(focal)
+    if focal is not None:
+        raise InputError("given beside the focal length", where="fov", fix="give one of the two")
+    return camera.with_focal(Camera.from_fov(camera.width, camera.height, fov_x=fov).fx)
+
+
 @dataclass(frozen=True)
 class ObservationChanges:
     """Camera, evidence and size in the place of those of observations.
@@ -245,12 +284,16 @@ class ObservationChanges:
     evidence : mapping
         Fields of `ImageEvidence`.
     size : Size, optional
+    focal, fov : float, optional
+        Focal length [px] or horizontal field of view [degrees] of all cameras.
     """
 
     camera: Path | None = None
     pixel_origin: PixelOrigin | None = None
     evidence: Mapping[str, Any] = field(default_factory=dict)
     size: Size | None = None
+    focal: float | None = None
+    fov: float | None = None
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
@@ -280,7 +323,8 @@ class ObservationChanges:
                 where=where,
                 fix="write camera, masks and other evidence into its `views`",
             )
-        return replace(observation, **changes) if changes else observation
+        changed = replace(observation, **changes) if changes else observation
+        return changed.with_lens(self.focal, fov=self.fov)
 
 
 @lru_cache(maxsize=64)

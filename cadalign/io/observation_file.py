@@ -18,7 +18,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import PixelOrigin, shift_of
+from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of
 from cadalign.io.documents import (
     Document,
     Labelled,
@@ -30,6 +30,7 @@ from cadalign.io.documents import (
     Text,
     convert,
     path_from,
+    require_unique,
     within,
     written_path,
 )
@@ -50,11 +51,12 @@ class KeypointFields(Labelled, kw_only=True):
     depth: Positive | None = None
 
 
-class FocalPriorFields(Document):
+class FocalPriorFields(Document, omit_defaults=True):
     """The entry ``fit.focal_prior``."""
 
     focal: Positive
     relative_sigma: Positive
+    source: str = ""
 
 
 class FitFields(Document):
@@ -68,7 +70,8 @@ class FitFields(Document):
     scale_prior_sigma: Positive | UnsetType | None = UNSET
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
-    focal_prior: FocalPriorFields | UnsetType | None = UNSET
+    focal_prior: FocalPriorFields | Literal["usual"] | UnsetType | None = UNSET
+    principal_sigma: Positive | UnsetType | None = UNSET
     shape_sigma: Positive | UnsetType = UNSET
 
 
@@ -112,6 +115,7 @@ class OneView(_ImageFields, kw_only=True):
     shape: PathText | None = None
     size: SizeFields | None = None
     object: Text | None = None
+    up_axis: Literal["x", "y", "z"] | None = "y"
     symmetry: Any = None  # in a form of `Symmetry.from_dict`
     unfinished: Any = None  # the annotator's
     init: StartFields | None = None
@@ -132,6 +136,7 @@ class SeveralViews(Document, kw_only=True):
     shape: PathText | None = None
     size: SizeFields | None = None
     object: Text | None = None
+    up_axis: Literal["x", "y", "z"] | None = "y"
     symmetry: Any = None  # in a form of `Symmetry.from_dict`
     unfinished: Any = None  # the annotator's
     init: StartFields | None = None
@@ -186,6 +191,11 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
     """
     names = _column(read.keypoints, "name")
     ids = _column(read.keypoints, "semantic_id")
+    for field in ("name", "semantic_id"):
+        require_unique(read.keypoints, field)
+    camera = Camera.from_dict(read.camera)
+    points_2d = np.array([each.uv for each in read.keypoints]).reshape(-1, 2)
+    check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
     evidence = {}
     for each in evidence_fields():
         value = getattr(read, each.name)
@@ -193,9 +203,8 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
         evidence[each.name] = path_from(value, folder) if is_path else value
     return ObservedImage(
         points_3d=np.array([each.xyz for each in read.keypoints]).reshape(-1, 3),
-        points_2d=np.array([each.uv for each in read.keypoints]).reshape(-1, 2)
-        - shift_of(read.pixel_origin),
-        camera=Camera.from_dict(read.camera),
+        points_2d=points_2d - shift_of(read.pixel_origin),
+        camera=camera,
         sigma=_column(read.keypoints, "sigma"),
         semantic_ids=None if ids is None else np.array(ids, dtype=np.int64),
         names=None if names is None else tuple(names),

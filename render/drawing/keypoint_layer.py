@@ -108,19 +108,10 @@ class KeypointMarks:
 
 
 def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Outlines of the ellipses that hold each point with `REGION_SHARE` probability.
+    """Outlines (k, 48, 2) of the ellipses that hold each point with `REGION_SHARE` probability.
 
-    Parameters
-    ----------
-    points_2d : (n, 2) float
-        Their centres [px].
-    covariances : (n, 2, 2) float
-        [px squared].
-
-    Returns
-    -------
-    (k, 48, 2) float
-        Outlines of the ellipses that are at least 3 px across.
+    ``points_2d`` (n, 2) [px] are their centres, ``covariances`` (n, 2, 2) [px squared]; ellipses of
+    less than 3 px across are left out.
 
     Examples
     --------

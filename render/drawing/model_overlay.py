@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.errors import InputError
+from cadalign.errors import InputError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.render.drawing.color import ByteImage
-from cadalign.render.drawing.model_layer import LINES, SHADED, TRANSLUCENT
 from cadalign.render.drawing.overlay import draw_overlay
+from cadalign.render.drawing.pictures import LINES, SHADED, TRANSLUCENT
 from cadalign.render.frame import Geometry
 from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
 from cadalign.render.scene import Scene
@@ -28,16 +28,6 @@ MODES = (SHADED, TRANSLUCENT, LINES, BOX)
 class OverlayStyle:
     """Style of a model drawn over its photo.
 
-    Parameters
-    ----------
-    mode : {"shaded", "translucent", "lines", "box"}
-        The model in its own colours, lit; as a red veil; its visible outline and creases alone; or
-        not at all, for the box alone.
-    opacity : float
-        Opacity of the shaded or translucent model, 0 to 1.
-    lines, box, axes : bool
-        Whether to draw outline and creases over the model, its box, and its x, y and z axes.
-
     Raises
     ------
     InputError
@@ -45,15 +35,20 @@ class OverlayStyle:
     """
 
     mode: str = "shaded"
+    """``shaded``, the model in its own colours, lit; ``translucent``, as a red veil; ``lines``, its
+    visible outline and creases alone; or ``box``, the box alone."""
     opacity: float = 0.6
+    """Opacity of the shaded or translucent model, 0 to 1."""
     lines: bool = True
+    """Whether to draw outline and creases over the model."""
     box: bool = True
+    """Whether to draw its box."""
     axes: bool = True
+    """Whether to draw its x, y and z axes."""
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:
-            fix = f"known are {', '.join(MODES)}"
-            raise InputError(f"unknown mode {self.mode!r}", where="mode", fix=fix)
+            raise unknown("mode", self.mode, MODES)
         if not 0 <= self.opacity <= 1:
             raise InputError(f"{self.opacity} is not from 0 to 1", where="opacity")
 

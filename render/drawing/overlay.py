@@ -12,11 +12,10 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import perspective
 from cadalign.render.drawing.canvas import Canvas, Color, LegendEntry
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.keypoint_layer import KeypointMarks
-from cadalign.render.drawing.model_layer import (
+from cadalign.render.drawing.pictures import (
     SHADED,
     TRANSLUCENT,
     VEIL_OPACITY,
@@ -218,16 +217,17 @@ def _strokes(
     box: Box, ends: FloatArray, camera: Camera, color: Color, **style: Any
 ) -> list[_Stroke]:
     """Project a segment (2, 3); none if it is not seen, several if a lens cuts it up."""
-    clipped = _clip(ends, camera, _NEAR * (float(np.linalg.norm(box.extents)) or 1.0))
+    clipped: FloatArray | None = ends
+    if not camera.is_wide:
+        clipped = _clip(ends, camera, _NEAR * (float(np.linalg.norm(box.extents)) or 1.0))
     if clipped is None:
         return []
-    depth = float(clipped[:, 2].mean())
+    depth = float((np.linalg.norm(clipped, axis=1) if camera.is_wide else clipped[:, 2]).mean())
     count = _BENT_LINE_POINTS if camera.distortion else 2
     share = np.linspace(0, 1, count)[:, None]
     points = clipped[0] + share * (clipped[1] - clipped[0])
-    normalized = perspective(points)
-    kept = within_lens_field(camera, normalized)
-    pixels = camera.pixels_from_normalized(normalized)
+    kept = within_lens_field(camera, points)
+    pixels = camera.pixels_of_rays(points)
     runs = np.split(np.arange(count), np.flatnonzero(np.diff(kept)) + 1)
     return [
         _Stroke(depth, pixels[run], color, **style) for run in runs if kept[run[0]] and len(run) > 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -23,6 +24,8 @@ from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.keypoint_layer import confidence_regions
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.frame import LIGHT_GREY, check_image_size
+from cadalign.render.raycast.renderer import cast_geometry
+from cadalign.render.scene import Scene
 
 logger = logging.getLogger("cadalign")
 
@@ -43,29 +46,17 @@ def draw_result(
     """Draw the estimated box, keypoints with their uncertainty, and mesh over the photo of a view.
 
     Keypoints that the view does not show are drawn with the regions that hold them; where the views
-    have a pose each, regions are drawn in the first one alone.
-
-    Parameters
-    ----------
-    image : ObservedImage
-        Its photo is drawn on, or grey where there is none.
-    result : Result
-    photo : (h, w, 3) uint8, optional
-        Its photo, if it has been read already.
-    mesh : Mesh, optional
-        The object's, in the model's frame before the stretch; see `mesh_of`.
-    bounds : (2, 3) float, optional
-        The box to draw, in the model's frame; by default the result's.
-    mask : (h, w), optional
-        The view's mask, whose contour is drawn.
-    number : int
-        The view's number in the result.
+    have a pose each, regions are drawn in the first one alone. ``photo`` (h, w, 3) is the image's
+    if it has been read already, grey where there is none; ``mesh`` the object's in the model's
+    frame before the stretch, see `mesh_of`; ``bounds`` (2, 3) the box to draw in that frame, by
+    default the result's; ``mask`` (h, w) the view's, whose contour is drawn; ``number`` the view's
+    in the result.
     """
     view = result.views[number]
     camera, alignment = view.camera, view.alignment
     photo = photo_of(image, camera) if photo is None else photo
     in_camera = alignment.apply(result.points_3d)
-    ahead = in_camera[:, 2] > 0
+    ahead = camera.sees(in_camera)
     seen = set(view.ids)
     unseen = ahead & np.array([label not in seen for label in result.ids], dtype=bool)
     row_of = {label: row for row, label in enumerate(result.ids)}
@@ -80,8 +71,6 @@ def draw_result(
         regions = confidence_regions(camera.project(in_camera[ahead]), projected)
     frame = None
     if mesh is not None:
-        from cadalign.render import Scene, cast_geometry  # takes time to import
-
         frame = cast_geometry(Scene(mesh), camera, alignment)
     return draw_overlay(
         photo if mask is None else draw_contour(photo, np.asarray(mask)),
@@ -105,8 +94,6 @@ def photo_of(observation: ObservedImage, camera: Camera) -> ByteImage:
 
 def draw_contour(image: ByteImage, mask: npt.NDArray[Any]) -> ByteImage:
     """Draw the contour of a mask (h, w) over an image; returns a copy."""
-    import cv2
-
     inside = (mask > _INSIDE).astype(np.uint8)
     contours, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     drawn = image.copy()

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.errors import InputError
+from cadalign.errors import InputError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
@@ -42,13 +42,7 @@ _FILL = 0.88
 
 @dataclass(frozen=True)
 class Angles:
-    """Viewing angles of a model; see `look_at`.
-
-    Parameters
-    ----------
-    azimuth, elevation, roll : float
-        Degrees.
-    """
+    """Viewing angles of a model [degrees]; see `look_at`."""
 
     azimuth: float
     elevation: float
@@ -120,8 +114,7 @@ def draw_still(
     if style == "lines":
         return _smooth_lines(scene, camera, cam_from_model)
     if style not in _PICTURES:
-        known = ", ".join(["color", *_PICTURES, "lines"])
-        raise InputError(f"unknown style {style!r}", where="style", fix=f"known are {known}")
+        raise unknown("style", style, ["color", *_PICTURES, "lines"])
     return _PICTURES[style](cast_geometry(scene, camera, cam_from_model))
 
 

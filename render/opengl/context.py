@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.errors import RenderError
 from cadalign.render.drawing.color import ByteImage
-from cadalign.render.remedy import missing_libraries
+from cadalign.render.probe import missing_libraries
 
 
 class GlContext:

@@ -61,9 +61,10 @@ class PyrenderRenderer:
     ) -> Frame:
         """Draw a scene; see `RaycastRenderer.render`.
 
-        OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off.
+        OpenGL antialiases with 4 samples whatever ``samples`` says; 1 turns antialiasing off. What
+        a wide lens sees is cast by rays: OpenGL has no picture of 180 degrees.
         """
-        if self.drawn_by(scene, samples=samples) != self.name:
+        if camera.is_wide or self.drawn_by(scene, samples=samples) != self.name:
             return self._fallback.render(scene, camera, cam_from_model, samples=samples)
         check_samples(samples)
         check_image_size(camera)

@@ -61,8 +61,8 @@ def _openness(geometry: Geometry, posed: PosedScene, reach: float) -> SingleImag
     if not len(inside):
         return None
     pixels = np.column_stack([columns[inside[:, 1]], rows[inside[:, 0]]]).astype(float)
-    rays, _ = camera.normalize_where_valid(pixels)
-    points = np.column_stack([rays, np.ones(len(rays))]) * depth[hit][:, None]
+    rays, _ = camera.rays_where_valid(pixels)
+    points = rays * depth[hit][:, None]
     points += _LIFT * posed.diagonal * normal[hit]
     sky = np.zeros(hit.shape, dtype=np.float32)
     tile = (inside[:, 0] % _TILE) * _TILE + inside[:, 1] % _TILE

@@ -26,6 +26,7 @@ _LAYER_GAP = 2e-5
 # Pixels left about the object.
 _MARGIN = 2
 _POINTS_PER_SIDE = 65
+_LEAST_COSINE = 0.05  # of a cone about the object
 
 
 @dataclass(frozen=True)
@@ -102,10 +103,13 @@ class PosedScene:
         _ = self.scene.barycentric_gradients
 
     def cast(
-        self, normalized: FloatArray, *, start: FloatArray | None = None
+        self, rays: FloatArray, *, start: FloatArray | None = None
     ) -> tuple[FaceArray, FloatArray]:
-        """Find what is seen in normalised directions (n, 2): triangles and depths, both (n,)."""
-        directions = self._directions(normalized)
+        """Find what is seen along rays (n, 3) of the camera: triangles and depths, both (n,).
+
+        A depth is the multiple of its ray that leads to the hit.
+        """
+        directions = self._directions(rays)
         face, depth = self._caster.first_hits(self._origin, directions, start=start)
         return self._as_shown(face), depth
 
@@ -141,47 +145,47 @@ class PosedScene:
 
     def mean_light(
         self,
-        normalized: FloatArray,
+        rays: FloatArray,
         valid: npt.NDArray[np.bool_],
         studio: Studio,
         *,
         samples: int,
     ) -> LinearArray:
-        """Mean colour of each ``samples`` successive normalised directions (n, 2), cast anew.
+        """Mean colour of each ``samples`` successive rays (n, 3) of the camera, cast anew.
 
-        Linear light, premultiplied, and opacity: (n / samples, 4) float32. Directions that are not
+        Linear light, premultiplied, and opacity: (n / samples, 4) float32. Rays that are not
         ``valid`` see nothing.
         """
-        directions = self._directions(normalized)
+        directions = self._directions(rays)
         face = self._caster.first_faces(self._origin, directions)
         face[~valid] = -1
         surface = self.scene.surface
         if surface.varies or not surface.opaque:
             depth = self._caster.distances(self._origin, directions, face)
-            light = self.light_of_hits(normalized, self._as_shown(face), depth, studio)
+            light = self.light_of_hits(rays, self._as_shown(face), depth, studio)
             return np.asarray(light.reshape(-1, samples, 4).mean(axis=1))
         # A triangle of one colour looks the same all over a pixel: one of its hits stands for all.
         chosen, share = _one_of_each(face.reshape(-1, samples))
         face = face[chosen]
         depth = self._caster.distances(self._origin, directions[chosen], face)
-        light = self.light_of_hits(normalized[chosen], self._as_shown(face), depth, studio)
+        light = self.light_of_hits(rays[chosen], self._as_shown(face), depth, studio)
         light *= share[:, None]
         begins = np.searchsorted(chosen // samples, np.arange(len(directions) // samples))
         return np.asarray(np.add.reduceat(light, begins, axis=0))
 
     def light_of_hits(
-        self, normalized: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
+        self, rays: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
     ) -> LinearArray:
-        """Colour seen in normalised directions (n, 2) whose first hits are known.
+        """Colour seen along rays (n, 3) of the camera whose first hits are known.
 
         Linear light, premultiplied, and opacity: (n, 4) float32.
         """
         result = np.zeros((len(face), 4), dtype=np.float32)
         active = np.flatnonzero(face >= 0)
         if self.scene.surface.opaque:
-            result[active] = self._shade(normalized[active], face[active], depth[active], studio)
+            result[active] = self._shade(rays[active], face[active], depth[active], studio)
             return result
-        rays, face, depth = normalized[active], face[active], depth[active]
+        rays, face, depth = rays[active], face[active], depth[active]
         for _ in range(_MAX_LAYERS):
             if not len(active):
                 break
@@ -201,7 +205,7 @@ class PosedScene:
         return result
 
     def _shade(
-        self, normalized: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
+        self, rays: FloatArray, face: FaceArray, depth: FloatArray, studio: Studio
     ) -> LinearArray:
         """Light and opacity (n, 4) of hits, not premultiplied."""
         surface = self.scene.surface
@@ -209,25 +213,23 @@ class PosedScene:
         smooth = np.flatnonzero(self.scene.is_smooth[face])
         weights: LinearArray | None = None
         if surface.varies:
-            weights = self._weights(normalized, face, depth)
+            weights = self._weights(rays, face, depth)
         if len(smooth):
             chosen = (
-                self._weights(normalized[smooth], face[smooth], depth[smooth])
+                self._weights(rays[smooth], face[smooth], depth[smooth])
                 if weights is None
                 else weights[smooth]
             )
             normal[smooth] = self._smooth_normals(face[smooth], chosen)
         color = surface.color(face, weights)
-        view = np.empty((len(face), 3), dtype=np.float32)
-        view[:, :2] = -normalized
-        view[:, 2] = -1
+        view = (-rays).astype(np.float32)
         view /= np.sqrt(np.einsum("nk,nk->n", view, view))[:, None]
         up = self._alignment.rotation[:, 1]
         return np.column_stack([studio.shade(color[:, :3], normal, view, up), color[:, 3]])
 
-    def _weights(self, normalized: FloatArray, face: FaceArray, depth: FloatArray) -> LinearArray:
+    def _weights(self, rays: FloatArray, face: FaceArray, depth: FloatArray) -> LinearArray:
         """Barycentric coordinates of hits, (n, 3)."""
-        points = self._directions(normalized) * depth[:, None]
+        points = self._directions(rays) * depth[:, None]
         points += self._origin - self.scene.triangles[face, 0]
         later = np.einsum("nck,nk->nc", self.scene.barycentric_gradients[face], points)
         weights = np.column_stack([1 - later.sum(axis=1), later])
@@ -245,10 +247,9 @@ class PosedScene:
         side = self._side[face].astype(np.float32)
         return np.asarray(turned * (side / np.maximum(length, np.float32(1e-30)))[:, None])
 
-    def _directions(self, normalized: FloatArray) -> FloatArray:
-        """Directions (n, 3) in the model frame of normalised ones (n, 2)."""
-        columns = self._model_from_ray.T
-        return np.asarray(normalized @ columns[:2] + columns[2])
+    def _directions(self, rays: FloatArray) -> FloatArray:
+        """Directions (n, 3) in the model frame of the camera's."""
+        return np.asarray(rays @ self._model_from_ray.T)
 
     def _to_camera(self, normals: FloatArray) -> LinearArray:
         rows = normals @ self._normal_matrix.T
@@ -285,23 +286,21 @@ def pose_scene(
 def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -> Rectangle | None:
     """The block of pixels that holds all of the object and a margin; None if it is unseen."""
     points = scene.used_vertices @ cam_from_model.linear.T + cam_from_model.translation
-    nearest = points[:, 2].min()
-    if points[:, 2].max() <= 0:
-        return None
     whole = Rectangle(0, 0, camera.width, camera.height)
-    if nearest <= 0:
-        return whole
-    normalized = perspective(points)
-    if not np.isfinite(normalized).all():
-        return whole
-    low, high = normalized.min(axis=0), normalized.max(axis=0)
-    if camera.distortion:
-        normalized = _outline(low, high)
-        if not within_lens_field(camera, normalized).all():
-            return whole
+    if camera.is_wide:
+        outline = _cone_about(points)
     else:
-        normalized = np.array([low, high])
-    pixels = camera.pixels_from_normalized(normalized)
+        if points[:, 2].max() <= 0:
+            return None
+        if points[:, 2].min() <= 0:
+            return whole
+        normalized = perspective(points)
+        if not np.isfinite(normalized).all():
+            return whole
+        outline = _outline(normalized.min(axis=0), normalized.max(axis=0))
+    if not len(outline) or not within_lens_field(camera, outline).all():
+        return whole
+    pixels = camera.pixels_of_rays(outline)
     size = (camera.width, camera.height)
     # Clip before converting to whole numbers, which far-off pixels would overflow.
     first = np.clip(np.floor(pixels.min(axis=0)) - _MARGIN, 0, size).astype(int)
@@ -311,10 +310,28 @@ def _object_rectangle(scene: Scene, camera: Camera, cam_from_model: Alignment) -
     return Rectangle(int(first[0]), int(first[1]), int(last[0]), int(last[1]))
 
 
+def _cone_about(points: FloatArray) -> FloatArray:
+    """Directions (n, 3) along the border of a cone that holds all points; none of half a space.
+
+    Nor of a cone about the direction straight behind, where a wide lens sees nothing.
+    """
+    rays = points / np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-300)
+    axis = rays.mean(axis=0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-300)
+    cosine = float((rays @ axis).min())
+    if cosine < _LEAST_COSINE or -axis[2] > cosine:
+        return np.empty((0, 3))
+    across = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.9 else [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    angles = np.linspace(0, 2 * np.pi, 4 * _POINTS_PER_SIDE)[:, None]
+    ring = np.cos(angles) * across + np.sin(angles) * np.cross(axis, across)
+    return np.asarray(cosine * axis + np.sqrt(1 - cosine**2) * ring)
+
+
 def _outline(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Points along the border of a rectangle, (n, 2)."""
+    """Directions (n, 3) along the border of a rectangle of normalised ones."""
     share = np.linspace(0, 1, _POINTS_PER_SIDE)[:, None]
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
     following = np.roll(corners, -1, axis=0)
     lines = [a + share * (b - a) for a, b in zip(corners, following, strict=True)]
-    return np.concatenate(lines)
+    return np.column_stack([np.concatenate(lines), np.ones(4 * _POINTS_PER_SIDE)])

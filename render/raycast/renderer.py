@@ -100,9 +100,9 @@ class RaycastRenderer:
             posed.prepare_color()
 
             def shade(
-                band: Rectangle, normalized: FloatArray, face: FaceArray, depth: FloatArray
+                band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
             ) -> None:
-                light = posed.light_of_hits(normalized, face, depth, self.studio)
+                light = posed.light_of_hits(rays, face, depth, self.studio)
                 color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
 
             _cast(geometry, posed, shade)
@@ -136,7 +136,7 @@ class RaycastRenderer:
 
         def draw(part: IntArray) -> None:
             pixels = (part[:, None] + offsets).reshape(-1, 2)
-            rays, valid = posed.camera.normalize_where_valid(pixels)
+            rays, valid = posed.camera.rays_where_valid(pixels)
             light = posed.mean_light(rays, valid, self.studio, samples=samples)
             color[part[:, 1], part[:, 0]] = _encode(light)
 
@@ -194,8 +194,8 @@ def _cast(
     """Fill the images with hits of one ray through each pixel's centre, and shade these."""
 
     def draw(band: Rectangle) -> None:
-        normalized, valid = posed.camera.normalize_where_valid(band.pixels)
-        face, depth = posed.cast(normalized)
+        rays, valid = posed.camera.rays_where_valid(band.pixels)
+        face, depth = posed.cast(rays)
         face[~valid] = -1
         hit = np.flatnonzero(face >= 0)
         shape = (band.height, band.width)
@@ -205,7 +205,7 @@ def _cast(
         normal[hit] = posed.normals[face[hit]]
         geometry.normal[band.slices] = normal.reshape(*shape, 3)
         if shade is not None:
-            shade(band, normalized, face, depth)
+            shade(band, rays, face, depth)
 
     in_threads(draw, posed.block.tiles(posed.block.width, _RAYS_AT_ONCE // posed.block.width))
 

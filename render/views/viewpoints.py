@@ -12,7 +12,6 @@ from cadalign.errors import InputError, RenderError, TooFewVisibleError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import perspective
 from cadalign.render.scene import Scene
 from cadalign.render.views.lens_field import within_lens_field
 from cadalign.render.views.visibility import visible_keypoints
@@ -23,18 +22,12 @@ _FILL_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """A camera's view of an object.
-
-    Parameters
-    ----------
-    cam_from_model : Alignment
-        The object's pose in the camera frame.
-    visible : (k,) bool
-        Which keypoints are seen.
-    """
+    """A camera's view of an object."""
 
     cam_from_model: Alignment
+    """The object's pose in the camera frame."""
     visible: npt.NDArray[np.bool_]
+    """(k,), which keypoints are seen."""
 
 
 def look_at(
@@ -210,7 +203,7 @@ def frame_object(
     corners = box.corners - box.center
     size = float(np.linalg.norm(box.extents)) or 1.0
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
-    axis = np.append(camera.normalize(middle)[0], 1.0)
+    (axis,), _ = camera.rays_where_valid(middle)
     # Depths of the box's centre: in the first a corner touches the camera's plane.
     near, far = size / 2, 1e6 * size
     for _ in range(_DISTANCE_STEPS):
@@ -228,12 +221,9 @@ def frame_object(
 
 def _share(corners: FloatArray, camera: Camera, middle: FloatArray) -> float:
     """Share of the way to the image's border that the farthest corner reaches."""
-    if corners[:, 2].min() <= 0:
+    if not within_lens_field(camera, corners).all():
         return np.inf
-    normalized = perspective(corners)
-    if not within_lens_field(camera, normalized).all():
-        return np.inf
-    offset = np.abs(camera.pixels_from_normalized(normalized) - middle)
+    offset = np.abs(camera.pixels_of_rays(corners) - middle)
     return float((2 * offset / (camera.width, camera.height)).max())
 
 

@@ -9,7 +9,7 @@ from cadalign.arrays import FloatArray, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import model_rays, perspective
+from cadalign.geometry.projection import model_rays
 from cadalign.render.scene import Scene
 from cadalign.render.views.lens_field import within_lens_field
 
@@ -82,19 +82,58 @@ def visible_keypoints(
 
 def seen_in_image(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.bool_]:
     """Say which camera-frame points (k, 3) lie before the camera and inside its image; (k,)."""
-    seen = points_cam[:, 2] > 0
-    before = np.flatnonzero(seen)
-    normalized = perspective(points_cam[before])
-    inside = camera.contains(camera.pixels_from_normalized(normalized))
-    seen[before] = inside & within_lens_field(camera, normalized)
-    return np.asarray(seen)
+    seen = within_lens_field(camera, points_cam)
+    seen[seen] = camera.contains(camera.pixels_of_rays(points_cam[seen]))
+    return seen
 
 
 def _beside(points_cam: FloatArray) -> FloatArray:
     """Offsets across the line of sight, of length 0 or 1, (k, 5, 3)."""
     sight = points_cam / np.linalg.norm(points_cam, axis=1, keepdims=True)
     across = np.column_stack([sight[:, 2], np.zeros(len(sight)), -sight[:, 0]])
+    across[np.abs(sight[:, 1]) > 0.99] = (1.0, 0.0, 0.0)  # seen by wide lenses alone
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     upright = np.cross(sight, across)
     axes = np.stack([across, upright], axis=1)
     return np.asarray(np.einsum("ra,kax->krx", _RAY_OFFSETS, axes))
+
+
+def silhouette_iou(*, est: npt.ArrayLike, gt: npt.ArrayLike) -> float:
+    """Intersection over union of the predicted and the observed object's pixels.
+
+    Parameters
+    ----------
+    est, gt : (h, w) bool
+        Where each is, for example `Geometry.mask`; of numbers, what is above half of the largest
+        possible value (1 for floats, 255 for bytes) counts, so that opacities will do.
+
+    Returns
+    -------
+    float
+        From 0 to 1; NaN where neither is anywhere.
+
+    Raises
+    ------
+    InputError
+        If they are not images of one size.
+
+    Examples
+    --------
+    >>> silhouette_iou(est=[[True, True, False]], gt=[[False, True, True]])
+    0.3333333333333333
+    """
+    one, other = _as_mask(est, "est"), _as_mask(gt, "gt")
+    if one.shape != other.shape:
+        raise InputError(f"shape {one.shape}, but gt has {other.shape}", where="est")
+    union = int((one | other).sum())
+    return int((one & other).sum()) / union if union else float("nan")
+
+
+def _as_mask(value: npt.ArrayLike, name: str) -> npt.NDArray[np.bool_]:
+    array = np.asarray(value)
+    if array.ndim != 2 or array.dtype.kind not in "buif":
+        raise InputError(f"shape {array.shape}, expected (h, w) of truth values", where=name)
+    if array.dtype.kind == "b":
+        return array.astype(bool)
+    full = 1.0 if array.dtype.kind == "f" else float(np.iinfo(array.dtype).max)
+    return np.asarray(array > full / 2)

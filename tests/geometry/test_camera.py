@@ -167,6 +167,11 @@ PARAMS = {
     "RADIAL": [500.0, 320.0, 240.0, 0.1, -0.05],
     "OPENCV": [500.0, 520.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02],
     "FULL_OPENCV": [500.0, 520.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6],
+    "SIMPLE_RADIAL_FISHEYE": [200.0, 320.0, 240.0, 0.1],
+    "RADIAL_FISHEYE": [200.0, 320.0, 240.0, 0.1, -0.05],
+    "OPENCV_FISHEYE": [200.0, 210.0, 320.0, 240.0, 0.1, -0.05, 0.01, -0.02],
+    "THIN_PRISM_FISHEYE": [200.0, 210.0, 320.0, 240.0, 0.1, 0, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6],
+    "FOV": [200.0, 210.0, 320.0, 240.0, 0.9],
 }
 EXPECTED = {
     "SIMPLE_PINHOLE": Camera(640, 480, 500.0, 500.0, 319.5, 239.5),
@@ -177,6 +182,20 @@ EXPECTED = {
     "FULL_OPENCV": Camera(
         640, 480, 500.0, 520.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6)
     ),
+    "SIMPLE_RADIAL_FISHEYE": Camera(
+        640, 480, 200.0, 200.0, 319.5, 239.5, (0.1, 0, 0, 0), lens="fisheye"
+    ),
+    "RADIAL_FISHEYE": Camera(
+        640, 480, 200.0, 200.0, 319.5, 239.5, (0.1, -0.05, 0, 0), lens="fisheye"
+    ),
+    "OPENCV_FISHEYE": Camera(
+        640, 480, 200.0, 210.0, 319.5, 239.5, (0.1, -0.05, 0.01, -0.02), lens="fisheye"
+    ),
+    "THIN_PRISM_FISHEYE": Camera(
+        *(640, 480, 200.0, 210.0, 319.5, 239.5, (0.1, 0, 0.01, -0.02, 0.3, 0.4, -0.5, 0.6)),
+        lens="fisheye",
+    ),
+    "FOV": Camera(640, 480, 200.0, 210.0, 319.5, 239.5, (0.9,), lens="fov"),
 }
 
 
@@ -222,9 +241,14 @@ def test_round_trip_through_colmaps_form_keeps_every_pixel(
         ("RADIAL", "OPENCV"),
         ("OPENCV", "OPENCV"),
         ("FULL_OPENCV", "FULL_OPENCV"),
+        ("SIMPLE_RADIAL_FISHEYE", "OPENCV_FISHEYE"),
+        ("RADIAL_FISHEYE", "OPENCV_FISHEYE"),
+        ("OPENCV_FISHEYE", "OPENCV_FISHEYE"),
+        ("THIN_PRISM_FISHEYE", "THIN_PRISM_FISHEYE"),
+        ("FOV", "FOV"),
     ],
 )
-def test_to_dict_writes_the_smallest_of_three_models(model: str, written: str) -> None:
+def test_to_dict_writes_the_smallest_model_of_the_lens(model: str, written: str) -> None:
     data = EXPECTED[model].to_dict()
     assert data["model"] == written
     assert len(data["params"]) == len(COLMAP_PARAMS[written])
@@ -326,7 +350,8 @@ COLMAP_DATA: dict[str, Any] = {
         (
             COLMAP_DATA | {"model": "FISHEYE"},
             "camera.model: unknown model 'FISHEYE'; known are SIMPLE_PINHOLE, PINHOLE, "
-            "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV",
+            "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, "
+            "OPENCV_FISHEYE, THIN_PRISM_FISHEYE, FOV",
         ),
         (
             COLMAP_DATA | {"params": [500, 320, 240]},

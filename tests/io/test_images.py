@@ -24,12 +24,18 @@ TAGS = {
     "unit": 0xA210,
     "width": 0xA002,
     "height": 0xA003,
+    "zoom": 0xA404,
 }
 DIAGONAL_MM = math.hypot(36, 24)
 
 
 def write_photo(
-    path: Path, *, size: tuple[int, int] = (640, 480), turn: int | None = None, **tags: Any
+    path: Path,
+    *,
+    size: tuple[int, int] = (640, 480),
+    turn: int | None = None,
+    model: str | None = None,
+    **tags: Any,
 ) -> Path:
     """A photo with a red left upper corner in its file, and EXIF tags."""
     pixels = np.zeros((size[1], size[0], 3), dtype=np.uint8)
@@ -38,6 +44,8 @@ def write_photo(
     exif = image.getexif()
     if turn is not None:
         exif[0x0112] = turn
+    if model is not None:
+        exif[0x0110] = model
     for name, value in tags.items():
         exif.get_ifd(0x8769)[TAGS[name]] = value
     image.save(path, exif=exif, quality=95)
@@ -156,6 +164,19 @@ def test_errors_of_the_reader_are_not_taken_for_the_photos(tmp_path: Path) -> No
             {"focal": 4.0, "density": 3000.0, "unit": 2, "width": 1280, "height": 960},
             4 * 3000 / 25.4 / 2,
         ),
+        ({"focal": 4.0, "density": 300.0, "unit": 3, "zoom": 2.0}, 2 * 4 * 300 / 10),
+        ({"focal": 4.0, "density": 300.0, "unit": 3, "zoom": 0.0}, 4 * 300 / 10),
+        ({"equivalent": 52, "focal": 4.25, "zoom": 2.0}, 52 / DIAGONAL_MM * 800),
+        ({"focal": 50.0, "model": "Canon EOS 5D Mark III"}, 50 / 36 * 640),
+        ({"focal": 50.0, "model": "Canon EOS 450D"}, 50 / 22.3 * 640),
+        ({"focal": 50.0, "model": "NIKON D850", "turn": 6}, 50 / 35.9 * 640),
+        ({"focal": 50.0, "model": "NIKON D300S"}, 50 / 23.5 * 640),
+        ({"focal": 50.0, "model": "NIKON D7000"}, 50 / 23.5 * 640),
+        ({"focal": 50.0, "model": "NIKON Z 50"}, 50 / 23.5 * 640),
+        ({"focal": 50.0, "model": "NIKON Z 6_2"}, 50 / 35.9 * 640),
+        ({"focal": 50.0, "model": "ILCE-7M3"}, 50 / 35.7 * 640),
+        ({"focal": 50.0, "model": "ILCE-6000"}, 50 / 23.5 * 640),
+        ({"focal": 50.0, "model": "Canon EOS 450D", "equivalent": 80}, 80 / DIAGONAL_MM * 800),
     ],
 )
 def test_focal_length_is_read(tmp_path: Path, tags: dict[str, Any], focal: float) -> None:
@@ -171,6 +192,8 @@ def test_focal_length_is_read(tmp_path: Path, tags: dict[str, Any], focal: float
         {},
         {"equivalent": 0},
         {"focal": 4.0},
+        {"focal": 4.0, "model": "Canon EOS-1D Mark IV"},
+        {"focal": 4.0, "model": "Unknown 5"},
         {"density": 3000.0},
         # Cropped since it was taken, so that the sensor's width is not the photo's.
         {"focal": 4.0, "density": 3000.0, "width": 1280, "height": 480},

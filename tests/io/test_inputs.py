@@ -100,7 +100,7 @@ def test_shape_that_an_observation_names_is_no_device(
 ) -> None:
     observation = {
         "camera": {"width": 64, "height": 48},
-        "keypoints": [{"xyz": [0, 0, 0], "uv": [1, 1], "name": "a"}] * 8,
+        "keypoints": [{"xyz": [0, 0, 0], "uv": [1, 1], "name": name} for name in "abcdefgh"],
         "shape": "/dev/zero",
     }
     path = tmp_path / "o.json"

@@ -130,7 +130,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
             "{path}: top level: unknown field 'cameras'; "
             "known are cam_from_rig, camera, camera_height, camera_height_sigma, depth, "
             "depth_scale, depth_sigma, fit, image, init, keypoints, mask, mask_sigma, model, "
-            "object, pixel_origin, shape, size, symmetry, unfinished, up, up_sigma_deg",
+            "object, pixel_origin, shape, size, symmetry, unfinished, up, up_axis, up_sigma_deg",
         ),
         (
             DATA | {"x` - at `$.y": 3},

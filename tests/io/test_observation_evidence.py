@@ -186,7 +186,7 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
         (
             SEVERAL | {"camera": CAMERA},
             "{path}: top level: unknown field 'camera'; "
-            "known are fit, init, model, object, shape, size, symmetry, unfinished, views",
+            "known are fit, init, model, object, shape, size, symmetry, unfinished, up_axis, views",
         ),
         (replaced(SEVERAL, "views.1.camera", ...), "{path}: views[1].camera: missing"),
         (

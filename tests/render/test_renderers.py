@@ -28,8 +28,7 @@ from cadalign.render import (
     make_renderer,
 )
 from cadalign.render import probe as probing
-from cadalign.render.probe import Probe, ball, probe_renderer
-from cadalign.render.remedy import remedy
+from cadalign.render.probe import Probe, ball, probe_renderer, remedy
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SKEWED = Camera(width=160, height=120, fx=170.0, fy=140.0, cx=60.25, cy=71.75)
@@ -316,8 +315,8 @@ def test_ambient_occlusion_darkens_corners_alone():
 def test_auto_takes_a_graphics_card_or_casts_rays_and_says_which(
     monkeypatch, caplog, found, taken, said
 ):
-    monkeypatch.setattr("cadalign.render.select.probe_renderer", lambda name: found)
-    monkeypatch.setattr("cadalign.render.select.load_renderer", lambda name, studio: name)
+    monkeypatch.setattr("cadalign.render.probe.probe_renderer", lambda name: found)
+    monkeypatch.setattr("cadalign.render.probe.load_renderer", lambda name, studio: name)
     with caplog.at_level(logging.INFO, logger="cadalign"):
         assert make_renderer("auto") == taken
     assert re.search(f"renderer: {taken} .*", caplog.text)
@@ -326,7 +325,7 @@ def test_auto_takes_a_graphics_card_or_casts_rays_and_says_which(
 
 def test_a_renderer_that_does_not_work_is_refused(monkeypatch):
     monkeypatch.setattr(
-        "cadalign.render.select.probe_renderer", lambda name: Probe(name, False, "no EGL", "")
+        "cadalign.render.probe.probe_renderer", lambda name: Probe(name, False, "no EGL", "")
     )
     for name in ("pyrender", "open3d"):
         with pytest.raises(RenderError, match=f"{name}: the renderer does not work here: no EGL"):
@@ -375,15 +374,15 @@ def test_probes_are_remembered(monkeypatch):
 
 
 def test_remedies_name_the_packages(monkeypatch):
-    monkeypatch.setattr("cadalign.render.remedy._loads", lambda library: library not in missing)
-    monkeypatch.setattr("cadalign.render.remedy.find_spec", lambda name: object())
+    monkeypatch.setattr("cadalign.render.probe._loads", lambda library: library not in missing)
+    monkeypatch.setattr("cadalign.render.probe.find_spec", lambda name: object())
     missing = {"libEGL.so.1", "libGL.so.1"}
     broken = Probe("pyrender", False, "OpenGL does not start", "")
     assert remedy(broken) == "sudo apt-get install libegl1 libgl1"
     missing = {"libusb-1.0.so.0"}
     detail = "libusb-1.0.so.0: cannot open shared object file"
     assert remedy(Probe("open3d", False, detail, "")) == "sudo apt-get install libusb-1.0-0"
-    monkeypatch.setattr("cadalign.render.remedy.find_spec", lambda name: None)
+    monkeypatch.setattr("cadalign.render.probe.find_spec", lambda name: None)
     assert remedy(Probe("open3d", False, "", "")).endswith("-m pip install 'cadalign[open3d]'")
 
 

@@ -82,8 +82,9 @@ def test_a_lens_does_not_fold_far_off_points_into_the_image(cube):
     camera = Camera(320, 240, 200, 200, 159.5, 119.5, (-0.3, 0, 0, 0))
     slopes = np.array([[0.3, 0.0], [1.0, 0.0], [1.6, 0.0], [-1.2, 1.2]])
     assert camera.contains(camera.pixels_from_normalized(slopes)).all()
-    assert within_lens_field(camera, slopes).tolist() == [True, True, False, False]
-    points = np.column_stack([slopes, np.ones(4)]) * 6 - np.array([0, 0, 40])
+    rays = np.column_stack([slopes, np.ones(4)])
+    assert within_lens_field(camera, rays).tolist() == [True, True, False, False]
+    points = rays * 6 - np.array([0, 0, 40])
     pose = Alignment(np.eye(3), [0, 0, 40], [1, 1, 1])
     assert visible_keypoints(cube, points, camera, pose).tolist() == [True, True, False, False]
 

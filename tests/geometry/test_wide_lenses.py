@@ -1,0 +1,234 @@
+"""Fisheye and fov lenses: projection, inverse and derivatives, beyond 90 degrees too."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cadalign import Camera
+from cadalign.datasets.sfm.colmap import Colmap, write_colmap
+from cadalign.datasets.sfm.correspondences import CameraView
+from cadalign.errors import InputError
+from cadalign.export.camera_files import read_camera_views, write_nerf
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.pixels import largest_angle
+from cadalign.geometry.rotations import rotation_from_vector
+
+LENSES = {
+    "equidistant": Camera(640, 640, 180.0, 185.0, 320.25, 318.5, lens="fisheye"),
+    "opencv": Camera(
+        640, 640, 180.0, 185.0, 320.25, 318.5, (0.05, -0.02, 0.01, -0.001), lens="fisheye"
+    ),
+    "thin prism": Camera(
+        *(640, 640, 180.0, 185.0, 320.25, 318.5),
+        (0.02, -0.005, 0.002, -0.003, 0.001, -1e-4, 0.001, -0.002),
+        lens="fisheye",
+    ),
+    "fov": Camera(640, 640, 180.0, 185.0, 320.25, 318.5, (0.9,), lens="fov"),
+}
+WIDEST = math.radians(110)  # of the lenses above, at which all can be inverted
+every_lens = pytest.mark.parametrize("name", LENSES)
+any_seed = given(seed=st.integers(0, 2**32 - 1))
+
+
+def directions(seed: int, *, widest: float = WIDEST, count: int = 40) -> np.ndarray:
+    """Points at random angles off the axis, and at random distances; the first lies on the axis."""
+    rng = np.random.default_rng(seed)
+    theta, phi = rng.uniform(0, widest, count), rng.uniform(0, 2 * np.pi, count)
+    theta[0] = 0.0
+    rows = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+    return np.stack(rows, axis=1) * rng.uniform(0.1, 20, (count, 1))
+
+
+@pytest.mark.parametrize("name", ["equidistant", "opencv"])
+@any_seed
+def test_fisheye_projects_as_opencvs(name: str, seed: int) -> None:
+    camera, points = LENSES[name], directions(seed, widest=math.radians(89.5))
+    expected, _ = cv2.fisheye.projectPoints(
+        points[:, None], np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
+    )
+    np.testing.assert_allclose(camera.project(points), expected[:, 0], rtol=0, atol=1e-8)
+
+
+@any_seed
+def test_fisheye_unprojects_as_opencvs(seed: int) -> None:
+    camera = LENSES["opencv"]
+    pixels = camera.project(directions(seed, widest=math.radians(80)))
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
+    expected = cv2.fisheye.undistortPoints(
+        pixels[:, None], camera.matrix, np.array(camera.distortion), criteria=criteria
+    )
+    np.testing.assert_allclose(camera.normalize(pixels), expected[:, 0], rtol=0, atol=1e-7)
+
+
+def by_colmap(camera: Camera, point: np.ndarray) -> tuple[float, float]:
+    """Pixel of a point by the formulas of COLMAP's ``src/colmap/sensor/models.h``, written out."""
+    u, v = point[0] / point[2], point[1] / point[2]
+    r = math.hypot(u, v)
+    if camera.lens == "fov":
+        (omega,) = camera.distortion
+        factor = math.atan(r * 2 * math.tan(omega / 2)) / (r * omega)
+        du, dv = u * factor, v * factor
+    else:
+        k1, k2, p1, p2, k3, k4, sx1, sy1 = camera.distortion
+        u, v = u * math.atan(r) / r, v * math.atan(r) / r
+        u2, uv, v2 = u * u, u * v, v * v
+        r2 = u2 + v2
+        radial = k1 * r2 + k2 * r2**2 + k3 * r2**3 + k4 * r2**4
+        du = u + u * radial + 2 * p1 * uv + p2 * (r2 + 2 * u2) + sx1 * r2
+        dv = v + v * radial + 2 * p2 * uv + p1 * (r2 + 2 * v2) + sy1 * r2
+    return camera.fx * du + camera.cx, camera.fy * dv + camera.cy
+
+
+@pytest.mark.parametrize("name", ["thin prism", "fov"])
+@any_seed
+def test_projection_follows_colmaps_formulas(name: str, seed: int) -> None:
+    points = directions(seed, widest=math.radians(89.5))[1:]
+    expected = [by_colmap(LENSES[name], point) for point in points]
+    np.testing.assert_allclose(LENSES[name].project(points), expected, rtol=0, atol=1e-8)
+
+
+@every_lens
+@any_seed
+def test_unproject_undoes_project(name: str, seed: int) -> None:
+    camera, points = LENSES[name], directions(seed)
+    expected = points / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(camera.unproject(camera.project(points)), expected, atol=1e-9)
+
+
+@every_lens
+@any_seed
+def test_a_turned_frame_changes_no_pixel(name: str, seed: int) -> None:
+    camera, points = LENSES[name], directions(seed)
+    turn = rotation_from_vector(np.random.default_rng(seed).normal(size=3))
+    turned = camera.turned(turn)
+    pixels = camera.project(points)
+    np.testing.assert_allclose(turned.project(points @ turn.T), pixels, atol=1e-9)
+    np.testing.assert_allclose(turned.unproject(pixels), camera.unproject(pixels) @ turn.T)
+    slopes = camera.projection_slopes(points)
+    np.testing.assert_allclose(turned.projection_slopes(points @ turn.T) @ turn, slopes, atol=1e-8)
+
+
+@every_lens
+@any_seed
+def test_slopes_are_those_of_finite_differences(name: str, seed: int) -> None:
+    camera = LENSES[name]
+    points = directions(seed)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    steps = 1e-6 * np.eye(3)
+    expected = [(camera.project(points + s) - camera.project(points - s)) / 2e-6 for s in steps]
+    np.testing.assert_allclose(
+        camera.projection_slopes(points), np.stack(expected, axis=2), rtol=1e-6, atol=1e-5
+    )
+
+
+def test_a_perspective_lens_has_the_slopes_of_finite_differences() -> None:
+    camera = Camera(640, 480, 500, 520, 310, 245, (-0.2, 0.05, 0.01, 0.02))
+    points = directions(3, widest=0.5)
+    steps = 1e-6 * np.eye(3)
+    expected = [(camera.project(points + s) - camera.project(points - s)) / 2e-6 for s in steps]
+    slopes = camera.projection_slopes(points)
+    np.testing.assert_allclose(slopes, np.stack(expected, axis=2), rtol=1e-5, atol=1e-4)
+
+
+def test_beyond_the_fold_nothing_is_seen() -> None:
+    camera = Camera(640, 640, 180, 180, 320, 320, (-0.1, 0, 0, 0), lens="fisheye")
+    limit = largest_angle("fisheye", camera.distortion)
+    assert limit == pytest.approx(math.sqrt(1 / 0.3))
+    angles = np.array([limit - 0.01, limit + 0.01])
+    points = np.stack([np.sin(angles), np.zeros(2), np.cos(angles)], axis=1)
+    assert camera.sees(points).tolist() == [True, False]
+    with pytest.raises(InputError) as caught:
+        camera.project(points)
+    assert str(caught.value) == (
+        "points_cam: 1 of 2 points lie outside the lens's field, the first is point 1; "
+        "only points less than 104.6 degrees off the axis have a projection"
+    )
+    assert np.isinf(camera.project_where_ahead(points)[1]).all()
+    rays, valid = camera.rays_where_valid([[320.0, 320.0], [3200.0, 320.0]])
+    assert valid.tolist() == [True, False]
+    assert np.isfinite(rays).all()
+
+
+def test_normalize_refuses_rays_beside_the_plane() -> None:
+    camera = LENSES["equidistant"]
+    pixels = camera.project([[0, 0, 1], [1, 0, -0.1], [0, 1, -0.2]])
+    with pytest.raises(InputError) as caught:
+        camera.normalize(pixels)
+    assert str(caught.value) == (
+        "points_2d: the rays of 2 of 3 pixels are 90 degrees or more off the z axis, the first is "
+        "point 1; these have no normalised coordinates; use unproject"
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"lens": "wide"}, "camera.lens: 'wide' is not a kind of lens; known are perspective,"),
+        (
+            {"lens": "fisheye", "distortion": (0.1,)},
+            r"camera.distortion: \(0.1,\) are not distortion coefficients; give \(k1, k2, k3, k4\)",
+        ),
+        ({"lens": "fov"}, r"camera.distortion: \(\) are not .*; give \(omega,\), an angle in rad"),
+        ({"lens": "fov", "distortion": (4.0,)}, r"\(4.0,\) are not distortion coefficients"),
+        (
+            {"lens": "fisheye", "focal_known": False},
+            "camera.lens: the focal length of a fisheye lens is unknown; calibrate the camera",
+        ),
+    ],
+)
+def test_impossible_lenses_are_refused(given: dict[str, object], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        Camera(640, 480, 500, 500, 320, 240, **given)  # type: ignore[arg-type]
+
+
+def test_files_of_wide_lenses_want_a_focal_length() -> None:
+    data = {"model": "FOV", "width": 640, "height": 480, "params": [None, None, 320, 240, 0.9]}
+    with pytest.raises(InputError, match=r"camera.params: the focal length of a fov lens is unkn"):
+        Camera.from_dict(data)
+
+
+def test_a_turned_frame_is_not_written() -> None:
+    with pytest.raises(InputError, match="a camera in a turned frame has no form in files"):
+        LENSES["fov"].turned(np.eye(3)).to_dict()
+
+
+def test_a_pinhole_is_not_turned() -> None:
+    with pytest.raises(InputError, match="the frame of a pinhole is its own"):
+        Camera(640, 480, 500, 500, 320, 240).turned(np.eye(3))
+
+
+def test_a_matrix_may_be_a_fisheyes() -> None:
+    camera = LENSES["opencv"]
+    data = {"matrix": camera.matrix, "width": 640, "height": 640, "distortion": camera.distortion}
+    assert Camera.from_dict(data | {"lens": "fisheye"}) == camera
+    assert camera._repr_html_().count("fisheye") == 1
+
+
+@every_lens
+def test_colmap_keeps_wide_lenses(name: str, tmp_path) -> None:
+    pose = Alignment(np.eye(3), [0.0, 0.0, 3.0], np.ones(3))
+    write_colmap(tmp_path, [CameraView(LENSES[name], pose, "a.png")])
+    assert Colmap(tmp_path)["a.png"].camera == LENSES[name]
+
+
+@pytest.mark.parametrize("name", ["equidistant", "opencv"])
+def test_nerf_files_keep_a_fisheye(name: str, tmp_path) -> None:
+    pose = Alignment(np.eye(3), [0.0, 0.0, 3.0], np.ones(3))
+    path = tmp_path / "transforms.json"
+    pinhole = Camera(640, 480, 500, 500, 320, 240)
+    views = [CameraView(LENSES[name], pose, "a.png"), CameraView(pinhole, pose, "b.png")]
+    write_nerf(path, views)
+    assert [view.camera for view in read_camera_views(path)] == [view.camera for view in views]
+
+
+@pytest.mark.parametrize("name", ["thin prism", "fov"])
+def test_nerf_files_have_no_place_for_other_lenses(name: str, tmp_path) -> None:
+    pose = Alignment(np.eye(3), [0.0, 0.0, 3.0], np.ones(3))
+    with pytest.raises(InputError, match="no place for more than k1, k2, p1, p2, or a fisheye's"):
+        write_nerf(tmp_path / "transforms.json", [CameraView(LENSES[name], pose, "a.png")])

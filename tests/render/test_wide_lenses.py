@@ -1,0 +1,156 @@
+"""Rendering and overlays with fisheye and fov lenses, beside and behind the camera's plane too."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.renderers import renderer_or_skip
+
+from cadalign import Alignment, Camera, Mesh, Model, Result, View, align, fit
+from cadalign.cli import main
+from cadalign.export.scene_parts import photo_plane
+from cadalign.geometry.box import Box
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.io.observation import Observation
+from cadalign.io.observed_image import ObservedImage
+from cadalign.render import Scene, cast_geometry, draw_overlay
+from cadalign.render.drawing.result_overlay import draw_result
+from cadalign.render.frame import LIGHT_GREY
+from cadalign.render.raycast.renderer import RaycastRenderer
+from cadalign.render.views.visibility import visible_keypoints
+
+FISHEYE = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (0.01, -0.003, 0.0, 0.0), lens="fisheye")
+FOV = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (0.9,), lens="fov")
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+FACES = np.array(
+    [
+        *([0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5]),
+        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 7, 3], [1, 5, 7]),
+    ]
+)
+BOX_MESH = Mesh(CORNERS, FACES)
+BOX = Scene(BOX_MESH)
+
+
+def placed(angle: float, about: float = 0.7, *, distance: float = 4.0) -> Alignment:
+    theta = np.radians(angle)
+    across = np.sin(theta) * np.array([np.cos(about), np.sin(about)])
+    return Alignment(
+        rotation_from_vector(np.array([0.4, -0.6, 0.3])),
+        distance * np.append(across, np.cos(theta)),
+        [1.0, 0.8, 1.3],
+    )
+
+
+@pytest.mark.parametrize("about", [0.0, 0.7, np.pi / 2])
+@pytest.mark.parametrize("angle", [0, 60, 90, 104])
+@pytest.mark.parametrize("camera", [FISHEYE, FOV], ids=["fisheye", "fov"])
+def test_every_pixel_shows_what_projects_to_it(camera: Camera, angle: float, about: float) -> None:
+    pose = placed(angle, about)
+    drawn = cast_geometry(BOX, camera, pose)
+    rows, columns = np.nonzero(drawn.mask)
+    assert len(rows) > 200
+    pixels = np.column_stack([columns, rows]).astype(float)
+    points = camera.unproject(pixels) * drawn.depth[rows, columns][:, None]
+    np.testing.assert_allclose(camera.project(points), pixels, atol=0.01)
+    in_model = (points - pose.translation) @ pose.rotation / pose.scale
+    np.testing.assert_allclose(np.abs(in_model).max(axis=1), 1.0, atol=1e-4)
+    # The outline of a convex object is that of all its surface's projections.
+    share = np.random.default_rng(0).dirichlet(np.ones(3), (12, 3000))
+    surface = np.einsum("fnk,fkc->fnc", share, CORNERS[FACES]).reshape(-1, 3)
+    seen = camera.project_where_ahead(pose.apply(surface))
+    inside = seen[camera.contains(seen, margin=1.0)].round().astype(int)
+    nearly = cv2.dilate(drawn.mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+    assert nearly[inside[:, 1], inside[:, 0]].all()
+    assert len(np.unique(inside, axis=0)) > 0.9 * len(rows)
+
+
+def test_keypoints_beside_the_plane_are_visible() -> None:
+    pose = placed(90)
+    visible = visible_keypoints(BOX, CORNERS, FISHEYE, pose)
+    distances = np.linalg.norm(pose.apply(CORNERS), axis=1)
+    assert visible[distances.argmin()]
+    assert not visible[distances.argmax()]
+    assert 4 <= visible.sum() <= 7
+    upwards = placed(90, np.pi / 2)
+    assert visible_keypoints(BOX, [[0, 0, 0]], FISHEYE, upwards).tolist() == [False]
+    assert visible_keypoints(BOX, CORNERS, FISHEYE, upwards).sum() >= 4
+
+
+def test_an_object_around_the_axis_behind_is_not_seen() -> None:
+    narrow = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (-0.1, 0.0, 0.0, 0.0), lens="fisheye")
+    assert not cast_geometry(BOX, narrow, placed(180)).mask.any()
+    drawn = cast_geometry(BOX, narrow, placed(100))
+    assert drawn.mask.any()
+
+
+def test_a_frame_in_colour_and_its_overlay() -> None:
+    pose = placed(88, np.pi)
+    frame = RaycastRenderer().render(BOX, FISHEYE, pose, samples=4)
+    assert (frame.color[frame.mask][:, 3] > 50).all()
+    noise = np.random.default_rng(0).normal(scale=0.3, size=(8, 2))
+    result = fit(CORNERS, FISHEYE.project(pose.apply(CORNERS)) + noise, FISHEYE)
+    picture = draw_overlay(
+        frame.composite((30, 30, 30)),
+        FISHEYE,
+        est_box=Box.from_model(result.bounds, result.alignment),
+        est_frame=cast_geometry(BOX, FISHEYE, result.alignment),
+        observed=FISHEYE.project(pose.apply(CORNERS)),
+        reprojected=FISHEYE.project(result.alignment.apply(CORNERS)),
+    )
+    changed = (picture != frame.composite((30, 30, 30))).any(axis=2)
+    assert changed[:, :120].sum() > 300  # the box lies at the left border, 88 degrees off the axis
+    axes = result.plot()
+    assert axes is not None
+
+
+def test_the_picture_of_a_result_shows_model_box_and_regions() -> None:
+    pose, points = placed(93, np.pi), CORNERS[[0, 1, 2, 4, 5, 7]]
+    seen = FISHEYE.project(pose.apply(points))
+    view = View(FISHEYE, seen, ids=[0, 1, 2, 4, 5, 7])
+    result = align(Model(points_3d=CORNERS, mesh=BOX_MESH), view)
+    picture = draw_result(ObservedImage(points, seen, FISHEYE), result, mesh=BOX_MESH)
+    drawn = cast_geometry(BOX, FISHEYE, pose).mask
+    grey = np.array(LIGHT_GREY)
+    changed = (np.abs(picture.astype(int) - grey).max(axis=2) > 8) & drawn
+    assert changed.sum() > 0.9 * drawn.sum()
+
+
+def test_opengl_leaves_wide_lenses_to_rays() -> None:
+    opengl = renderer_or_skip("pyrender")
+    pose = placed(90)
+    expected = RaycastRenderer().render(BOX, FISHEYE, pose, samples=4)
+    drawn = opengl.render(BOX, FISHEYE, pose, samples=4)
+    np.testing.assert_array_equal(drawn.color, expected.color)
+
+
+def test_the_photo_of_a_wide_lens_is_exported_as_a_pinholes() -> None:
+    rows, columns = np.indices((241, 241))
+    image = np.stack([rows, columns, 0 * rows], axis=2).astype(np.uint8)
+    plane = photo_plane(FISHEYE, image)
+    assert plane.image is not None
+    height, width = plane.image.shape[:2]
+    for u, v in ((0.0, 0.0), (0.7, -0.5), (-0.4, 0.8)):
+        x, y = (np.array([u, v]) - plane.low) / (plane.high - plane.low) * (width, height) - 0.5
+        ((column, row),) = FISHEYE.project([[u, v, 1.0]])
+        shown = plane.image[round(float(y)), round(float(x))].astype(float)
+        np.testing.assert_allclose(shown[:2], [row, column], atol=1.5)
+
+
+@pytest.mark.slow
+def test_the_command_fits_and_draws_an_observation_of_a_fisheye(tmp_path: Path) -> None:
+    pose = placed(95)
+    noise = np.random.default_rng(0).normal(scale=0.3, size=(8, 2))
+    pixels = FISHEYE.project(pose.apply(CORNERS)) + noise
+    path = tmp_path / "box.json"
+    Observation(CORNERS, pixels, FISHEYE).save(path)
+    assert json.loads(path.read_text())["camera"]["model"] == "OPENCV_FISHEYE"
+    assert main(["fit", str(path), "--out", str(tmp_path)]) == 0
+    found = Result.from_json((tmp_path / "fit.json").read_text())
+    assert found.camera == FISHEYE
+    np.testing.assert_allclose(found.alignment.translation, pose.translation, atol=0.3)
+    assert (tmp_path / "overlay.png").is_file()

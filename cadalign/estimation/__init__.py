@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
+    from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
     from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
     from cadalign.estimation.uncertainty.summary import (
         Contribution,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Advice",
+    "AlignedScene",
     "Alternative",
     "Contribution",
     "EvidenceKind",
@@ -54,11 +56,13 @@ __all__ = [
     "RansacOptions",
     "Result",
     "Results",
+    "SceneObject",
     "Size",
     "Uncertainty",
     "View",
     "ViewResult",
     "align_batch",
+    "align_scene",
     "fit_batch",
     "model_of",
     "object_of",
@@ -71,7 +75,3 @@ __all__ = [
 ]
 
 __getattr__ = lazy_names(__name__)
-
-
-def __dir__() -> list[str]:
-    return __all__

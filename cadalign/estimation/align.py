@@ -10,21 +10,17 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from cadalign.arrays import worker_count
-from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.joint import found_in_minima, result_of
+from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.estimation.focal import USUAL, PriorOption
+from cadalign.estimation.joint import result_of_minima
+from cadalign.estimation.joint_mistakes import joint_mistake
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import (
-    JointProblem,
-    find_minima,
-    joint_mistake,
-    widened_by_noise,
-)
+from cadalign.estimation.search import JointProblem, find_minima, widened_by_noise
 from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
 from cadalign.estimation.view import View
 from cadalign.estimation.weak_views import (
@@ -33,7 +29,9 @@ from cadalign.estimation.weak_views import (
     views_without_pose,
     with_views_left_out,
 )
+from cadalign.estimation.wide_views import check_sides, facing_inits, facing_view, turned_back
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import needs_facing
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 
@@ -51,7 +49,7 @@ def align(
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
     focal: str = "known",
-    focal_prior: FocalPrior | None = None,
+    focal_prior: PriorOption = USUAL,
 ) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
 
@@ -78,8 +76,8 @@ def align(
     focal : {"known", "estimate"}
         Take the focal lengths of the views' cameras as right, or estimate them: views of equal
         cameras share one. ``result.cameras`` have the estimates.
-    focal_prior : FocalPrior, optional
-        Prior on focal lengths to be estimated.
+    focal_prior : FocalPrior, "usual" or None
+        Prior on focal lengths to be estimated, as for `cadalign.fit`.
 
     Returns
     -------
@@ -113,9 +111,16 @@ def align(
     inits = _checked_inits(init, given)
     options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
     Lenses.of(given, focal, focal_prior)  # checks the cameras
+    _check_numbers(model, given)
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
+    if needs_facing([view.camera for view in given]):
+        facing = [facing_view(view, number) for number, view in enumerate(given)]
+        if ransac is None:
+            check_sides(facing)
+        inits = facing_inits(inits, facing)
+        return turned_back(_align_all(model, facing, inits, size, options, ransac, start), given)
     return _align_all(model, given, inits, size, options, ransac, start)
 
 
@@ -149,7 +154,7 @@ def _align_all(
             where="views",
             fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
-    mistake = None if ransac is None else joint_mistake(problem, minima[0], ransac)
+    mistake = joint_mistake(problem, minima[0], ransac)
     masks = None
     if any(view.mask is not None for view in views):
         from cadalign.estimation.contours.depth import fit_depths
@@ -159,8 +164,8 @@ def _align_all(
         minima = masks.minima
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
-    found = found_in_minima(model, problem, likely, stats, mistake=mistake)
-    return result_of(found) if masks is None else masks.noted_in(result_of(found))
+    result = result_of_minima(model, problem, likely, stats, mistake=mistake)
+    return result if masks is None else masks.noted_in(result)
 
 
 def align_batch(
@@ -173,7 +178,7 @@ def align_batch(
     loss_scale: float = 2.0,
     ransac: RansacOptions | None = None,
     focal: str = "known",
-    focal_prior: FocalPrior | None = None,
+    focal_prior: PriorOption = USUAL,
     workers: int = 1,
 ) -> Results:
     """Align many objects of one kind; each as `align` does, bit for bit.
@@ -220,6 +225,7 @@ def align_batch(
         "loss_scale": loss_scale,
         "ransac": ransac,
         "focal": focal,
+        "focal_prior": focal_prior,
     }
 
     def one(
@@ -270,6 +276,20 @@ def _checked_views(given: object) -> list[View]:
             what = f"expected a cadalign.View, got {type(view).__name__}"
             raise InputError(what, where=f"views[{number}]")
     return views
+
+
+def _check_numbers(model: object, views: Sequence[View]) -> None:
+    """Refuse views without ids where the model's first keypoints are not called 0, 1, 2, ..."""
+    known = model.ids if isinstance(model, Model | ShapeModel) else ()
+    for number, view in enumerate(views):
+        own = tuple(known or ())[: len(view.keypoint_ids)]
+        if view.is_numbered and own != tuple(range(len(own))):
+            listed = ", ".join(quote(each) for each in own[:5]) + (", ..." if len(own) > 5 else "")
+            raise InputError(
+                f"no ids are given, and the model's keypoints are not 0, 1, 2, ... but {listed}",
+                where=f"views[{number}].ids",
+                fix="give the model's id of each keypoint of the view, in the view's order",
+            )
 
 
 def _check_size(size: object) -> None:

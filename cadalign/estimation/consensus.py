@@ -11,8 +11,10 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.focal import log_focal_range
+from cadalign.estimation.facing import faced, turned_poses
+from cadalign.estimation.focal import check_estimable, log_focal_range
 from cadalign.estimation.focal_search import focal_views
+from cadalign.estimation.mistakes import Explained, Mistake, find_mistake, larger_sizes
 from cadalign.estimation.options import (
     MINIMAL_SOLVERS,
     FitOptions,
@@ -22,13 +24,11 @@ from cadalign.estimation.options import (
 from cadalign.estimation.problems import Problems, are_in_one_plane, rays_of, whitening_of
 from cadalign.estimation.solve import solve_one
 from cadalign.estimation.support import (
-    Explained,
-    Mistake,
+    SOLUTIONS_OF_FOUR,
     Support,
     area_of,
     check_support,
     disagreeing,
-    find_mistake,
 )
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -38,7 +38,6 @@ from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, Views
 from cadalign.solvers.ransac import Settings, ransac_kernel
 
 _MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
-_SOLUTIONS = 2.3  # valid ones of 4 points, in the mean
 _CHANCE = 0.2  # bound on the expected number of models; 1 in 50 such problems has one
 _SIGMAS = 3.0  # that the threshold of inliers is taken to be where the noise is not known
 _STRETCH_SIGMA = 1.0  # of log scales, by which alignments are compared: outliers invite extremes
@@ -91,12 +90,9 @@ class RobustSearch:
         return projected - self.problems.points_2d
 
     def check(self, best: Consensus) -> None:
-        """Refuse a hypothesis that has no more support than chance gives.
+        """Refuse a hypothesis that has no more support than chance gives: NoConsensusError.
 
-        Raises
-        ------
-        NoConsensusError
-            It carries the best score reached.
+        It carries the best score reached.
         """
         errors = np.linalg.norm(best.residuals[best.inliers], axis=1)
         size = SAMPLE_SIZES[MINIMAL_SOLVERS[self.ransac.minimal]]
@@ -106,7 +102,7 @@ class RobustSearch:
             max_reproj_error=self.threshold,
             score=best.score,
             where="points_2d",
-            solutions=_SOLUTIONS,
+            solutions=SOLUTIONS_OF_FOUR,
             chance=_CHANCE,
             disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
         )
@@ -148,18 +144,15 @@ def mistake_in(search: RobustSearch, found: Explained) -> str | None:
         except CadalignError:
             return None
 
-    return find_mistake(found, given, explain)
+    sizes = larger_sizes(search.problems.points_2d, search.problems.cameras[0])
+    return find_mistake(found, given, explain, sizes)
 
 
 def find_consensus(search: RobustSearch) -> Consensus:
     """Find the best hypothesis of LO-RANSAC, which chance may give as well.
 
-    Raises
-    ------
-    InputError
-        If the keypoints are fewer than the minimal solver needs, or options don't go together.
-    DegenerateError
-        If all keypoints lie in one plane.
+    Raises InputError if the keypoints are fewer than the minimal solver needs, or options don't go
+    together; DegenerateError if all keypoints lie in one plane.
     """
     problems, options, ransac = search.problems, search.options, search.ransac
     camera = problems.cameras[0]
@@ -180,7 +173,8 @@ def find_consensus(search: RobustSearch) -> Consensus:
     by_confidence = order_of_confidence(search.confidences, count)
     order = np.random.default_rng(ransac.seed).permutation(count)
     ranked = np.arange(count) if by_confidence is None else np.argsort(order)[by_confidence]
-    views = _views(problems.points_2d[order], camera, options)
+    facing = faced(camera, problems.points_2d)
+    views = _views(problems.points_2d[order], facing, options)
     exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
     pose = np.zeros(POSE_SIZE)
     inliers = np.zeros(count, dtype=bool)
@@ -220,7 +214,8 @@ def find_consensus(search: RobustSearch) -> Consensus:
         )
     if options.focal == "estimate":
         camera = camera.with_focal(math.exp(log_focal))
-    alignment = Alignment.from_packed(options.in_model_axes(pose))
+    pose = turned_poses(options.in_model_axes(pose), facing.lens_from_camera)
+    alignment = Alignment.from_packed(pose)
     kept = np.empty(count, dtype=bool)
     kept[order] = inliers
     residuals = search.residuals_of(alignment, camera)
@@ -232,9 +227,10 @@ def find_consensus(search: RobustSearch) -> Consensus:
 def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:
     """Rays and weights, in pixels, at the camera's focal length or at those to be tried."""
     if options.focal == "estimate":
+        check_estimable([camera])
         return focal_views(points_2d, camera, options.focal_prior, None)
     camera.require_focal()
-    rays = rays_of(points_2d, camera)
+    rays = rays_of(points_2d, camera, clips=True)
     return Views(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.focal import FocalPrior, PriorOption
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
@@ -36,7 +36,10 @@ Matrix = list[list[Finite]]
 Kind = TypeVar("Kind", bound=ResultData)
 _BEHIND = (math.inf, math.inf)
 _UNKNOWN = (math.nan, math.nan)
-_PLAIN = ("method", "component", "sigma", "cost", "known_axis", "stretched_axes", "focal")
+_PLAIN = (
+    *("method", "component", "sigma", "cost", "known_axis", "stretched_axes", "focal"),
+    "principal_std",
+)
 """Fields of a result that are numbers and words, in its JSON form as they are."""
 
 
@@ -59,7 +62,8 @@ class _Options(ForeignDocument):
     scale_prior_sigma: Positive | None
     known_axis: str
     focal: str
-    focal_prior: FocalPrior | None
+    focal_prior: FocalPrior | Literal["usual"] | None
+    principal_sigma: Positive | None = None  # older files lack it
 
 
 class _View(ForeignDocument):
@@ -145,6 +149,7 @@ class _Result(ForeignDocument):
     points_cam_covariance: list[Matrix] | None = None
     degrees_of_freedom: Positive | None = None
     component: int = 0
+    principal_std: tuple[NotNegative, NotNegative] | None = None
     sigma: NotNegative | None = None
     cost: float | None = None
     alternatives: tuple[_Alternative, ...] = ()
@@ -191,7 +196,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "points_covariance": _plain(statistics.points_covariance),
         "points_cam_covariance": _plain(statistics.points_cam_covariance),
         "degrees_of_freedom": result.degrees_of_freedom,
-        "focal_prior": result.focal_prior and asdict(result.focal_prior),
+        "focal_prior": _plain_prior(result.focal_prior),
         "alternatives": [
             {
                 "alignment": other.alignment.to_dict(),
@@ -243,16 +248,17 @@ def _plain_options(options: FitOptions) -> dict[str, Any]:
     sigma = options.sigma
     plain = sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
     prior = options.focal_prior
-    return {**vars(options), "sigma": plain, "focal_prior": prior and asdict(prior)}
+    return {**vars(options), "sigma": plain, "focal_prior": _plain_prior(prior)}
+
+
+def _plain_prior(prior: PriorOption) -> Any:
+    return asdict(prior) if isinstance(prior, FocalPrior) else prior
 
 
 def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
     """Read the parsed form of a result; see `cadalign.Result.from_dict`.
 
-    Raises
-    ------
-    InputError
-        If a field is missing or invalid.
+    Raises InputError if a field is missing or invalid.
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):

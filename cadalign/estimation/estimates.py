@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.solvers.joint.covariance import JointCovariance
@@ -115,18 +115,35 @@ def with_box(
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
     rows = np.unique(evidence.sightings.point)
-    rows = rows[rows < keypoints]
-    bounds = margins.bounds(points[-2:], points[rows])
+    bounds, own = placed_box(points, rows[rows < keypoints], margins)
+    axes = np.arange(3)
     mean, modes = shape.mean.copy(), shape.modes.copy()
     displacements = state.displacements.copy()
-    outermost = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
-    for face, axis in np.argwhere(bounds != points[-2:]).tolist():
-        row, own = face - 2, outermost[face, axis]
-        mean[row, axis] = mean[own, axis] + bounds[face, axis] - points[own, axis]
-        modes[:, row, axis] = modes[:, own, axis]
-        displacements[row, axis] = displacements[own, axis]
+    mean[-2:] = mean[own, axes] + bounds - points[own, axes]
+    modes[:, -2:] = modes[:, own, axes]
+    displacements[-2:] = displacements[own, axes]
     placed = evidence._replace(shape=shape._replace(mean=mean, modes=modes))
     return placed, state._replace(displacements=displacements)
+
+
+def placed_box(
+    points: FloatArray, rows: IntArray, margins: BoxMargins
+) -> tuple[FloatArray, IntArray]:
+    """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
+
+    Those of the keypoints that are seen, ``rows``, or the box's own corners.
+    """
+    bounds = margins.bounds(points[-2:], points[rows])
+    outermost = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
+    own = len(points) - np.array([[2], [1]])
+    return bounds, np.where(bounds != points[-2:], outermost, own)
+
+
+def widen_box(points: FloatArray, rows: IntArray) -> None:
+    """Let the box, last of points (m, 3), hold those that are seen, in place."""
+    seen = points[rows]
+    points[-2] = np.minimum(points[-2], seen.min(axis=0, initial=np.inf))
+    points[-1] = np.maximum(points[-1], seen.max(axis=0, initial=-np.inf))
 
 
 def with_boxes(
@@ -135,20 +152,15 @@ def with_boxes(
     """A component for each of the first minima, with the box that `with_box` gives."""
     if not mixture.covariances.any():
         return mixture, minima
-    component = minima.label[:count]
+    component, axes = minima.label[:count], np.arange(3)
     means, covariances = mixture.means[component], mixture.covariances[component]
-    rows, axes = np.unique(seen.points), np.arange(3)
-    box = 3 * means.shape[1] - np.arange(6, 0, -1).reshape(2, 3)
     for k in range(count):
         points = shape_at(mixture, component[k], seen, force_of(minima.states[k]))
-        bounds = margins.bounds(points[-2:], points[rows])
-        determined = bounds != points[-2:]
-        outermost = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
-        own = np.where(determined, 3 * outermost + axes, box)
-        means[k, -2:] = means[k].ravel()[own]
-        means[k, -2:] += np.where(determined, bounds - points[outermost, axes], 0.0)
-        covariances[k, box.ravel()] = covariances[k, own.ravel()]
-        covariances[k, :, box.ravel()] = covariances[k, :, own.ravel()]
+        bounds, rows = placed_box(points, seen.points, margins)
+        means[k, -2:] = means[k, rows, axes] + bounds - points[rows, axes]
+        own = (3 * rows + axes).ravel()
+        covariances[k, -6:] = covariances[k, own]
+        covariances[k, :, -6:] = covariances[k, :, own].T
     numbers = np.arange(count, dtype=minima.label.dtype)
     placed = Mixture(means, covariances, mixture.penalties[component])
     return placed, minima._replace(label=numbers)

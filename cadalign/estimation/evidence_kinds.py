@@ -100,22 +100,33 @@ class EvidenceKind:
     fields: tuple[EvidenceField, ...] = ()
 
 
-def _upward(field: str, prior: ShapePrior) -> FloatArray:
-    """The model's up axis."""
+def upward(field: str, prior: ShapePrior) -> FloatArray:
+    """The model's up axis (3,).
+
+    Raises
+    ------
+    InputError
+        If it has none; names the ``field`` that asks for it.
+    """
     if prior.up is None:
         fix = f"learn it with an up axis, or leave `{field}` away"
         raise InputError("the model has no up axis", where=field, fix=fix)
     return prior.up
 
 
+def lowest_corner(up: FloatArray) -> int:
+    """Row of the box's two corners that lies in its lowest face."""
+    return 0 if up.sum() > 0 else 1
+
+
 def _gravity(given: Mapping[str, Any], prior: ShapePrior) -> list[Known]:
-    return [KnownDirection(_upward("up", prior), given["up"], given["up_sigma_deg"])]
+    return [KnownDirection(upward("up", prior), given["up"], given["up_sigma_deg"])]
 
 
 def _camera_height(given: Mapping[str, Any], prior: ShapePrior) -> list[Known]:
     """From the box's corner in its lowest face to the camera."""
-    up = _upward("camera_height", prior)
-    lowest = len(prior.components[0].mean) - (2 if up.sum() > 0 else 1)
+    up = upward("camera_height", prior)
+    lowest = len(prior.components[0].mean) - 2 + lowest_corner(up)
     height = given["camera_height"]
     sigma = np.hypot(height * given["camera_height_sigma"], prior.components[0].spread[lowest])
     return [KnownDistance((lowest, KnownDistance.CAMERA), up, height, float(sigma))]
@@ -195,10 +206,7 @@ def known_of(
 ) -> tuple[Directions, Offsets]:
     """All known directions and distances of the fields of views, and of the size.
 
-    Raises
-    ------
-    InputError
-        If the model does not allow one.
+    Raises InputError if the model does not allow one.
     """
     found = [(0, -1, known) for known in _lengths(size, prior)]
     for view, given in enumerate(views):

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.assemble import canonical_result, result_of_solution
-from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, pack_many, pack_one
 from cadalign.estimation.result import Result
@@ -42,7 +42,8 @@ def fit(
     scale_prior_sigma: float | None = None,
     known_axis: str = "x",
     focal: str = "known",
-    focal_prior: FocalPrior | None = None,
+    focal_prior: PriorOption = USUAL,
+    principal_sigma: float | None = None,
     ransac: RansacOptions | None = None,
     confidences: npt.ArrayLike | None = None,
     symmetry: Symmetry | None = None,
@@ -86,8 +87,13 @@ def fit(
         Take the camera's focal length as right, or estimate it too: a ninth unknown, for which
         5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
         pixels are the camera's.
-    focal_prior : FocalPrior, optional
-        Prior on a focal length to be estimated, for example from `FocalPrior.from_exif`.
+    focal_prior : FocalPrior, "usual" or None
+        Prior on a focal length to be estimated, for example from `FocalPrior.from_exif`; by default
+        that of usual lenses, `FocalPrior.of_usual_lenses`; None for none.
+    principal_sigma : float, optional
+        Standard deviation of the principal point about the camera's [px], of a photo that may be
+        cropped: two further unknowns. ``result.camera`` has the estimate, ``result.principal_std``
+        its standard deviation. By default it is taken as right.
     ransac : RansacOptions, optional
         Search for the alignment with the most inliers, and fit to these: for keypoints with
         outliers. ``result.inliers`` marks the inliers.
@@ -126,13 +132,23 @@ def fit(
     The same photo without its focal length, which is 150 px:
 
     >>> camera = Camera.without_focal(640, 480)
-    >>> result = fit(problem.points_3d, problem.points_2d, camera, focal="estimate")
+    >>> unknown = {"focal": "estimate", "focal_prior": None}
+    >>> result = fit(problem.points_3d, problem.points_2d, camera, **unknown)
     >>> round(result.camera.fx, 3)
     150.0
     """
     start = time.perf_counter()
     shape = (stretch, scale_prior_sigma, known_axis)
-    chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, focal, focal_prior)
+    chosen: tuple[Any, ...] = (
+        method,
+        sigma,
+        loss,
+        loss_scale,
+        *shape,
+        focal,
+        focal_prior,
+        principal_sigma,
+    )
     try:
         options = _checked_options(*chosen)
     except InputError:
@@ -160,7 +176,8 @@ def fit_batch(
     scale_prior_sigma: float | None = None,
     known_axis: str = "x",
     focal: str = "known",
-    focal_prior: FocalPrior | None = None,
+    focal_prior: PriorOption = USUAL,
+    principal_sigma: float | None = None,
     ransac: RansacOptions | None = None,
     confidences: Sequence[npt.ArrayLike] | None = None,
     symmetry: Symmetry | None = None,
@@ -178,8 +195,10 @@ def fit_batch(
         One for all problems, or one each.
     sigma : float, None, or sequence of B
         As for `fit`, for all problems; a sequence gives each problem its own.
-    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, focal, focal_prior, ransac
+    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, focal, focal_prior
         As for `fit`; every problem has a focal length of its own.
+    principal_sigma, ransac
+        As for `fit`.
     confidences : sequence of B (n_b,) float, optional
         As for `fit`, for each problem.
     symmetry : Symmetry, optional
@@ -215,7 +234,9 @@ def fit_batch(
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
     shape = (stretch, scale_prior_sigma, known_axis)
-    options = FitOptions(method, given, loss, loss_scale, *shape, focal, focal_prior)
+    options = FitOptions(
+        method, given, loss, loss_scale, *shape, focal, focal_prior, principal_sigma
+    )
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
     if per_problem:
@@ -227,12 +248,17 @@ def fit_batch(
         _check_symmetry(symmetry)
     bounds = np.linspace(0, len(problems), worker_count(workers) + 1).astype(int).tolist()
     parts = [(a, b) for a, b in pairwise(bounds) if a < b]
+    sizes = {(each.width, each.height) for each in problems.cameras}
+    if len(sizes) == 1:
+        options = options.for_camera(problems.cameras[0])
+    is_solved_at_once = ransac is None and options.focal_prior != USUAL
+    is_solved_at_once &= principal_sigma is None
 
     @np.errstate(all="ignore")  # holds for one thread only
     def run(part: tuple[int, int]) -> Results:
         some = problems.part(*part)
         own = None if sigmas is None else sigmas[part[0] : part[1]]
-        if ransac is None and not options.estimates_in_rounds:
+        if is_solved_at_once and not options.estimates_in_rounds:
             start = time.perf_counter()
             solutions = solve(some, options, own)
             solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
@@ -308,16 +334,27 @@ def _fit_one(
     start: float,
 ) -> Result:
     """Fit the only problem, which was begun at ``start`` [s]."""
+    camera = problems.camera(0)
+    options = options.for_camera(camera)
+    if options.principal_sigma is not None:
+        from cadalign.estimation.principal import fit_with_principal_point  # rarely asked
+
+        known = replace(options, principal_sigma=None)
+
+        def fit_at(camera: Camera) -> Result:
+            moved = pack_one(problems.points_3d, problems.points_2d, camera)
+            return _fit_one(moved, known, ransac, confidences, symmetry, start)
+
+        return fit_with_principal_point(fit_at, camera, options)
     if ransac is None:
         solutions = solve_one(problems, options)
         result = result_of_solution(problems, solutions, options, time.perf_counter() - start)
     else:
         # Only here: most programs never search for outliers, and its kernels take time to import.
-        if options.sigma is None and ransac.max_reproj_error is None:
-            from cadalign.estimation.robust_similar import fit_similar_robustly as search
-        else:
-            from cadalign.estimation.robust import fit_robustly as search
+        from cadalign.estimation.robust import fit_robustly, fit_similar_robustly
 
+        is_noise_known = options.sigma is not None or ransac.max_reproj_error is not None
+        search = fit_robustly if is_noise_known else fit_similar_robustly
         result = search(problems, options, ransac, confidences, start)
     return result if symmetry is None else canonical_result(result, symmetry)
 

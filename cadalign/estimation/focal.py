@@ -5,14 +5,15 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_positive
-from cadalign.errors import brief
+from cadalign.errors import InputError, brief
 from cadalign.geometry.camera import Camera
 
 logger = logging.getLogger("cadalign")
@@ -21,6 +22,10 @@ SHORTEST, LONGEST = 0.1, 50.0
 """Over the longer side of the image: fields of view from 157 to 1 degrees."""
 _GRID = (0.15, 0.22, 0.3, 0.4, 0.55, 0.72, 0.95, 1.25, 1.65, 2.3, 3.3, 5.0, 10.0, 30.0)
 
+USUAL: Final = "usual"
+"""In the place of a prior: that of usual lenses, `FocalPrior.of_usual_lenses`."""
+_USUAL_FOCAL = 1.2  # over the longer side of the image
+_USUAL_SIGMA = 0.6
 _EXIF_SIGMA = 0.05  # roundings, focusing, and corrections of the lens inside the camera
 _SAME_LENS = 0.01
 _CONTRADICTION = 1.25
@@ -28,13 +33,28 @@ _CONTRADICTING_SIGMAS = 3.0
 _FULL_FRAME_DIAGONAL_MM = math.hypot(36.0, 24.0)
 # EXIF tags, and the length of their units [mm].
 _EXIF_IFD = 0x8769
+_MODEL = 0x0110
 _FOCAL_LENGTH = 0x920A
+_DIGITAL_ZOOM = 0xA404
 _FOCAL_LENGTH_35MM = 0xA405
 _PLANE_X_RESOLUTION = 0xA20E
 _PLANE_UNIT = 0xA210
 _PIXEL_X_DIMENSION = 0xA002
 _PIXEL_Y_DIMENSION = 0xA003
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_SENSOR_WIDTHS_MM = (
+    (r"canon eos (5ds?r?|6d|r|rp|r[1356])( mark \w+|m\d)?$", 36.0),
+    (r"canon eos (\d{2,4}d\b|rebel|kiss|m\d*\b|r(7|10|50|100)$)", 22.3),
+    (r"nikon (d[3456][sx]?|d[678]\d\d[aes]?|z ?[56789f](_\d|ii)?)$", 35.9),
+    (r"nikon (d\d+\w?|z ?(30|50|fc)(_\d)?)$", 23.5),
+    (r"ilce-(1|7\w*|9\w*)$", 35.7),
+    (r"ilce-\d{4}|nex-\w+$", 23.5),
+    (r"x-(t|e|h|pro)\d+\w*$|x100\w*$", 23.5),
+    (r"e-(m|p|pl|pm)\d\w*$|dmc-g\w+$|dc-g\w+$", 17.3),
+    (r"dsc-rx100\w*$|fc6310\w*$|l1d-20c$", 13.2),
+    (r"hero\d", 6.17),
+)
+"""Widths of sensors by patterns of camera models' names in EXIF data, from their makers' data."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +67,8 @@ class FocalPrior:
         The horizontal focal length [px].
     relative_sigma : float
         Its standard deviation, relative: 0.05 is 5 %.
+    source : str
+        What it was taken from, for the texts of results.
 
     Raises
     ------
@@ -61,6 +83,7 @@ class FocalPrior:
 
     focal: float
     relative_sigma: float = _EXIF_SIGMA
+    source: str = field(default="", compare=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("focal", "relative_sigma"):
@@ -71,6 +94,34 @@ class FocalPrior:
         """True if both can be of one lens: the focal lengths differ by less than 1 %."""
         return abs(math.log(self.focal / other.focal)) < _SAME_LENS
 
+    def __str__(self) -> str:
+        """The focal length with its standard deviation and source."""
+        return f"{self.focal:.4g} px +- {100 * self.relative_sigma:.2g} %" + (
+            f", {self.source}" if self.source else ""
+        )
+
+    @classmethod
+    def of_usual_lenses(cls, width: int, height: int) -> FocalPrior:
+        """The prior on the focal length of a photo of which nothing but the size is known.
+
+        Its mean is 1.2 times the longer side, the guess of COLMAP and openMVG where a photo does
+        not say, and its 95 % range, 0.37 to 3.9 times the longer side, is that of lenses of 13 to
+        140 mm (35 mm equivalent): wide phones to telephoto lenses. It holds 99 % of the
+        distribution of photos' focal lengths, log-normal above 14 mm, that Hold-Geoffroy et al.
+        draw from, "A Perceptual Measure for Deep Single Image Camera Calibration", CVPR 2018.
+
+        Parameters
+        ----------
+        width, height : int
+            Image size [px].
+
+        Examples
+        --------
+        >>> print(FocalPrior.of_usual_lenses(640, 480))
+        768 px +- 60 %, usual lenses
+        """
+        return cls(_USUAL_FOCAL * max(width, height), _USUAL_SIGMA, "usual lenses")
+
     @classmethod
     def from_exif(
         cls, path: str | os.PathLike[str], *, relative_sigma: float = _EXIF_SIGMA
@@ -78,8 +129,10 @@ class FocalPrior:
         """Read a photo's focal length from its EXIF data.
 
         From the 35 mm equivalent (taken along the diagonal, as CIPA defines it), otherwise from the
-        focal length and the pixels' size on the sensor. Values that cannot be right, such as a
-        focal length of 0, are ignored with a warning (logger "cadalign").
+        focal length, times the digital zoom, and the pixels' size on the sensor, or else the
+        sensor's width, where the camera's model is known. A photo turned upright has the same focal
+        length. Values that cannot be right, such as a focal length of 0, are ignored with a warning
+        (logger "cadalign").
 
         Parameters
         ----------
@@ -101,10 +154,58 @@ class FocalPrior:
         from cadalign.io.images import open_photo  # only here: a known focal length needs none
 
         with open_photo(path) as image:
-            tags = dict(image.getexif().get_ifd(_EXIF_IFD))
+            exif = image.getexif()
+            tags = {_MODEL: exif.get(_MODEL), **exif.get_ifd(_EXIF_IFD)}
             width, height = image.size
         focal = _focal_in_pixels(tags, width, height, str(path))
-        return None if focal is None else cls(focal, relative_sigma)
+        return None if focal is None else cls(focal, relative_sigma, "the photo's EXIF data")
+
+
+PriorOption = FocalPrior | Literal["usual"] | None
+"""Prior on an unknown focal length: one's own, that of usual lenses, or none."""
+
+
+def prior_of_camera(prior: PriorOption, camera: Camera) -> FocalPrior | None:
+    """The prior on the focal length of a camera."""
+    if prior == USUAL:
+        return FocalPrior.of_usual_lenses(camera.width, camera.height)
+    assert not isinstance(prior, str)
+    return prior
+
+
+def check_prior(prior: object, *, focal: str) -> None:
+    """Refuse what is no prior, and one on a known focal length.
+
+    Raises
+    ------
+    InputError
+        If it is one of these.
+    """
+    if prior is None or prior == USUAL:
+        return
+    if not isinstance(prior, FocalPrior):
+        what = f"expected a cadalign.FocalPrior, 'usual' or None, got {type(prior).__name__}"
+        raise InputError(what, where="focal_prior")
+    if focal != "estimate":
+        raise InputError(
+            "given for a known focal length",
+            where="focal_prior",
+            fix='give focal="estimate" with it',
+        )
+
+
+def check_estimable(cameras: Sequence[Camera]) -> None:
+    """Refuse to estimate the focal length of a wide lens.
+
+    Raises
+    ------
+    InputError
+        If a camera has one.
+    """
+    for camera in cameras:
+        if camera.is_wide:
+            what = f"the focal length of a {camera.lens} lens is not estimated"
+            raise InputError(what, where="focal", fix='calibrate it, and give focal="known"')
 
 
 def focal_bounds(camera: Camera) -> tuple[float, float]:
@@ -114,12 +215,13 @@ def focal_bounds(camera: Camera) -> tuple[float, float]:
 
 
 def log_focal_range(
-    camera: Camera, prior: FocalPrior | None, unit: float = 1.0
+    camera: Camera, prior: PriorOption, unit: float = 1.0
 ) -> tuple[float, float, float, float]:
     """Bounds of a log focal length, which a prior may widen, and its mean and weight.
 
     Focal lengths are in ``unit`` [px].
     """
+    prior = prior_of_camera(prior, camera)
     low, high = (math.log(bound / unit) for bound in focal_bounds(camera))
     if prior is None:
         return low, high, 0.0, 0.0
@@ -127,8 +229,9 @@ def log_focal_range(
     return min(low, mean), max(high, mean), mean, prior.relative_sigma**-2
 
 
-def focal_grid(camera: Camera, prior: FocalPrior | None) -> FloatArray:
+def focal_grid(camera: Camera, prior: PriorOption) -> FloatArray:
     """Focal lengths from which the search starts [px]; with a prior those near it, and it."""
+    prior = prior_of_camera(prior, camera)
     grid = np.array(_GRID) * max(camera.width, camera.height)
     if prior is None:
         return grid
@@ -136,14 +239,15 @@ def focal_grid(camera: Camera, prior: FocalPrior | None) -> FloatArray:
     return np.sort(np.append(grid[near], prior.focal))
 
 
-def focal_doubt(camera: Camera, prior: FocalPrior | None) -> str | None:
+def focal_doubt(camera: Camera, prior: PriorOption) -> str | None:
     """Warning about a camera whose estimated focal length is doubtful, or None."""
+    prior = prior_of_camera(prior, camera)
     if prior is not None:
         off = math.log(camera.fx / prior.focal)
         if abs(off) > _CONTRADICTING_SIGMAS * prior.relative_sigma:
             return (
                 f"the keypoints contradict the focal length's prior: {camera.fx:.4g} px "
-                f"instead of {prior.focal:.4g} px +-{100 * prior.relative_sigma:.2g} %"
+                f"instead of {prior}"
             )
     if np.isclose(camera.fx, focal_bounds(camera), rtol=1e-6).any():
         return (
@@ -161,11 +265,16 @@ def _focal_in_pixels(tags: Mapping[int, Any], width: int, height: int, where: st
     focals = []
     if equivalent is not None:
         focals.append(equivalent / _FULL_FRAME_DIAGONAL_MM * math.hypot(width, height))
-    if millimetres is not None and density is not None:
-        unit = _UNIT_MM.get(tags.get(_PLANE_UNIT, 2), 25.4)
-        original = _original_width(tags, width, height)
-        if original is not None:
+    original = _original_width(tags, width, height)
+    if millimetres is not None and original is not None:
+        # The 35 mm equivalent holds the digital zoom already, the lens's own focal length does not.
+        millimetres *= max(_positive(tags, _DIGITAL_ZOOM, "DigitalZoomRatio", where) or 1.0, 1.0)
+        sensor = _sensor_width(tags)
+        if density is not None:
+            unit = _UNIT_MM.get(tags.get(_PLANE_UNIT, 2), 25.4)
             focals.append(millimetres * density / unit * width / original)
+        elif equivalent is None and sensor is not None:
+            focals.append(millimetres / sensor * max(width, height))
     side = max(width, height)
     if any(not SHORTEST * side < focal < LONGEST * side for focal in focals):
         named = ", ".join(f"{focal:.4g} px" for focal in focals)
@@ -196,10 +305,17 @@ def _positive(tags: Mapping[int, Any], tag: int, name: str, where: str) -> float
         value = math.nan
     if 0 < value < math.inf:
         return value
-    if tag == _FOCAL_LENGTH_35MM and value == 0:  # EXIF's way to say that it is not known
-        return None
+    if tag in (_FOCAL_LENGTH_35MM, _DIGITAL_ZOOM) and value == 0:
+        return None  # EXIF's way to say that it is not known, or not used
     logger.warning("%s: the EXIF data state %s %s; ignored", where, name, brief(tags[tag]))
     return None
+
+
+def _sensor_width(tags: Mapping[int, Any]) -> float | None:
+    """The width of the sensor [mm], if the camera's model is known."""
+    name = str(tags.get(_MODEL) or "").strip("\0 ").lower()
+    found = (width for pattern, width in _SENSOR_WIDTHS_MM if re.match(pattern, name))
+    return next(found, None)
 
 
 def _original_width(tags: Mapping[int, Any], width: int, height: int) -> float | None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.focal import FocalPrior, focal_bounds, focal_grid, log_focal_range
+from cadalign.estimation.focal import PriorOption, focal_bounds, focal_grid, log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
 from cadalign.estimation.problems import Problems, Solutions, focal_slopes, rays_of, whitening_of
 from cadalign.geometry.camera import Camera
@@ -264,7 +264,7 @@ def _with_linear_guess(task: _Task, views: Views) -> Views:
 
 
 def focal_views(
-    points_2d: FloatArray, camera: Camera, prior: FocalPrior | None, sigma: Sigma | None
+    points_2d: FloatArray, camera: Camera, prior: PriorOption, sigma: Sigma | None
 ) -> Views:
     """The keypoints at the focal lengths of `focal_grid` at which the lens can be undone."""
     found = []

@@ -6,9 +6,10 @@ stands for all.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple, cast
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -19,9 +20,11 @@ from cadalign.estimation.estimates import (
     pose_and_border,
     pose_and_lengths,
     poses_of,
+    widen_box,
     with_box,
 )
-from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.focal import prior_of_camera
+from cadalign.estimation.mistakes import outside_image
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior, is_exact, widened
 from cadalign.estimation.result import Result
@@ -37,6 +40,7 @@ from cadalign.estimation.symmetry import (
 )
 from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
+from cadalign.estimation.uncertainty.held_out import ShapeTails
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
@@ -47,14 +51,14 @@ from cadalign.estimation.uncertainty.summary import (
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import nearest_rotation
+from cadalign.geometry.rotations import nearest_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, group_of
-from cadalign.shapes.inflation import inflation_with
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.tails import inflation_with
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import points_of
-from cadalign.solvers.marginal.moments import Likely, Moments, moments_of
+from cadalign.solvers.linalg import cholesky, solve_cholesky
 
 _Held = tuple[bool, bool, bool]
 _ALONG_AXES = 1e-6  # of a rotation's entries, that are 0 or 1 where it takes axes to axes
@@ -79,144 +83,119 @@ class Estimate(NamedTuple):
     is_optimum: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Findings of an estimate's stages, of which `result_of` makes the result.
-
-    Parameters
-    ----------
-    model, prior, views
-        What was given.
-    estimates : sequence of Estimate
-        The likely ones, the best first.
-    inliers : sequence of (n_v,) bool
-        Of every view, by the best estimate.
-    is_curved : bool
-        The rotations' covariances lack `curvature_of_rotations`.
-    warnings, evidence, basis
-        As of `Stated`; warnings beside those about deviations and alternatives.
-    cost, stats, component and so on
-        As of `cadalign.Result`.
-    """
-
-    model: Model | ShapeModel
-    prior: ShapePrior
-    views: Sequence[View]
-    estimates: Sequence[Estimate]
-    inliers: Sequence[BoolArray]
-    is_curved: bool
-    warnings: tuple[str, ...]
-    evidence: tuple[EvidenceSummary, ...]
-    basis: AnyBasis
-    cost: float
-    stats: FitStats
-    component: int
-    sigma: float | None = None
-    known_axis: str | None = None
-    stretched_axes: str = ""
-    symmetry: Symmetry | None = None
-    rig_from_model: Alignment | None = None
-    focal: str = "known"
-    focal_prior: FocalPrior | None = None
-
-
-def result_of(found: Found) -> Result:
-    """The result of what was found.
+def result_of(
+    model: Model | ShapeModel,
+    prior: ShapePrior,
+    views: Sequence[View],
+    estimates: Sequence[Estimate],
+    *,
+    inliers: Sequence[BoolArray],
+    is_curved: bool,
+    warnings: tuple[str, ...],
+    evidence: tuple[EvidenceSummary, ...],
+    basis: AnyBasis,
+    **of_result: Any,
+) -> Result:
+    """The result of likely estimates, the best first.
 
     Its covariance is the second moment, about the best estimate, of the mixture of Gaussians that
     the likely ones are.
+
+    The rotations' covariances lack `curvature_of_rotations` where the estimate ``is_curved``;
+    ``warnings`` are those beside the ones about uncertainties and alternatives, and ``of_result``
+    further fields of `cadalign.Result`.
     """
-    best, prior = found.estimates[0], found.prior
-    moments = [_moments(found.estimates, view) for view in range(len(found.views))]
-    covariances = [each.covariance for each in moments]
-    if found.is_curved:
+    best = estimates[0]
+    moments = [_moments(estimates, view) for view in range(len(views))]
+    covariances = [covariance for covariance, _ in moments]
+    if is_curved:
         for covariance in covariances:
             covariance[:3, :3] += curvature_of_rotations(covariance[:3, :3])
-    is_far = moments[0].distances > SAME_SQUARES
-    others = [each for each, far in zip(found.estimates, is_far, strict=True) if far]
+    is_far = moments[0][1] > SAME_SQUARES
+    others = [each for each, far in zip(estimates, is_far, strict=True) if far]
     alternatives = tuple(
         Alternative(
             each.poses[0], each.likelihood, each.cameras[0], each.points[:-2], each.points[-2:]
         )
-        for each, far in zip(found.estimates, is_far, strict=True)
+        for each, far in zip(estimates, is_far, strict=True)
         if far or (each.is_optimum and each is not best)
     )
     pose, points = best.poses[0], best.points[:-2]
+    of_points, of_seen = _moments_of_points(estimates)
     statistics = Stated(
         covariances[0],
         fisher_covariance=best.covariances[0],
-        points_covariance=moments[0].of_points[:-2],
-        points_cam_covariance=moments[0].of_seen[:-2],
+        points_covariance=of_points[:-2],
+        points_cam_covariance=of_seen[:-2],
         warnings=(
+            *(
+                text
+                for number, view in enumerate(views)
+                for text in _outside(view, number, len(views), not warnings)
+            ),
             *weaknesses(pose, uncertainty_of(covariances[0])),
-            *found.warnings,
+            *warnings,
             *another_pose(
                 pose,
                 [each.poses[0] for each in others],
                 [each.likelihood for each in others],
             ),
         ),
-        evidence=found.evidence,
+        evidence=evidence,
         degrees_of_freedom=prior.degrees_of_freedom,
-        basis=found.basis,
+        basis=basis,
     )
-    views = []
-    for number, view in enumerate(found.views):
+    of_views = []
+    for number, view in enumerate(views):
         rows, observed = prior.rows_of(view.keypoint_ids, "ids"), cast(FloatArray, view.points_2d)
         camera, alignment = best.cameras[number], best.poses[number]
-        views.append(
+        of_views.append(
             ViewResult(
                 camera,
                 alignment,
                 view.keypoint_ids,
                 observed,
                 camera.project(alignment.apply(points[rows])) - observed,
-                found.inliers[number],
+                inliers[number],
                 Stated(covariances[number]) if number else statistics,
             )
         )
     has_length = prior.lengths > 0
     return Result(
-        views=tuple(views),
+        views=tuple(of_views),
         ids=prior.ids,
         points_3d=points,
         method="align",
         statistics=statistics,
-        known_axis=found.known_axis,
-        stretched_axes=found.stretched_axes,
-        focal=found.focal,
-        focal_prior=found.focal_prior,
-        sigma=found.sigma,
-        cost=found.cost,
         alternatives=alternatives,
-        stats=found.stats,
-        symmetry=found.symmetry,
-        model=found.model,
-        component=found.component,
-        rig_from_model=found.rig_from_model,
+        model=model,
         own_bounds=best.points[-2:],
         own_stretch=np.where(
             has_length, best.lengths / np.where(has_length, prior.lengths, 1), 1.0
         ),
+        **of_result,
     )
 
 
-def found_in_minima(
+def _outside(view: View, number: int, count: int, agree: bool) -> tuple[str, ...]:
+    """Warning about keypoints outside of one of so many views' images."""
+    where = f"views[{number}]: " if count > 1 else ""
+    return outside_image(cast(FloatArray, view.points_2d), view.camera, agree=agree, where=where)
+
+
+def result_of_minima(
     model: Model | ShapeModel,
     problem: JointProblem,
     minima: Sequence[Minimum],
     stats: FitStats,
     *,
     mistake: str | None = None,
-) -> Found:
-    """The likely estimates of minima, the likeliest first, with widened deviations of the shape.
+) -> Result:
+    """The result of minima, of which the likely ones count, with a widened prior of the shape.
 
     ``mistake`` is a warning about one in the data.
 
-    Raises
-    ------
-    DegenerateError
-        If the evidence determines none of them.
+    Raises DegenerateError if the evidence determines none of them.
     """
     prior, views = problem.prior, problem.views
     minima = [each for each in minima if np.isfinite(each.score)]
@@ -245,15 +224,14 @@ def found_in_minima(
         minimum.evidence,
         minimum.state,
         minimum.cost,
-        inflation=inflation,
-        degrees_of_freedom=prior.degrees_of_freedom,
+        ShapeTails(inflation, prior.degrees_of_freedom),
     )
-    return Found(
+    return result_of(
         model,
         prior,
         views,
         likely,
-        _inliers(prior, views, minimum),
+        inliers=_inliers(prior, views, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=warnings if mistake is None else (mistake,),
         evidence=summaries_of(minimum.evidence, minimum.state, likely[0].cameras),
@@ -267,7 +245,7 @@ def found_in_minima(
         symmetry=symmetry,
         rig_from_model=_in_rig(views, minimum, likely[0]),
         focal="estimate" if minimum.lenses.count else "known",
-        focal_prior=minimum.lenses.prior,
+        focal_prior=prior_of_camera(minimum.lenses.prior, views[0].camera),
     )
 
 
@@ -280,9 +258,7 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
     stretched = points_of(evidence.shape, state)[rows]
     if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         sighted = np.unique(evidence.sightings.point)
-        seen = stretched[sighted[sighted < keypoints]]
-        stretched[-2] = np.minimum(stretched[-2], seen.min(axis=0, initial=np.inf))
-        stretched[-1] = np.maximum(stretched[-1], seen.max(axis=0, initial=-np.inf))
+        widen_box(stretched, sighted[sighted < keypoints])
     found = joint_covariance(evidence, state)
     return Estimate(
         stretched / scale,
@@ -319,22 +295,52 @@ def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> list
     return np.split(kept, ends[:-1])
 
 
-def _moments(estimates: Sequence[Estimate], view: int) -> Moments:
-    """Second moments of estimates about the first, in a view's camera; of points in the first."""
-    poses = [each.poses[view] for each in estimates]
-    with_focal = [[each.cameras[view].fx][: len(each.covariances[view]) - 9] for each in estimates]
-    return moments_of(
-        Likely(
-            np.array([np.append(each.rotation.ravel(), each.translation) for each in poses]),
-            np.array([each.points * each.scale for each in estimates]),
-            np.array(
-                [[*each.lengths, *focal] for each, focal in zip(estimates, with_focal, strict=True)]
-            ),
-            np.array([each.covariances[view] for each in estimates]),
-            np.array([each.of_points for each in estimates]),
-            np.array([each.of_seen for each in estimates]),
-            np.array([each.likelihood for each in estimates]),
-        )
+def _moments(estimates: Sequence[Estimate], view: int) -> tuple[FloatArray, FloatArray]:
+    """Second moments of estimates about the first, in a view's camera, and distances (L,).
+
+    These are squared distances of the rotations from the first one's, in its standard deviations;
+    infinite where it has none.
+    """
+    best, *others = estimates
+    total, distances = best.likelihood * best.covariances[view], np.zeros(len(estimates))
+    factor = best.covariances[view][:3, :3].copy()
+    is_determined = cholesky(factor, 3, 0.0)
+    for k, each in enumerate(others, start=1):
+        step = _step(best, each, view)
+        total += each.likelihood * (each.covariances[view] + step[:, None] * step)
+        solved = step[:3].copy()
+        solve_cholesky(factor, 3, solved)
+        distances[k] = step[:3] @ solved if is_determined else np.inf
+    return total / sum(each.likelihood for each in estimates), distances
+
+
+def _step(first: Estimate, second: Estimate, view: int) -> FloatArray:
+    """Rotation vector, translation, log lengths and log focal length between estimates."""
+    start, end = first.poses[view], second.poses[view]
+    before = [*first.lengths.tolist(), first.cameras[view].fx]
+    after = [*second.lengths.tolist(), second.cameras[view].fx]
+    turn = vector_from_rotation(end.rotation @ start.rotation.T)
+    logs = [math.log(b / a) if a > 0 < b else 0.0 for a, b in zip(before, after, strict=True)]
+    step = [*turn, *(end.translation - start.translation), *logs]
+    return np.array(step[: len(first.covariances[view])])
+
+
+def _moments_of_points(estimates: Sequence[Estimate]) -> tuple[FloatArray, FloatArray]:
+    """Second moments (m, 3, 3) of points about the first estimate, in model and first camera."""
+    best = estimates[0]
+    if len(estimates) == 1:
+        return best.of_points, best.of_seen
+    weights = np.array([each.likelihood for each in estimates])
+    weights /= weights.sum()
+
+    def total(covariances: list[FloatArray], places: list[FloatArray]) -> FloatArray:
+        gaps = np.array(places) - places[0]
+        squares = gaps[..., None] * gaps[..., None, :]
+        return np.asarray(np.tensordot(weights, np.array(covariances) + squares, axes=1))
+
+    return (
+        total([e.of_points for e in estimates], [e.points * e.scale for e in estimates]),
+        total([e.of_seen for e in estimates], [e.poses[0].apply(e.points) for e in estimates]),
     )
 
 

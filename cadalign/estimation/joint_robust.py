@@ -12,11 +12,10 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
-from cadalign.estimation.uncertainty.evidence import kept_rows, seen_in_cameras
+from cadalign.estimation.uncertainty.evidence import seen_in_cameras
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES, UNKNOWNS
-from cadalign.solvers.joint.evidence import Evidence, State, log_focals_of, points_of
-from cadalign.solvers.joint.search import search_joint
-from cadalign.solvers.joint.starts import ViewRays, rays_in
+from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, log_focals_of, points_of
+from cadalign.solvers.joint.search import ViewRays, rays_in, search_joint
 from cadalign.solvers.optimal import optimal_batch
 
 OUTLIER_COST = 5.0
@@ -74,21 +73,13 @@ def robust_minima(
 ) -> tuple[list[JointConsensus], int]:
     """Estimates that most keypoints support, the best first, with the iterations they took.
 
-    Each of the starts is refined under a robust loss, then on its inliers alone until these don't
-    change. A keypoint that is left out costs as much as one at its threshold, and the logarithm
-    that one more keypoint would add (`OUTLIER_COST`).
+    Each of the starts is refined under a robust loss, then on its inliers alone, once, or where it
+    ``settles`` until these don't change. Whitened residuals of inliers are below the ``threshold``
+    (N,). A keypoint that is left out costs as much as one at its threshold, and the logarithm that
+    one more keypoint would add (`OUTLIER_COST`).
 
-    Parameters
-    ----------
-    evidence : Evidence
-    starts : Starts
-    threshold : (N,) float
-        Largest whitened residual of an inlier.
-    settles : bool
-        Refine on the inliers until these don't change any more, and not only once.
-    projects : bool
-        Widen thresholds by what each point's own displacement projects to: the residual of one that
-        is left out has all of it.
+    Thresholds are widened by what each point's own displacement ``projects`` to: the residual of a
+    point that is left out has all of it.
     """
     minima, iterations = search_joint(with_loss(evidence, CAUCHY), *starts)
     found = []

@@ -40,6 +40,9 @@ class Model:
     scale_prior_sigma : float, optional
         As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
         similar has similar proportions, and its keypoints alone would say otherwise.
+    up_axis : {"y", "x", "z"} or None
+        The model's axis that points up, as `View.up` and camera heights take it; None where no axis
+        does.
     symmetry : Symmetry, optional
         As for `cadalign.fit`: motions that take the model to itself. Where the object's size is
         estimated, a quarter turn that exchanges two stretches is an equal alignment, too.
@@ -64,6 +67,7 @@ class Model:
     stretch: str | None = None
     scale_prior_sigma: float | None = None
     known_axis: str = "x"
+    up_axis: str | None = "y"
     symmetry: Symmetry | None = None
 
     def __repr__(self) -> str:
@@ -97,6 +101,7 @@ class Model:
             object.__setattr__(self, "shape_sigma", sigma)
         if self.symmetry is not None:
             check_symmetry(self.symmetry)
+        check_axis(self.up_axis)
         self.fit_options(1.0)
 
     def fit_options(self, sigma: float) -> FitOptions:
@@ -112,13 +117,23 @@ class Model:
         )
 
 
-def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
-    """Ids of ``count`` keypoints, each once; their numbers where none are given.
+def check_axis(axis: object) -> None:
+    """Refuse what is neither an axis nor None.
 
     Raises
     ------
     InputError
-        If there are more or fewer, or one occurs twice.
+        If it is that.
+    """
+    if axis is not None and axis not in ("x", "y", "z"):
+        fix = "give x, y, z, or None"
+        raise InputError(f"{quote(axis)} is no axis", where="up_axis", fix=fix)
+
+
+def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
+    """Ids of ``count`` keypoints, each once; their numbers where none are given.
+
+    Raises InputError if there are more or fewer, or one occurs twice.
     """
     if ids is None:
         return tuple(range(count))

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from cadalign.errors import InputError
-from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import in_file, within
 
@@ -68,11 +68,19 @@ class ObservationFit:
     focal: Literal["known", "estimate"] | None = None
     """Focal length: known (the file's) or estimate; by default known, if every view has one. Views
     of equal cameras share an estimated one."""
+    focal_prior: Literal["usual", "none"] | float | None = None
+    """Mean [px] of the prior on an estimated focal length, or: usual (usual lenses) or none; by
+    default the file's, or that of the photo's EXIF data, or else usual."""
+    focal_prior_sigma: float = FocalPrior.relative_sigma
+    """Relative standard deviation of --focal-prior."""
     exif: bool = True
     """Use the photo's EXIF data as a prior on an estimated focal length."""
     stored: bool = True
     """Take the options that the file stores, except for those that flags set to another value than
     their defaults; with --no-stored flags alone count."""
+    up_axis: Literal["x", "y", "z"] | None = None
+    """The model's axis that points up, for evidence of gravity and heights; y, unless the file says
+    otherwise."""
     fitting: FitOptions = field(default_factory=FitOptions)
     """Method and model; of sigma and focal length, the options above hold."""
     ransac: RansacOptions = field(default_factory=RansacOptions)
@@ -130,36 +138,53 @@ class ObservationFit:
         """Options of the fit: those that are given, otherwise those of the file."""
         given = dict(observation.fit_options) if self.stored else {}
         given.pop("shape_sigma", None)  # which is the model's
-        has_prior, stored_prior = "focal_prior" in given, given.pop("focal_prior", None)
         with in_file(where), within("fit"):
-            stored = FitOptions(**given)
+            stored = FitOptions(**{key: given[key] for key in given if key != "focal_prior"})
         set_by_flags = {
             field.name: getattr(self.fitting, field.name)
             for field in fields(self.fitting)
             if getattr(self.fitting, field.name) != field.default
         }
         are_known = all(view.camera.focal_known for view in observation.views)
-        focal = self.focal or given.get("focal", "known" if are_known else "estimate")
+        word = self.focal if isinstance(self.focal, str) else None  # a number is the camera's
+        focal = word or given.get("focal", "known" if are_known else "estimate")
         if focal == "known" and not are_known:
             raise InputError(
                 "the focal length is unknown",
                 where=f"{where}: camera",
                 fix=f"give {self.named('focal')} estimate, or a calibrated camera",
             )
-        prior = None
         if focal == "estimate":
-            if has_prior:
-                prior = None if stored_prior is None else FocalPrior(**stored_prior)
-            elif self.exif:
-                prior = _prior_of_photos(observation, note)
-            if prior is not None:
-                share = 100 * prior.relative_sigma
-                source = "the file's prior" if has_prior else "the photo's EXIF data"
-                note(f"Focal length from {source}: {prior.focal:.4g} px +-{share:.2g} %")
+            prior = self._prior_for(observation, given, note)
+            shown = prior_of_camera(prior, observation.camera)
+            if shown is not None:
+                note(f"Focal length is estimated, its prior: {shown}")
+        elif self.focal_prior is not None:
+            raise InputError(
+                "given for a known focal length",
+                where=self.named("focal_prior"),
+                fix=f"give {self.named('focal')} estimate with it",
+            )
+        else:
+            prior = None
         sigma = self.stated_sigma(observation).get("sigma", self.sigma_of(observation))
         changes = {**set_by_flags, "sigma": sigma, "focal": focal, "focal_prior": prior}
         chosen = replace(stored, **changes)
         return self._with_scale_prior(chosen, is_stored="scale_prior_sigma" in given)
+
+    def _prior_for(
+        self, observation: Observation, stored: Mapping[str, Any], note: Note
+    ) -> PriorOption:
+        """The prior on an estimated focal length: the flag's, the file's, or the photos'."""
+        given = self.focal_prior
+        if given is not None and not isinstance(given, str):
+            return FocalPrior(given, self.focal_prior_sigma)
+        if given is not None:
+            return USUAL if given == "usual" else None
+        if "focal_prior" in stored:
+            prior = stored["focal_prior"]
+            return FocalPrior(**prior) if isinstance(prior, dict) else prior
+        return (_prior_of_photos(observation, note) if self.exif else None) or USUAL
 
     def _with_scale_prior(self, options: FitOptions, *, is_stored: bool) -> FitOptions:
         """The options with the default prior on a similar model's stretch, or without any."""
@@ -191,7 +216,7 @@ class ObservationFit:
             "similar": is_shaped and self.similar,
             "no_scale_prior": is_shaped and not self.scale_prior,
         }
-        for name in ("method", *(_OF_THE_MODEL if learned is not None else ())):
+        for name in ("method", "principal_sigma", *(_OF_THE_MODEL if learned is not None else ())):
             is_changed = getattr(self.fitting, name) != getattr(FitOptions, name)
             refused[name] = is_changed
         for name, is_given in refused.items():
@@ -262,10 +287,16 @@ class ObservationFit:
         CadalignError
             If the options or the observation are invalid, or there is no alignment.
         """
+        notes: list[str] = []
         is_plain = observation.is_plain and self.shape_of(observation) is None
+        found: tuple[Result, tuple[View, ...] | None]
         if is_plain and self.shape_sigma_of(observation) is None:
-            return self._fit(observation, where, note), None
-        return self._align(observation, where, note, status or nullcontext())
+            found = self._fit(observation, where, notes.append), None
+        else:
+            found = self._align(observation, where, notes.append, status or nullcontext())
+        for text in notes:
+            note(text)
+        return found
 
     def _fit(self, observation: Observation, where: str, note: Note) -> Result:
         """Fit the stretched model to keypoints of one image."""
@@ -291,22 +322,13 @@ class ObservationFit:
     ) -> tuple[Result, tuple[View, ...]]:
         """Align any model to all evidence."""
         from cadalign.estimation.align import align
-        from cadalign.estimation.observed import views_of
 
-        self.check_for(observation)
-        options = self.options_for(observation, where, note)
-        model = self._model(observation, where, options)
-        stated = self.stated_sigma(observation)
-        with in_file(where):
-            views = views_of(observation, model, sigma=stated.get("sigma"))
-            size = observation.size
-        if "sigma" in stated and stated["sigma"] is None:
-            views = tuple(replace(view, sigma=None) for view in views)
+        model, views, options = self.problem(observation, where, note)
         with status, self._located(where):
             result = align(
                 model,
                 views,
-                size=size,
+                size=observation.size,
                 init=observation.init,
                 loss=options.loss,
                 loss_scale=options.loss_scale,
@@ -315,6 +337,28 @@ class ObservationFit:
                 focal_prior=options.focal_prior,
             )
         return result, views
+
+    def problem(
+        self, observation: Observation, where: str, note: Note = lambda text: None
+    ) -> tuple[Model | ShapeModel, tuple[View, ...], FitOptions]:
+        """Model, views and options of an observation for `cadalign.align`.
+
+        Raises
+        ------
+        CadalignError
+            If the options or the observation are invalid.
+        """
+        from cadalign.estimation.observed import views_of
+
+        self.check_for(observation)
+        options = self.options_for(observation, where, note)
+        model = self._model(observation, where, options)
+        stated = self.stated_sigma(observation)
+        with in_file(where):
+            views = views_of(observation, model, sigma=stated.get("sigma"))
+        if "sigma" in stated and stated["sigma"] is None:
+            views = tuple(replace(view, sigma=None) for view in views)
+        return model, views, options
 
     def _model(
         self, observation: Observation, where: str, options: FitOptions
@@ -334,7 +378,8 @@ class ObservationFit:
         mesh = None if observation.model is None else load_mesh(observation.model)
         sigma = self.shape_sigma_of(observation)
         with self._located(where):
-            return model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+            found = model_of(observation, options=options, shape_sigma=sigma, mesh=mesh)
+            return found if self.up_axis is None else replace(found, up_axis=self.up_axis)
 
     @contextmanager
     def _located(self, where: str) -> Iterator[None]:

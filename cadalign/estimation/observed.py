@@ -67,6 +67,7 @@ def model_of(
         scale_prior_sigma=options.scale_prior_sigma,
         known_axis=options.known_axis,
         symmetry=observation.symmetry,
+        up_axis=observation.up_axis,
     )
 
 
@@ -103,13 +104,7 @@ def views_of(
 
 
 def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]:
-    """The ids, or names, by which a learned shape knows an image's keypoints.
-
-    Raises
-    ------
-    InputError
-        As `views_of`.
-    """
+    """The ids, or names, by which a learned shape knows an image's keypoints; see `views_of`."""
     if not len(image.points_2d):
         return ()
     named = isinstance(shape.ids[0], str)
@@ -123,11 +118,6 @@ def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]
         )
     ids = tuple(each if named else int(each) for each in given)
     shape.rows(ids, where=f"keypoints.{field}")
-    twice = next((each for row, each in enumerate(ids) if each in ids[:row]), None)
-    if twice is not None:
-        raise InputError(
-            f"{twice!r} occurs twice", where=f"keypoints.{field}", fix="give each once"
-        )
     return ids
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -15,7 +15,13 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_positive, is_number, is_whole
 from cadalign.errors import InputError, quote
-from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.focal import (
+    USUAL,
+    PriorOption,
+    check_prior,
+    prior_of_camera,
+)
+from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS, ScalePrior
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
@@ -76,8 +82,12 @@ class FitOptions(AlignmentOptions):
     """Axis of the model whose length is right: x, y or z."""
     focal: str = "known"
     """Focal length: known (the camera's) or estimate."""
-    focal_prior: FocalPrior | None = None
-    """Prior on a focal length to be estimated, from EXIF data for example."""
+    focal_prior: PriorOption = USUAL
+    """Prior on a focal length to be estimated: that of usual lenses, a `FocalPrior`, from EXIF data
+    for example, or None."""
+    principal_sigma: float | None = None
+    """Standard deviation of the principal point about the camera's [px], of a photo that may be
+    cropped: estimates it, for an exact model's keypoints in one view. By default it is known."""
 
     def __post_init__(self) -> None:
         _check_known("method", self.method, METHODS)
@@ -88,6 +98,9 @@ class FitOptions(AlignmentOptions):
         if self.scale_prior_sigma is not None:
             scale_prior_sigma = as_positive(self.scale_prior_sigma, name="scale_prior_sigma")
             object.__setattr__(self, "scale_prior_sigma", scale_prior_sigma)
+        if self.principal_sigma is not None:
+            principal_sigma = as_positive(self.principal_sigma, name="principal_sigma")
+            object.__setattr__(self, "principal_sigma", principal_sigma)
         if self.sigma is not None and not is_number(self.sigma):
             try:
                 np.ndim(self.sigma)
@@ -95,15 +108,24 @@ class FitOptions(AlignmentOptions):
                 raise InputError("its entries are not of one shape", where="sigma") from None
         if self.stretch is not None:
             self._check_stretch(self.stretch)
-        if self.focal == "estimate" or self.focal_prior is not None:
-            self._check_focal()
+        if self.focal == "estimate" and self.method != "optimal":
+            raise InputError(
+                f"the method {self.method!r} needs a known focal length",
+                where="focal",
+                fix="use the method 'optimal'",
+            )
+        check_prior(self.focal_prior, focal=self.focal)
+        if self.focal == "known":
+            object.__setattr__(self, "focal_prior", None)
         if self.method != "optimal" and (
             self.loss != "linear"
             or self.scale_prior_sigma is not None
             or (self.stretch is not None and len(self.stretched_axes) < 2)
+            or self.principal_sigma is not None
         ):
             raise InputError(
-                f"the method {self.method!r} supports neither loss, stretch nor scale prior",
+                f"the method {self.method!r} supports neither loss, stretch, scale prior nor "
+                "principal point",
                 where="method",
                 fix="use the method 'optimal', or leave these options at their defaults",
             )
@@ -118,26 +140,11 @@ class FitOptions(AlignmentOptions):
                 fix=f"give one of {', '.join(allowed)}",
             )
 
-    def _check_focal(self) -> None:
-        if self.focal == "estimate" and self.method != "optimal":
-            raise InputError(
-                f"the method {self.method!r} needs a known focal length",
-                where="focal",
-                fix="use the method 'optimal'",
-            )
-        if self.focal_prior is None:
-            return
-        if not isinstance(self.focal_prior, FocalPrior):
-            raise InputError(
-                f"expected a cadalign.FocalPrior, got {type(self.focal_prior).__name__}",
-                where="focal_prior",
-            )
-        if self.focal != "estimate":
-            raise InputError(
-                "given for a known focal length",
-                where="focal_prior",
-                fix='give focal="estimate" with it',
-            )
+    def for_camera(self, camera: Camera) -> FitOptions:
+        """The options for one camera, with the prior on its focal length."""
+        if self.focal_prior != USUAL:
+            return self
+        return replace(self, focal_prior=prior_of_camera(self.focal_prior, camera))
 
     @property
     def stretched_axes(self) -> str:

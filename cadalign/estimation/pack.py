@@ -21,6 +21,7 @@ from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import (
+    Directions,
     Evidence,
     Offsets,
     Planes,
@@ -28,6 +29,8 @@ from cadalign.solvers.joint.evidence import (
     Shape,
     Sightings,
     State,
+    kept_rows,
+    stacked,
 )
 
 _NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
@@ -52,11 +55,8 @@ def evidence_of(
     By default the views' focal lengths are known. Keypoints without a sigma have the standard
     deviation ``noise`` [px].
 
-    Raises
-    ------
-    InputError
-        If a view names a keypoint that the model lacks, tells nothing, or tells of an up axis that
-        the model lacks, or if only some views have a known pose.
+    Raises InputError if a view names a keypoint that the model lacks, tells nothing, or tells of an
+    up axis that the model lacks, or if only some views have a known pose.
     """
     if lenses is None:
         lenses = Lenses.of(views, "known", None)
@@ -67,6 +67,8 @@ def evidence_of(
     for number, view in enumerate(views):
         _check_view(view, number)
     directions, offsets = known_of(prior, [view.given for view in views], size)
+    if any(camera.turn for camera in lenses.cameras):
+        directions = _in_turned_frames(directions, lenses.cameras)
     return Evidence(
         prior.components[0],
         _sightings(rows, views, lenses.cameras, noise, loss, loss_scale),
@@ -76,6 +78,16 @@ def evidence_of(
         offsets,
         sampled_planes(prior.components[0], rows, views),
         scale_priors(prior, _is_metric(offsets, views)),
+    )
+
+
+def _in_turned_frames(directions: Directions, cameras: Sequence[Camera]) -> Directions:
+    """Directions that are known in the lenses' frames, in those of cameras that are turned."""
+    turns = np.array([cameras[image].lens_from_camera for image in directions.image])
+    turns = turns.reshape(-1, 3, 3)
+    return directions._replace(
+        camera=np.einsum("dij,di->dj", turns, directions.camera),
+        whitening=directions.whitening @ turns,
     )
 
 
@@ -101,29 +113,25 @@ def _sightings(
     loss: int,
     loss_scale: float,
 ) -> Sightings:
-    points, images, rays, whitenings, depths, slopes = [], [], [], [], [], []
+    tables = []
     for number, (rows, view, camera) in enumerate(zip(names, views, cameras, strict=True)):
-        pixels = cast(FloatArray, view.points_2d)
-        points.append(np.array(rows, dtype=np.int64))
-        images.append(np.full(len(rows), number))
-        seen = rays_of(np.require(pixels, requirements="W"), camera)
-        rays.append(seen)
+        pixels, count = cast(FloatArray, view.points_2d), len(rows)
+        rays = rays_of(np.require(pixels, requirements="W"), camera, clips=True)
         sigma = noise if view.sigma is None else view.sigma
-        whitenings.append(np.broadcast_to(whitening_of(sigma, seen, camera), (len(rows), 3)))
-        slopes.append(focal_slopes(pixels, camera, seen) if camera.distortion else 0.0 * seen)
-        depths.append(_depths(view, len(rows)))
-    point = np.concatenate(points)
-    order = np.argsort(point, kind="stable")
-    return Sightings(
-        point[order],
-        np.concatenate(images)[order],
-        np.concatenate(rays)[order],
-        np.concatenate(whitenings)[order],
-        np.concatenate(depths)[order],
-        np.full(len(point), loss),
-        np.full(len(point), float(loss_scale)),
-        np.concatenate(slopes)[order],
-    )
+        tables.append(
+            Sightings(
+                np.array(rows, dtype=np.int64),
+                np.full(count, number),
+                rays,
+                np.broadcast_to(whitening_of(sigma, rays, camera), (count, 3)),
+                _depths(view, count),
+                np.full(count, loss),
+                np.full(count, float(loss_scale)),
+                focal_slopes(pixels, camera, rays) if camera.distortion else 0.0 * rays,
+            )
+        )
+    whole = stacked(tables)
+    return kept_rows(whole, np.argsort(whole.point, kind="stable"))
 
 
 def _depths(view: View, count: int) -> FloatArray:
@@ -158,34 +166,32 @@ def sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View
 
     They count under Cauchy's loss: a keypoint may be hidden by something nearer.
     """
-    points, images, depths, sigmas = [], [], [], []
+    tables = []
     for number, view in enumerate(views):
-        image = view.depth_image
-        if image is None:
+        if view.depth_image is None:
             continue
         relative = float(cast(float, view.depth_sigma))
-        depth = sample_depth(image, cast(FloatArray, view.points_2d), sigma=relative)
-        known = np.isfinite(depth)
-        points.append(np.array(rows[number], dtype=np.int64)[known])
-        images.append(np.full(int(known.sum()), number))
-        depths.append(depth[known])
-        sigmas.append(relative * depth[known])
-    if not points:
+        found = sample_depth(view.depth_image, cast(FloatArray, view.points_2d), sigma=relative)
+        known = np.isfinite(found)
+        point, depth = np.array(rows[number], dtype=np.int64)[known], found[known]
+        count = len(point)
+        tables.append(
+            Planes(
+                point,
+                np.full(count, number),
+                np.tile([0.0, 0.0, 1.0], (count, 1)),
+                np.zeros((count, 2)),
+                depth,
+                1.0 / np.hypot(relative * depth, shape.spread[point]),
+                np.full(count, CAUCHY),
+                np.full(count, _LOSS_SCALE),
+            )
+        )
+    if not tables:
         none, no_value = np.empty(0, dtype=np.int64), np.empty(0)
         directions = np.empty((0, 3)), np.empty((0, 2))
         return Planes(none, none, *directions, no_value, no_value, none, no_value)
-    point = np.concatenate(points)
-    count = len(point)
-    return Planes(
-        point,
-        np.concatenate(images),
-        np.tile([0.0, 0.0, 1.0], (count, 1)),
-        np.zeros((count, 2)),
-        np.concatenate(depths),
-        1.0 / np.hypot(np.concatenate(sigmas), shape.spread[point]),
-        np.full(count, CAUCHY),
-        np.full(count, _LOSS_SCALE),
-    )
+    return stacked(tables)
 
 
 def sample_depth(image: FloatArray, points_2d: FloatArray, *, sigma: float) -> FloatArray:
@@ -227,6 +233,7 @@ class SingleBasis:
     pose: FloatArray
     force: FloatArray
     numbers: tuple[int, ...] | None = None
+    turn: FloatArray | None = None
 
     @cached_property
     def evidence(self) -> Evidence:

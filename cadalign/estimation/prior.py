@@ -5,19 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError, quote
-from cadalign.estimation.focal import FocalPrior, focal_grid, log_focal_range
+from cadalign.estimation.focal import (
+    PriorOption,
+    check_estimable,
+    focal_grid,
+    log_focal_range,
+    prior_of_camera,
+)
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.box_margins import BoxMargins
-from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.tails import FewKeypoints
 from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.joint.evidence import Evidence, Focals, ScalePriors, Shape, State
 
@@ -25,7 +32,6 @@ _COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
 _SAME_SCALE_SIGMA = 1e-4
 _PROPORTION_SIGMA = 3.0  # of free log scales about their mean, lest an unseen axis collapses
 _NO_BOUND = ScalePrior(0.0, 0.0)
-_Y = np.array([0.0, 1.0, 0.0])
 _SETTLED = 1e-8  # change of a log focal length
 LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
 
@@ -58,10 +64,7 @@ class ShapePrior:
     def rows_of(self, ids: tuple[Hashable, ...], where: str) -> list[int]:
         """Row numbers of keypoints.
 
-        Raises
-        ------
-        InputError
-            If the model has no such keypoint.
+        Raises InputError if the model has no such keypoint.
         """
         return rows_among(self.ids, ids, where)
 
@@ -82,10 +85,7 @@ def rows_among(known: Sequence[Hashable], ids: Sequence[Hashable], where: str) -
 def prior_of(model: object) -> ShapePrior:
     """The prior of an exact, a stretched or a learned model.
 
-    Raises
-    ------
-    InputError
-        If it is none of these.
+    Raises InputError if it is none of these.
     """
     if isinstance(model, Model):
         return _of_model(model)
@@ -104,9 +104,11 @@ def _of_model(model: Model) -> ShapePrior:
     bound = _NO_BOUND if options.prior_weight else options.scale_prior
     scales = ScalePriors(free, np.diag(free * options.prior_weight), bound)
     shape = Shape(mean, np.empty((0, len(mean), 3)), spread)
-    return ShapePrior(cast("tuple[Hashable, ...]", model.ids), (shape,), (1.0,), scales, _Y)
+    ids, up = cast("tuple[Hashable, ...]", model.ids), axis_vector(model.up_axis)
+    return ShapePrior(ids, (shape,), (1.0,), scales, up)
 
 
+@lru_cache(maxsize=4)
 def _of_category(model: ShapeModel) -> ShapePrior:
     shapes = tuple(
         Shape(
@@ -117,7 +119,7 @@ def _of_category(model: ShapeModel) -> ShapePrior:
         for component in model.components
     )
     weights = tuple(component.weight for component in model.components)
-    up = None if model.up_axis is None else np.eye(3)["xyz".index(model.up_axis)]
+    up = axis_vector(model.up_axis)
     held = ScalePriors(np.zeros(3), np.zeros((3, 3)), _NO_BOUND)
     return ShapePrior(
         model.ids,
@@ -130,6 +132,11 @@ def _of_category(model: ShapeModel) -> ShapePrior:
         box_margins=model.box_margins,
         few_keypoints=model.few_keypoints,
     )
+
+
+def axis_vector(axis: str | None) -> FloatArray | None:
+    """The unit vector (3,) of an axis; None of none."""
+    return None if axis is None else np.eye(3)["xyz".index(axis)]
 
 
 def scale_priors(prior: ShapePrior, metric: bool) -> ScalePriors:
@@ -169,34 +176,26 @@ def is_exact(evidence: Evidence) -> bool:
 
 @dataclass(frozen=True)
 class Lenses:
-    """Cameras of views (V,), with focal lengths that are to be estimated.
+    """Cameras of views (V,), with focal lengths that are to be estimated."""
 
-    Parameters
-    ----------
-    cameras : tuple of Camera
-        The reference of each view: the estimate is a multiple of its focal length.
-    groups : tuple of int
-        Numbers the focal length of each view; -1 where it is known.
-    prior : FocalPrior, optional
-    """
-
-    cameras: tuple[Camera, ...]
-    groups: tuple[int, ...]
-    prior: FocalPrior | None = None
+    cameras: tuple[Camera, ...]  # the estimate is a multiple of the focal length of each view's
+    groups: tuple[int, ...]  # number of each view's focal length; -1 where it is known
+    prior: PriorOption = None
 
     @classmethod
-    def of(cls, views: Sequence[View], focal: str, prior: FocalPrior | None) -> Lenses:
+    def of(cls, views: Sequence[View], focal: str, prior: PriorOption) -> Lenses:
         """The cameras of views, their focal lengths known or to be estimated."""
         cameras = tuple(view.camera for view in views)
         if focal == "known":
             for camera in cameras:
                 camera.require_focal()
             return cls(cameras, (-1,) * len(cameras))
+        check_estimable(cameras)
         distinct = list(dict.fromkeys(cameras))
         reference = []
         for camera in cameras:
-            grid = focal_grid(camera, prior)
-            known = prior.focal if prior is not None else float(grid[len(grid) // 2])
+            grid, own = focal_grid(camera, prior), prior_of_camera(prior, camera)
+            known = own.focal if own is not None else float(grid[len(grid) // 2])
             reference.append(camera.with_focal(known))
         return cls(tuple(reference), tuple(distinct.index(camera) for camera in cameras), prior)
 

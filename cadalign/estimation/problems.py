@@ -19,6 +19,7 @@ from cadalign.arrays import FloatArray, IntArray, as_points, is_number
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import check_pixels
 from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
 from cadalign.solvers.linear import aepnp_error, describe_plane, out_of_range_error
 from cadalign.solvers.projection import all_finite, pinhole_rays
@@ -82,6 +83,13 @@ class Problems:
         )
         return replace(self, cameras=cameras)
 
+    def facing(self) -> Problems:
+        """The same problems, each seen by a camera that is turned to its keypoints."""
+        from cadalign.estimation.facing import faced  # wide lenses are rare
+
+        cameras = [faced(self.camera(b), self.points_2d[self.rows(b)]) for b in range(len(self))]
+        return replace(self, cameras=tuple(cameras))
+
     def part(self, first: int, last: int) -> Problems:
         """Problems ``first`` to ``last``, that one left out."""
         start, end = self.offsets[first], self.offsets[last]
@@ -97,6 +105,7 @@ def pack_one(points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera)
     """Check one problem's arguments."""
     model, image = _check_pair(points_3d, points_2d, "points_3d", "points_2d")
     _check_camera(camera)
+    check_pixels(image, camera.width, camera.height, where="points_2d")
     return Problems(model, image, np.array([0, len(model)]), (camera,))
 
 
@@ -120,18 +129,27 @@ def pack_many(
         image = np.array(points_2d, dtype=np.float64, order="C").reshape(-1, 2)
         if len(model) == len(image) and all_finite(model, image):
             offsets = np.arange(count + 1) * (len(model) // count)
-            return Problems(model, image, offsets, cameras)
+            return _checked(Problems(model, image, offsets, cameras))
     pairs = [
         _check_pair(points_3d[b], points_2d[b], f"points_3d[{b}]", f"points_2d[{b}]")
         for b in range(count)
     ]
     offsets = np.concatenate([[0], np.cumsum([len(model) for model, _ in pairs])])
-    return Problems(
+    problems = Problems(
         np.concatenate([model for model, _ in pairs]),
         np.concatenate([image for _, image in pairs]),
         offsets.astype(np.int64),
         cameras,
     )
+    return _checked(problems)
+
+
+def _checked(problems: Problems) -> Problems:
+    """The problems, none of whose keypoints are normalised coordinates."""
+    for b in range(len(problems)):
+        camera, image = problems.camera(b), problems.points_2d[problems.rows(b)]
+        check_pixels(image, camera.width, camera.height, where=f"points_2d[{b}]")
+    return problems
 
 
 def distinct_rows(rows: FloatArray) -> int:
@@ -196,8 +214,12 @@ def _check_pair(
     return model, image
 
 
-def rays_of(points_2d: FloatArray, camera: Camera) -> FloatArray:
-    """Normalised image coordinates (n, 2) of checked pixels (n, 2)."""
+def rays_of(points_2d: FloatArray, camera: Camera, *, clips: bool = False) -> FloatArray:
+    """Normalised image coordinates (n, 2) of checked pixels (n, 2); see `rays_ahead`."""
+    if camera.is_wide:
+        from cadalign.estimation.facing import rays_ahead  # wide lenses are rare
+
+        return rays_ahead(points_2d, camera, clips=clips)
     if camera.distortion:
         return camera.normalize(points_2d)
     return pinhole_rays(points_2d, camera.fx, camera.fy, camera.cx, camera.cy)
@@ -242,10 +264,7 @@ def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> Float
 def check_sigmas(sigmas: Sequence[Sigma | None], counts: IntArray) -> None:
     """Check the standard deviations of problems of so many keypoints each, or one for all.
 
-    Raises
-    ------
-    InputError
-        If one is no standard deviation, or has another shape than its keypoints.
+    Raises InputError if one is no standard deviation, or has another shape than its keypoints.
     """
     for b, sigma in enumerate(sigmas):
         if sigma is None or (isinstance(sigma, int | float) and is_number(sigma) and sigma > 0):

@@ -218,10 +218,10 @@ class Results(Sequence[Result | CadalignError]):
         >>> results = Results.open("runs/fit")  # doctest: +SKIP
         >>> results[0].alignment, results.to_dataframe()  # doctest: +SKIP
         """
-        from cadalign.estimation.results_file import RECORDS, StoredResults, read_arrays
+        from cadalign.estimation.results_file import StoredResults, read_arrays
 
         path = Path(folder)
-        arrays, stored = read_arrays(path), StoredResults.open(path / RECORDS)
+        arrays, stored = read_arrays(path), StoredResults.open(path)
         if in_memory:
             stored.load()
         return cls(**arrays, single=stored.single)

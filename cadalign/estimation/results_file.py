@@ -22,7 +22,8 @@ from cadalign.io.documents import in_file
 if TYPE_CHECKING:
     import pyarrow as pa
 
-TABLE, RECORDS = "results.parquet", "exhibits.parquet"
+TABLE = "results.parquet"
+_RECORDS = ("exhibits.parquet", "records.parquet")  # of earlier versions, and of this one
 _FIX = "give a folder that `cadalign fit` or `cadalign.fit_many` has written"
 
 
@@ -40,10 +41,12 @@ class StoredResults:
     _kept: Any = field(default=None, repr=False)
 
     @classmethod
-    def open(cls, path: Path) -> Self:
-        """Open the table of records."""
+    def open(cls, folder: Path) -> Self:
+        """Open the table of records of a run's folder."""
         import pyarrow.parquet as pq
 
+        earlier, path = (folder / name for name in _RECORDS)
+        path = earlier if earlier.exists() else path
         with _reading(path):
             metadata = pq.read_metadata(path)
         sizes = [metadata.row_group(k).num_rows for k in range(metadata.num_row_groups)]
@@ -77,10 +80,7 @@ class StoredResults:
 def read_arrays(folder: Path) -> dict[str, Any]:
     """The arguments of `Results` for a run's folder, without ``single``.
 
-    Raises
-    ------
-    DataError
-        If it is not the folder of a finished run of fits.
+    Raises DataError if it is not the folder of a finished run of fits.
     """
     import pyarrow.parquet as pq
 

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import NoConsensusError
 from cadalign.estimation.joint_robust import (
-    OUTLIER_COST,
     JointConsensus,
     robust_minima,
     robust_starts,
@@ -24,14 +21,7 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import LENS_ROUNDS, Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.starts import Start, Starts, starts_of
-from cadalign.estimation.support import (
-    Explained,
-    Mistake,
-    Support,
-    area_of,
-    check_support,
-    find_mistake,
-)
+from cadalign.estimation.support import Support, area_of, check_support
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
@@ -44,7 +34,6 @@ _MOST_PER_FOCAL_OF_SEVERAL = 3
 _ITERATIONS = 100  # about a lens that is linearised anew
 _MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
 
-_FEW_REJECTED = 0.9  # share of the keypoints that agree, above which no mistake is searched for
 _NOISES = np.geomspace(0.1, 100.0, 10)  # [px]
 _USUAL, _USUAL_LOG_SIGMA = 2.0, 1.5  # [px], prior: few keypoints fit any noise by the shape
 _NOISE_ROUNDS = 3  # of a search with the noise of the last
@@ -92,26 +81,6 @@ class JointProblem(NamedTuple):
         )
         return everything._replace(shape=shape)
 
-    def without(self, mistake: Mistake) -> JointProblem:
-        """The problem with a mistake in the model or in the keypoints of all views undone."""
-        components = tuple(
-            shape._replace(mean=_undone(mistake, shape.mean), modes=_undone(mistake, shape.modes))
-            for shape in self.prior.components
-        )
-        views = [
-            replace(each, points_2d=mistake.undo_2d(cast(FloatArray, each.points_2d), each.camera))
-            for each in self.views
-        ]
-        return self._replace(prior=replace(self.prior, components=components), views=views)
-
-
-def _undone(mistake: Mistake, points: FloatArray) -> FloatArray:
-    """Points (..., m, 3) without a mistake; the last two stay the box's least and greatest."""
-    undone = mistake.undo_3d(points)
-    if mistake.mirrored:
-        undone[..., -2:, 0] = undone[..., :-3:-1, 0].copy()
-    return undone
-
 
 class Minimum(NamedTuple):
     """An estimate under one component of the prior; ``score`` is -2 log of its probability.
@@ -139,7 +108,7 @@ class Minimum(NamedTuple):
         return points_of(self.evidence.shape, self.state) / np.exp(self.state.log_scales)
 
 
-def _find_minima(
+def minima_at_noise(
     problem: JointProblem, init: Inits, ransac: RansacOptions | None
 ) -> tuple[list[Minimum], int, int]:
     """Minima, the likeliest first, and the numbers of iterations and of starts, at one noise."""
@@ -154,7 +123,7 @@ def _find_minima(
         if ransac is None:
             found, used = _search(evidence, starts)
         else:
-            threshold = _thresholds(evidence, problem.lenses, problem.threshold(ransac))
+            threshold = thresholds(evidence, problem.lenses, problem.threshold(ransac))
             found, used = robust_minima(
                 evidence,
                 starts,
@@ -232,9 +201,9 @@ def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
 def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float) -> None:
     """Refuse a minimum that chance gives as well; few keypoints leave that to other evidence."""
     views, rig, sightings = problem.views, best.evidence.rig, best.evidence.sightings
-    limits = _thresholds(best.evidence, best.lenses, 1.0)
+    limits = thresholds(best.evidence, best.lenses, 1.0)
     errors = whitened_lengths(best.evidence, best.state) / limits
-    areas = _areas(views, max_reproj_error)
+    areas = outlier_areas(views, max_reproj_error)
     free = int(best.evidence.scales.free.sum())
     size = 3 + min(free, _MOST_FREE) // 2 + (problem.lenses.count > 0)
     supports = []
@@ -252,7 +221,7 @@ def _check_support(problem: JointProblem, best: Minimum, max_reproj_error: float
         check_support(supports, size, max_reproj_error=max_reproj_error, score=score, where="views")
 
 
-def _areas(views: Sequence[View], max_reproj_error: float) -> FloatArray:
+def outlier_areas(views: Sequence[View], max_reproj_error: float) -> FloatArray:
     """Areas [px^2] over which the outliers of each view are scattered; 1 without keypoints."""
     return np.array(
         [
@@ -264,39 +233,7 @@ def _areas(views: Sequence[View], max_reproj_error: float) -> FloatArray:
     )
 
 
-def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions) -> str | None:
-    """Name the mistake without which the keypoints agree better, where many are rejected.
-
-    See `find_mistake`.
-    """
-    if best.inliers.mean() > _FEW_REJECTED:
-        return None
-
-    def explain(mistake: Mistake) -> Explained | None:
-        unknown = [None] * len(problem.views)  # starts are of the data as given
-        try:
-            minima, _, _ = _find_minima(problem.without(mistake), unknown, ransac)
-        except NoConsensusError:
-            return None
-        return _explained(problem, minima[0], ransac) if minima else None
-
-    return find_mistake(_explained(problem, best, ransac), len(best.inliers), explain)
-
-
-def _explained(problem: JointProblem, minimum: Minimum, ransac: RansacOptions) -> Explained:
-    """Likelihood of all keypoints at a minimum: outliers of any threshold lie anywhere."""
-    rejected, error = ~minimum.inliers, problem.threshold(ransac)
-    evidence = problem.evidence(minimum.evidence.shape, minimum.lenses)
-    squares = _thresholds(evidence, minimum.lenses, error)[rejected] ** 2
-    areas = _areas(problem.views, error)[evidence.sightings.image[rejected]]
-    anywhere = 2 * np.log(areas * squares / (2 * math.pi * error**2))
-    score = minimum.score + float((anywhere - squares - OUTLIER_COST).sum())
-    in_rig = minimum.state.poses[evidence.rig.pose[0], :9].reshape(3, 3)
-    in_camera = evidence.rig.cam_from_rig[0, :9].reshape(3, 3) @ in_rig
-    return Explained(score, int(minimum.inliers.sum()), -float(in_camera[1, 1]))
-
-
-def _thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> FloatArray:
+def thresholds(evidence: Evidence, lenses: Lenses, max_reproj_error: float) -> FloatArray:
     """Largest whitened residuals (N,) of inliers."""
     sightings = evidence.sightings
     focal = np.array([np.sqrt(camera.fx * camera.fy) for camera in lenses.cameras])
@@ -328,21 +265,15 @@ def find_minima(
     """Minima, with the likeliest standard deviation of the keypoints where these have none.
 
     The shape is integrated out, and so is the pose by Laplace's approximation, so that the estimate
-    is free of the bias that fitted unknowns cause.
+    is free of the bias that fitted unknowns cause. Returns the problem with that noise, minima, the
+    likeliest first, and numbers of iterations and of starts.
 
-    Returns
-    -------
-    The problem with that noise, minima, the likeliest first, numbers of iterations and of starts.
-
-    Raises
-    ------
-    DegenerateError
-        If noise is to be estimated, and the keypoints fit exactly whatever they are.
-    NoConsensusError
-        With ``ransac``: if the likeliest has no more support by keypoints than chance gives.
+    Raises DegenerateError if noise is to be estimated, and the keypoints fit exactly whatever they
+    are; NoConsensusError if the likeliest has no more support by keypoints than chance gives, with
+    ``ransac``.
     """
     if not problem.lacks_sigma:
-        return problem, *_find_minima(problem, inits, ransac)
+        return problem, *minima_at_noise(problem, inits, ransac)
     counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
     poses = 1 if problem.views[0].cam_from_rig is not None else len(problem.views)
     if 2 * sum(counts) <= 6 * poses:
@@ -350,7 +281,7 @@ def find_minima(
     effort = np.zeros(2, dtype=int)
     minima: list[Minimum] = []
     for _ in range(_NOISE_ROUNDS):
-        minima, *spent = _find_minima(problem, inits, ransac)
+        minima, *spent = minima_at_noise(problem, inits, ransac)
         effort += spent
         if not minima:
             break
@@ -360,7 +291,7 @@ def find_minima(
         if change < _NOISE_TOLERANCE:
             break
     if minima:
-        minima, *spent = _find_minima(problem, inits, ransac)
+        minima, *spent = minima_at_noise(problem, inits, ransac)
         effort += spent
     return problem, minima, int(effort[0]), int(effort[1])
 

@@ -17,7 +17,8 @@ from cadalign.errors import DegenerateError
 from cadalign.estimation.assemble import canonical_result
 from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
-from cadalign.estimation.joint import Estimate, Found, result_of
+from cadalign.estimation.joint import Estimate, result_of
+from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import SingleBasis
@@ -30,8 +31,8 @@ from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
 from cadalign.estimation.uncertainty.held_out import SeenShape, ShapeTails, keypoint_misfits
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.shapes.inflation import inflation_with
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.tails import inflation_with
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.marginal.equations import POSE, force_of
 from cadalign.solvers.marginal.posterior import posteriors_of
@@ -39,6 +40,8 @@ from cadalign.solvers.marginal.problem import Mixture, Seen
 from cadalign.solvers.marginal.search import search_view
 
 _LEAST_POINTS = 3
+_SUSPICIOUS = 2.0  # reduced chi-square at which a mistake in the keypoints is looked for
+_DECISIVE = 10.0  # of -2 log likelihood, times the variance of shapes that were held out
 
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
@@ -93,19 +96,15 @@ def align_single(
 ) -> Result:
     """The result of `cadalign.align` where `is_single` holds.
 
-    Raises
-    ------
-    InputError
-        If the view names a keypoint that the model lacks.
-    DegenerateError
-        If no pose has all keypoints in front of the camera.
+    Raises InputError if the view names a keypoint that the model lacks; DegenerateError if no pose
+    has all keypoints in front of the camera.
     """
     start = time.perf_counter()
     prior = prior_of(model)
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
     means, covariances, weights = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
-    seen = _seen(view, rows, options)
+    seen = _seen(view, cast(FloatArray, view.points_2d), rows, options)
     minima, hypotheses = search_view(mixture, seen, _given(init))
     count, iterations = minima.counts.tolist()
     if not count:
@@ -117,11 +116,11 @@ def align_single(
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
+    inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
     placed = mixture, minima
     if model.box_margins is not None:
         placed = with_boxes(mixture, seen, minima, len(likelihoods), model.box_margins)
-    inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
-    likely = posteriors_of(placed[0], seen, placed[1], likelihoods, inflation)
+    likely = posteriors_of(placed[0], seen, placed[1], len(likelihoods), inflation)
     estimates = [
         Estimate(
             likely.points[k],
@@ -136,7 +135,8 @@ def align_single(
         )
         for k, likelihood in enumerate(likelihoods.tolist())
     ]
-    in_camera = estimates[0].poses[0].apply(likely.points[0][rows])
+    points = estimates[0].points[rows]
+    in_camera = estimates[0].poses[0].apply(points)
     errors = in_camera[:, :2] / in_camera[:, 2:] - seen.rays
     component, cost = int(minima.label[0]), float(minima.costs[0])
     pose, force = minima.states[0, :POSE].copy(), force_of(minima.states[0])
@@ -145,7 +145,7 @@ def align_single(
         beside = (3 * np.array(rows)[:, None] + np.arange(3)).ravel()
         warnings = keypoint_misfits(
             SeenShape(
-                likely.points[0][rows],
+                points,
                 means[component].reshape(-1, 3)[rows],
                 covariances[component][np.ix_(beside, beside)],
                 estimates[0].poses[0],
@@ -157,26 +157,53 @@ def align_single(
             tails=ShapeTails(inflation, model.degrees_of_freedom),
             focal=view.camera.fx,
         )
+        if warnings or cost > _SUSPICIOUS * (2 * len(rows) - POSE):
+            score = float(minima.scores[0]) - _DECISIVE * inflation**2
+            mistake = _mistake_in(mixture, view, rows, options, score)
+            warnings = warnings if mistake is None else (mistake,)
     return result_of(
-        Found(
-            model,
-            prior,
-            [view],
-            estimates,
-            [np.ones(len(rows), dtype=bool)],
-            is_curved=bool(covariances.any()),
-            warnings=warnings,
-            evidence=(summary_of_keypoints(errors, seen.whitening, 0, view.camera),),
-            basis=SingleBasis(model, view, options, component, pose, force),
-            cost=cost,
-            stats=stats,
-            component=component,
-        )
+        model,
+        prior,
+        [view],
+        estimates,
+        inliers=[np.ones(len(rows), dtype=bool)],
+        is_curved=bool(covariances.any()),
+        warnings=warnings,
+        evidence=(summary_of_keypoints(errors, seen.rays, seen.whitening, 0, view.camera),),
+        basis=SingleBasis(model, view, options, component, pose, force),
+        cost=cost,
+        stats=stats,
+        component=component,
+        known_axis=None,
+        stretched_axes="",
     )
 
 
-def _seen(view: View, rows: list[int], options: FitOptions) -> Seen:
-    pixels = cast(FloatArray, view.points_2d)
+def _mistake_in(
+    mixture: Mixture,
+    view: View,
+    rows: list[int],
+    options: FitOptions,
+    score: float,
+) -> str | None:
+    """Name the mistake without which the keypoints fit the shape, below that score."""
+    given = cast(FloatArray, view.points_2d)
+
+    def explain(mistake: Mistake) -> Explained | None:
+        if mistake.mirrored:  # not a learned shape: its models share one frame
+            return None
+        seen = _seen(view, mistake.undo_2d(given, view.camera), rows, options)
+        minima, _ = search_view(mixture, seen, _given(None))
+        if not minima.counts[0] or minima.costs[0] > _SUSPICIOUS * (2 * len(rows) - POSE):
+            return None
+        up = -float(minima.states[0, 4])
+        return Explained(float(minima.scores[0]), len(rows), up)
+
+    found = find_in_all(score, len(rows), explain, larger_sizes(given, view.camera))
+    return None if found is None else f"{found[0]}: corrected, the keypoints fit the learned shapes"
+
+
+def _seen(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:
     rays = rays_of(np.require(pixels, requirements="W"), view.camera)
     whitening = np.empty((len(rows), 3))
     whitening[:] = whitening_of(view.sigma, rays, view.camera)

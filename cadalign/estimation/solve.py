@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import CadalignError
+from cadalign.estimation.focal import check_estimable
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
 from cadalign.estimation.problems import (
     Problems,
@@ -23,7 +24,7 @@ from cadalign.estimation.problems import (
     whitening_of,
 )
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch
@@ -59,12 +60,16 @@ def solve(
         short = _solve_one_linearly(problems, options)
         if short is not None:
             return short
+    if needs_facing(problems.cameras):
+        return _solve_facing(problems, options, sigmas)
     points = problems.points_3d
     if options.known_axis != "x":
         points = np.ascontiguousarray(points[:, options.axis_order])
     if options.focal == "known":
         for camera in problems.cameras:
             camera.require_focal()
+    else:
+        check_estimable(problems.cameras)
     if options.method != "optimal" and not _is_plain(options.sigma, sigmas):
         # The other methods would not notice a wrong one.
         check_sigmas([options.sigma] if sigmas is None else sigmas, problems.counts)
@@ -81,6 +86,24 @@ def solve(
     if np.count_nonzero(statuses):
         found = found._replace(errors=_errors(problems, options, found))
     return found if options.known_axis == "x" else _in_model_axes(found, options)
+
+
+def _solve_facing(
+    problems: Problems, options: FitOptions, sigmas: Sequence[Sigma] | None
+) -> Solutions:
+    """Solve in frames that face the keypoints of wide lenses."""
+    from cadalign.estimation.facing import turned_covariance, turned_poses  # wide lenses are rare
+
+    facing = problems.facing()
+    found = solve(facing, options, sigmas)
+    poses, covariances = found.poses.copy(), found.covariances
+    covariances = None if covariances is None else covariances.copy()
+    for b in range(len(problems)):
+        turn = facing.camera(b).lens_from_camera
+        poses[b] = turned_poses(found.poses[b], turn)
+        if covariances is not None:
+            covariances[b] = turned_covariance(covariances[b], turn)
+    return found._replace(poses=poses, covariances=covariances)
 
 
 def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | None:
@@ -370,10 +393,7 @@ def _in_model_axes(found: Solutions, options: FitOptions) -> Solutions:
 def solve_one(problems: Problems, options: FitOptions) -> Solutions:
     """Solve the only problem.
 
-    Raises
-    ------
-    CadalignError
-        If it has no solution.
+    Raises CadalignError if it has no solution.
     """
     solutions = solve(problems, options)
     if solutions.errors:

@@ -7,15 +7,15 @@ shape leaves open which side is seen, starts half a turn away are added.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.metric_starts import metric_starts
 from cadalign.estimation.uncertainty.evidence import count_equations
-from cadalign.solvers.joint.evidence import Evidence, distances_of
-from cadalign.solvers.joint.starts import MOST_PER_VIEW, view_starts
+from cadalign.solvers.joint.evidence import Evidence, distances_of, kept_rows
+from cadalign.solvers.joint.search import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
 
@@ -143,16 +143,14 @@ def _with_sized(
 def _of_pose(evidence: Evidence, pose: int) -> Evidence:
     """The evidence of the views that share a pose."""
     chosen = evidence.rig.pose == pose
-    columns: dict[str, Any] = {
-        name: type(rows)(*(column[(rows.image < 0) | chosen[rows.image]] for column in rows))
-        for name, rows in (
-            ("sightings", evidence.sightings),
-            ("directions", evidence.directions),
-            ("offsets", evidence.offsets),
-            ("planes", evidence.planes),
-        )
+    tables = {
+        name: getattr(evidence, name) for name in ("sightings", "directions", "offsets", "planes")
     }
-    return evidence._replace(**columns)
+    kept = {
+        name: kept_rows(rows, (rows.image < 0) | chosen[rows.image])
+        for name, rows in tables.items()
+    }
+    return evidence._replace(**kept)
 
 
 def _sized(

@@ -1,9 +1,9 @@
-"""Support of an estimate by keypoints: chance, or data with a usual mistake, may give as much."""
+"""Support of an estimate by keypoints: chance may give as much."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +13,9 @@ from cadalign.errors import NoConsensusError
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 
+SOLUTIONS_OF_FOUR = 2.3  # valid alignments to 4 points, in the mean
 LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
 _MOST_NAMED = 5  # keypoints, in a message
-_LEAST_GAIN = 2.0  # of -2 log likelihood, by which corrected data must explain more
-_AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
-_UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 
 
 class Support(NamedTuple):
@@ -30,103 +28,6 @@ class Support(NamedTuple):
     errors: FloatArray
     given: int
     area: float
-
-
-class Explained(NamedTuple):
-    """Agreement of keypoints with an estimate: -2 log likelihood of all, and number of inliers.
-
-    ``up`` is the cosine between the model's y axis and the photo's upwards.
-    """
-
-    score: float
-    inliers: int
-    up: float
-
-
-class Mistake(NamedTuple):
-    """A usual mistake in keypoints, named by a clause; made again, it is undone.
-
-    The model mirrored across x, u or v counted from the photo's other side, or u and v swapped.
-    """
-
-    clause: str
-    mirrored: bool = False
-    flipped: tuple[bool, bool] = (False, False)
-    swapped: bool = False
-
-    def undo_3d(self, points_3d: FloatArray) -> FloatArray:
-        """Keypoints on the model (n, 3) without the mistake."""
-        return points_3d * [-1.0, 1.0, 1.0] if self.mirrored else points_3d
-
-    def undo_2d(self, points_2d: FloatArray, camera: Camera) -> FloatArray:
-        """Keypoints in the image (n, 2) [px] without the mistake."""
-        if self.swapped:
-            return np.ascontiguousarray(points_2d[:, ::-1])
-        last = np.array([camera.width - 1.0, camera.height - 1.0])
-        return np.where(self.flipped, last - points_2d, points_2d)
-
-
-# About a centred principal point, flips are the same as a mirrored model.
-_MISTAKES = (
-    Mistake("the model is mirrored", mirrored=True),
-    Mistake("u and v are swapped", swapped=True),
-    Mistake("the photo is flipped", flipped=(True, False)),
-    Mistake("v counts from the bottom", flipped=(False, True)),
-)
-
-
-def find_mistake(
-    found: Explained, given: int, explain: Callable[[Mistake], Explained | None]
-) -> str | None:
-    """Name the mistake without which the keypoints would agree much better.
-
-    Parameters
-    ----------
-    found : Explained
-        By the estimate.
-    given : int
-        Number of keypoints.
-    explain : callable
-        What the best estimate explains after a mistake is undone; None where there is none.
-
-    Returns
-    -------
-    str or None
-        A warning; None where no mistake makes the data likelier.
-    """
-
-    def explained(mistakes: Sequence[Mistake]) -> list[tuple[Mistake, Explained]]:
-        pairs = ((mistake, explain(mistake)) for mistake in mistakes)
-        return [(mistake, each) for mistake, each in pairs if each is not None]
-
-    def is_better(each: Explained) -> bool:
-        """Likelier, and by more keypoints: outliers and wrong shapes change the likelihood, too."""
-        more = each.inliers > found.inliers or each.inliers == given
-        return more and each.score < found.score - _LEAST_GAIN
-
-    rejected = given - found.inliers
-    # Where all agree, perspective is so weak that they agree with a mirrored model if with any.
-    first = 2 if rejected else 1
-    tried = explained(_MISTAKES[:first])
-    if not any(is_better(each) for _, each in tried):
-        return None
-    tried += explained(_MISTAKES[first:])
-    best = min((each for _, each in tried if is_better(each)), key=lambda each: each.score)
-    likely = [(m.clause, each) for m, each in tried if each.score < best.score + _AS_LIKELY]
-    upright = [clause for clause, each in likely if each.up > _UPRIGHT]
-    others = [clause for clause, each in likely if each.up <= _UPRIGHT]
-    named = _listed(upright or others)
-    if upright and others:
-        named += f" (or, if y is not up in the photo, {_listed(others)})"
-    return (
-        f"{named}: corrected, {best.inliers} of {given} keypoints agree; as given, "
-        f"{rejected} ({100 * rejected / given:.0f} %) are rejected"
-    )
-
-
-def _listed(clauses: Sequence[str]) -> str:
-    *some, last = clauses
-    return f"{', '.join(some)} or {last}" if some else last
 
 
 def area_of(points_2d: FloatArray, camera: Camera, max_reproj_error: float) -> float:
@@ -149,13 +50,8 @@ def check_support(
     """Refuse an estimate whose poses have no more support together than chance gives.
 
     ``size`` keypoints determine a pose, with so many ``solutions``; ``score`` is the truncated sum
-    of squares [px^2]. ``chance`` bounds the expected number of models with as much support;
-    ``disagreeing`` are words about keypoints that disagree.
-
-    Raises
-    ------
-    NoConsensusError
-        It carries the score.
+    of squares [px^2], which the NoConsensusError carries. ``chance`` bounds the expected number of
+    models with as much support; ``disagreeing`` are words about keypoints that disagree.
     """
     logarithm = sum(min(0.0, log_expected_by_chance(each, size, solutions)) for each in supports)
     if np.isfinite(score) and logarithm <= math.log(chance):

@@ -15,7 +15,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.rotations import angle_between, vector_from_rotation
+from cadalign.geometry.rotations import angle_between, by_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, SymmetryGroup, group_of
 
@@ -28,10 +28,7 @@ _SAME_SCALE = 1e-4
 def check_symmetry(symmetry: object) -> None:
     """Check that a symmetry's motions make a group.
 
-    Raises
-    ------
-    InputError
-        If it is something else, or its motions make none.
+    Raises InputError if it is something else, or its motions make none.
     """
     if not isinstance(symmetry, Symmetry):
         what = f"expected a cadalign.Symmetry, got {type(symmetry).__name__}"
@@ -56,9 +53,8 @@ def step_to(best: Equal, given: Alignment) -> FloatArray:
     Both by the rotation vector in the camera frame, the translation and the log scales.
     """
     turn, shift = best.motion[:3, :3], best.motion[:3, 3]
-    x, y, z = given.linear @ shift
     step = np.eye(9)
-    step[3:6, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+    step[3:6, :3] = by_rotation(given.linear @ shift)
     step[3:6, 6:] = given.linear * shift
     step[6:, 6:] = (turn**2).T
     return step

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -24,6 +24,7 @@ from cadalign.errors import InputError, quote
 from cadalign.estimation.model import checked_ids
 from cadalign.estimation.options import Sigma
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import DeclaredEvidence
 from cadalign.io.images import read_grey
@@ -104,6 +105,8 @@ class View(DeclaredEvidence):
     ids: Sequence[Hashable] | None = None
     sigma: Sigma | None = 1.0
     confidences: npt.ArrayLike | None = None
+    is_numbered: bool = field(init=False, repr=False)
+    """True where no ids are given."""
 
     def __post_init__(self) -> None:
         self._check_more()
@@ -113,7 +116,9 @@ class View(DeclaredEvidence):
         _check_camera(self.camera)
         points = np.empty((0, 2)) if np.size(self.points_2d) == 0 else self.points_2d
         points = as_points(points, name="points_2d", dimension=2)
+        check_pixels(points, self.camera.width, self.camera.height, where="points_2d")
         object.__setattr__(self, "points_2d", read_only(points))
+        object.__setattr__(self, "is_numbered", self.ids is None)
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
         if self.depth is not None:
             depth = checked_depth(self.depth, self.camera, len(points), self.depth_scale)
@@ -170,10 +175,7 @@ def _check_camera(camera: object) -> None:
 def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:
     """Depths of the keypoints (n,), or a depth image (h, w); NaN where unknown.
 
-    Raises
-    ------
-    InputError
-        If it has neither shape, or a depth is negative.
+    Raises InputError if it has neither shape, or a depth is negative.
     """
     factor = None if scale is None else as_positive(scale, name="depth_scale")
     if isinstance(given, str | os.PathLike):
@@ -206,10 +208,7 @@ def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -
 def checked_depth_sigma(sigma: npt.ArrayLike, depth: object, count: int) -> None:
     """Check the relative standard deviation of depths.
 
-    Raises
-    ------
-    InputError
-        If it is not positive, or neither one nor one per depth.
+    Raises InputError if it is not positive, or neither one nor one per depth.
     """
     relative = np.asarray(sigma, dtype=np.float64)
     shapes = [()] if isinstance(depth, np.ndarray) and depth.ndim == 2 else [(), (count,)]
@@ -220,10 +219,7 @@ def checked_depth_sigma(sigma: npt.ArrayLike, depth: object, count: int) -> None
 def checked_mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
     """A mask (h, w): bool, or probabilities.
 
-    Raises
-    ------
-    InputError
-        If it has another size than the camera, or holds other values.
+    Raises InputError if it has another size than the camera, or holds other values.
     """
     is_file = isinstance(given, str | os.PathLike)
     mask = read_grey(Path(given)) != 0 if is_file else np.asarray(given)
@@ -243,10 +239,7 @@ def checked_mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
 def checked_up_sigma(sigma: Any) -> None:
     """Check the standard deviation of a direction, or its covariance (3, 3).
 
-    Raises
-    ------
-    InputError
-        If it is neither positive nor a covariance.
+    Raises InputError if it is neither positive nor a covariance.
     """
     if np.ndim(sigma) == 0:
         if not is_number(sigma) or not sigma > 0:

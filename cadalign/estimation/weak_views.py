@@ -54,10 +54,7 @@ def views_without_pose(
 def check_first(without_pose: Sequence[int]) -> None:
     """Refuse a first view that is left out, for its camera's frame is that of the result.
 
-    Raises
-    ------
-    DegenerateError
-        If it is among the numbers.
+    Raises DegenerateError if it is among the numbers.
     """
     if 0 in without_pose:
         raise DegenerateError(

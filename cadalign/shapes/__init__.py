@@ -9,16 +9,6 @@ if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel
     from cadalign.shapes.warp import LinearWarp, linear_warp, warp_mesh
 
-__all__ = [
-    "Example",
-    "LinearWarp",
-    "ShapeModel",
-    "linear_warp",
-    "warp_mesh",
-]
+__all__ = ["Example", "LinearWarp", "ShapeModel", "linear_warp", "warp_mesh"]
 
 __getattr__ = lazy_names(__name__)
-
-
-def __dir__() -> list[str]:
-    return __all__

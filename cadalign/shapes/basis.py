@@ -1,13 +1,16 @@
-"""Shape components from given means, modes and covariances."""
+"""Shape components from given means, modes and covariances, and from a mirror symmetry."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError
-from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
+from cadalign.shapes.parts import AXES, BOX_ROWS, KeypointId, Reflection, ShapeComponent
 
 # Rounding leaves eigenvalues this far below zero, relative to the largest.
 _NEGATIVE = 1e-8
@@ -46,20 +49,9 @@ def component_of_covariance(
 ) -> ShapeComponent:
     """Make a component from a covariance: its largest eigenvectors are the modes.
 
-    The variance that they leave is spread evenly over the coordinates.
-
-    Parameters
-    ----------
-    mean : (m + 2, 3) float
-    covariance : (3 (m + 2), 3 (m + 2)) float
-    weight : float
-    modes : int, optional
-        Number of modes; by default all of positive variance.
-
-    Raises
-    ------
-    InputError
-        If the covariance is not finite, symmetric and positive semi-definite.
+    ``mean`` is (m + 2, 3), ``covariance`` (3 (m + 2), 3 (m + 2)); by default all modes of positive
+    variance are taken. The variance that they leave is spread evenly over the coordinates. Raises
+    InputError if the covariance is not finite, symmetric and positive semi-definite.
     """
     matrix = as_floats(covariance, name=where, shape=(mean.size, mean.size))
     largest = np.abs(matrix).max()
@@ -130,3 +122,72 @@ def orthogonal(modes: FloatArray, count: int) -> FloatArray:
     _, lengths, directions = np.linalg.svd(modes.reshape(len(modes), -1), full_matrices=False)
     keep = lengths > 1e-12 * max(float(lengths[0]), 1e-300)
     return np.asarray((lengths[keep, None] * directions[keep]).reshape(-1, count, 3))
+
+
+_ROUNDS = 10  # of pairing keypoints and moving the mirror; 3 suffice as a rule
+
+
+def find_reflection(completed: FloatArray, ids: Sequence[KeypointId], axis: int) -> Reflection:
+    """Find the pairs of keypoints that a mirror across an axis exchanges best.
+
+    Keypoints are paired such that the squared distances between the mirrored keypoints and their
+    partners, over all models, are least, in turns with the place of the mirror. ``completed`` (N, m
+    + 2, 3) are keypoints and box corners of the models, none missing; ``axis`` is 0, 1 or 2.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    points = completed[:, :-BOX_ROWS]
+    offset = float(completed[:, -BOX_ROWS:, axis].mean())
+    partner = np.arange(len(ids))
+    for _ in range(_ROUNDS):
+        mirrored = points.copy()
+        mirrored[..., axis] = 2 * offset - mirrored[..., axis]
+        gaps = ((mirrored[:, :, None] - points[:, None, :]) ** 2).sum(axis=3).mean(axis=0)
+        _, found = linear_sum_assignment(gaps + gaps.T)
+        # A mirror undoes itself; a longer cycle of keypoints is none.
+        found = np.where(found[found] == np.arange(len(ids)), found, np.arange(len(ids)))
+        midpoints = (points[..., axis] + points[:, found, axis]) / 2
+        # The median, since keypoints without a partner may lie off the mirror.
+        offset = float(np.median(midpoints.mean(axis=0)))
+        if (found == partner).all():
+            break
+        partner = found
+    partners = enumerate(partner.tolist())
+    pairs = tuple((ids[row], ids[other]) for row, other in partners if row < other)
+    return Reflection(AXES[axis], offset, pairs)
+
+
+def mirrored_rows(
+    rows: FloatArray, ids: Sequence[KeypointId], reflection: Reflection
+) -> FloatArray:
+    """Mirror models' keypoints and box corners, (N, m + 2, 3) float, NaN where missing."""
+    mirrored = mirrored_motions(rows, ids, reflection)
+    mirrored[..., AXES.index(reflection.axis)] += 2 * reflection.offset
+    return mirrored
+
+
+def mirrored_motions(
+    motions: FloatArray, ids: Sequence[KeypointId], reflection: Reflection
+) -> FloatArray:
+    """Mirror displacements of models' keypoints and box corners, (N, m + 2, 3) float."""
+    axis = AXES.index(reflection.axis)
+    exchanged = motions[:, [*reflection.partners(ids), -BOX_ROWS, -1]]
+    exchanged[..., axis] = -exchanged[..., axis]
+    exchanged[:, [-BOX_ROWS, -1], axis] = exchanged[:, [-1, -BOX_ROWS], axis]
+    return exchanged
+
+
+def symmetric_component(
+    component: ShapeComponent, ids: Sequence[KeypointId], reflection: Reflection
+) -> ShapeComponent:
+    """Make a component symmetric: an object is as likely as its mirror image.
+
+    Mean and covariance are the average of the component's own and of the mirrored ones.
+    """
+    mean, modes = component.mean, component.modes
+    mirrored = mirrored_motions(modes, ids, reflection)
+    return replace(
+        component,
+        mean=(mean + mirrored_rows(mean[None], ids, reflection)[0]) / 2,
+        modes=orthogonal(np.concatenate([modes, mirrored]) / np.sqrt(2), len(mean)),
+    )

@@ -24,19 +24,8 @@ _OUTWARD = np.array([[-1.0], [1.0]])
 class BoxMargins:
     """Distances between the faces of objects' boxes, their keypoints, and linear boxes.
 
-    Parameters
-    ----------
-    margins : (2, 3) float
-        Median distance of the least and the greatest face along x, y, z beyond the outermost
-        keypoint [model units].
-    tolerances : (2, 3) float
-        How far beyond the true face the linear box, given all keypoints, lies in one held-out
-        object of twenty [model units].
-
-    Raises
-    ------
-    InputError
-        If a shape is wrong, or a value is NaN, infinite or, of the tolerances, negative.
+    Raises InputError if a shape is wrong, or a value is NaN, infinite or, of the tolerances,
+    negative.
 
     Examples
     --------
@@ -50,7 +39,11 @@ class BoxMargins:
     """
 
     margins: FloatArray
+    """(2, 3), median distance of the least and the greatest face along x, y, z beyond the outermost
+    keypoint [model units]."""
     tolerances: FloatArray
+    """(2, 3), how far beyond the true face the linear box, given all keypoints, lies in one
+    held-out object of twenty [model units]."""
 
     def __post_init__(self) -> None:
         for name in ("margins", "tolerances"):

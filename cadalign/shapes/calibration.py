@@ -20,9 +20,8 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.shapes.gaussians import Gaussians
-from cadalign.shapes.inflation import FEW, FewKeypoints
 from cadalign.shapes.parts import BOX_ROWS
-from cadalign.shapes.tails import probability_within
+from cadalign.shapes.tails import FEW, FewKeypoints, probability_within
 
 _FACTORS = np.geomspace(1.0, 3.0, 12)  # deviations are never narrowed; the first is no factor
 _DEGREES_OF_FREEDOM = (None, 20.0, 10.0, 7.0, 5.0, 4.0, 3.0)
@@ -57,24 +56,13 @@ class _View(NamedTuple):
 def calibrate(
     parts: Iterable[tuple[FloatArray, Gaussians]], *, sigma: float, rng: np.random.Generator
 ) -> Calibration:
-    """Find the deviations and tails at which held-out truths lie where they should.
+    """Find the factor and tails at which held-out truths lie where they should.
 
-    Shares of truths in regions of rotations and of keypoints, given or not, are to depart least
-    from their nominal probabilities, in the sum of squares.
-
-    Parameters
-    ----------
-    parts : iterable of ((N, m + 2, 3) float, Gaussians)
-        Models, NaN for what they lack, and the mixture learned without them.
-    sigma : float
-        Standard deviation of the image's noise [model units].
-    rng : Generator
-        Source of the directions, the keypoints that are given, and the noise.
-
-    Returns
-    -------
-    Calibration
-        The factor is 1 or more. Gaussian with a factor of 1 if no model has enough keypoints.
+    Shares of truths in regions of rotations and of keypoints, given or not, are to differ least
+    from their nominal probabilities, in the sum of squares. ``parts`` are models (N, m + 2, 3), NaN
+    for what they lack, with the mixture learned without them; ``sigma`` is the standard deviation
+    of the image's noise [model units]; ``rng`` draws directions, given keypoints and noise. The
+    factor is 1 or more; without a model of enough keypoints it is 1, and errors are Gaussian.
     """
     every, few, counts = _Errors([], []), _Errors([], []), []
     for rows, mixture in parts:

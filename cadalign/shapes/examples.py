@@ -22,19 +22,6 @@ logger = logging.getLogger("cadalign")
 class Example:
     """One model to learn from.
 
-    Parameters
-    ----------
-    model_id : str
-        Its name, for messages and to find it again.
-    ids : (n,) int or str
-        Semantic ids or names of its keypoints.
-    points_3d : (n, 3) float
-        The keypoints [model units].
-    bounds : (2, 3) float, optional
-        The least and the greatest corner of its bounding box [model units].
-    mesh_path : Path, optional
-        Its mesh.
-
     Raises
     ------
     InputError
@@ -43,10 +30,15 @@ class Example:
     """
 
     model_id: str
+    """Its name, for messages and to find it again."""
     ids: Sequence[KeypointId]
+    """(n,) int or str, semantic ids or names of its keypoints."""
     points_3d: FloatArray
+    """(n, 3), the keypoints [model units]."""
     bounds: FloatArray | None = None
+    """(2, 3), the least and the greatest corner of its bounding box [model units]."""
     mesh_path: Path | None = None
+    """Its mesh."""
 
     def __post_init__(self) -> None:
         where = f"model {self.model_id}"
@@ -116,21 +108,11 @@ def examples_of(
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Models as rows of one array.
+    """Models as rows of one array."""
 
-    Parameters
-    ----------
-    ids : tuple of int or str
-        All ids that a model has, sorted.
-    rows : (N, m + 2, 3) float
-        Keypoints and box corners; NaN for what a model lacks.
-    shapes : TrainingShapes
-        The models' ids, keypoints and meshes.
-    """
-
-    ids: tuple[KeypointId, ...]
-    rows: FloatArray
-    shapes: TrainingShapes
+    ids: tuple[KeypointId, ...]  # all ids that a model has, sorted
+    rows: FloatArray  # (N, m + 2, 3), keypoints and box corners; NaN for what a model lacks
+    shapes: TrainingShapes  # the models' ids, keypoints and meshes
 
     @classmethod
     def of(cls, examples: Sequence[Example], *, least: int) -> Table:

@@ -20,19 +20,11 @@ _UNSEEN = 1e-6  # weight of the previous mean: a component without vectors stays
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """A mixture of Gaussians.
+    """A mixture of Gaussians."""
 
-    Parameters
-    ----------
-    weights : (g,) float
-        Sum to 1.
-    means : (g, d) float
-    covariances : (g, d, d) float
-    """
-
-    weights: FloatArray
-    means: FloatArray
-    covariances: FloatArray
+    weights: FloatArray  # (g,), sum to 1
+    means: FloatArray  # (g, d)
+    covariances: FloatArray  # (g, d, d)
 
     def widened(self, sigma: float) -> Gaussians:
         """The distribution of the vectors with independent noise in every entry."""
@@ -42,57 +34,29 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """Prior on the covariances.
+    """Prior on the covariances."""
 
-    Parameters
-    ----------
-    covariance : (d, d) float
-        What the covariances are drawn towards.
-    strength : float
-        How many vectors it counts as.
-    floor : float
-        Standard deviation that no direction falls below.
-    """
-
-    covariance: FloatArray
-    strength: float
-    floor: float
+    covariance: FloatArray  # (d, d), what the covariances are drawn towards
+    strength: float  # how many vectors it counts as
+    floor: float  # standard deviation that no direction falls below
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Vectors that have the same entries.
+    """Vectors that have the same entries."""
 
-    Parameters
-    ----------
-    rows : (r,) int
-        Which vectors.
-    seen, missing : (n,) and (d - n,) int
-        The entries that they have and lack.
-    values : (r, n) float
-        What they have.
-    """
-
-    rows: IntArray
-    seen: IntArray
-    missing: IntArray
-    values: FloatArray
+    rows: IntArray  # (r,), which vectors
+    seen: IntArray  # (n,), the entries that they have
+    missing: IntArray  # (d - n,), the entries that they lack
+    values: FloatArray  # (r, n), what they have
 
 
 @dataclass(frozen=True, eq=False)
 class Vectors:
-    """Weighted vectors with missing entries.
+    """Weighted vectors with missing entries."""
 
-    Parameters
-    ----------
-    values : (N, d) float
-        NaN for what is missing; every vector has an entry.
-    weights : (N,) float
-        How often each vector counts.
-    """
-
-    values: FloatArray
-    weights: FloatArray
+    values: FloatArray  # (N, d), NaN for what is missing; every vector has an entry
+    weights: FloatArray  # (N,), how often each vector counts
 
     @cached_property
     def patterns(self) -> tuple[Pattern, ...]:
@@ -156,18 +120,9 @@ def learn_mixture(
 ) -> Gaussians:
     """Learn a mixture from a first clustering.
 
-    Covariances are drawn towards their mean over the components.
-
-    Parameters
-    ----------
-    vectors : Vectors
-    labels : (N,) int
-        The component that each vector starts in.
-    common : Gaussians
-        The Gaussian of all vectors, from which the components start.
-    strength, floor : float
-        See `Prior`.
-    rounds : int
+    ``labels`` (N,) are the components that the vectors start in, ``common`` is the Gaussian of all,
+    from which the components start. Covariances are drawn towards their mean over the components;
+    for ``strength`` and ``floor`` see `Prior`.
     """
     count = int(labels.max()) + 1
     model = Gaussians(

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
-from cadalign.shapes.basis import component_of_covariance
+from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
 from cadalign.shapes.box_margins import BoxMargins, excesses_of, learn_margins
 from cadalign.shapes.calibration import Calibration, calibrate
 from cadalign.shapes.gaussians import (
@@ -29,7 +29,6 @@ from cadalign.shapes.gaussians import (
     log_likelihoods,
 )
 from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent
-from cadalign.shapes.reflections import find_reflection, mirrored_rows
 
 LEAST_MODELS = 4
 # Lengths relative to the models' median diagonal.
@@ -88,20 +87,11 @@ class _Recipe:
 
 @dataclass(frozen=True, eq=False)
 class _Models:
-    """Models to learn from.
+    """Models to learn from."""
 
-    Parameters
-    ----------
-    ids : (m,) int or str
-    rows : (N, m + 2, 3) float
-        Keypoints and box corners, NaN where missing.
-    size : float
-        Their median diagonal.
-    """
-
-    ids: Sequence[KeypointId]
-    rows: FloatArray
-    size: float
+    ids: Sequence[KeypointId]  # (m,) int or str
+    rows: FloatArray  # (N, m + 2, 3), keypoints and box corners, NaN where missing
+    size: float  # their median diagonal
 
     def some(self, chosen: BoolArray) -> _Models:
         """A part of the models."""
@@ -148,19 +138,11 @@ class _Models:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A recipe, what is learned by it without each fold, and how likely that makes the folds.
-
-    Parameters
-    ----------
-    recipe : _Recipe
-    learned : tuple of Gaussians
-    scores : (N,) float
-        Log-likelihood of each model under what was learned without its fold.
-    """
+    """A recipe, what is learned by it without each fold, and how likely that makes the folds."""
 
     recipe: _Recipe
     learned: tuple[Gaussians, ...]
-    scores: FloatArray
+    scores: FloatArray  # (N,), log-likelihood of each model under what was learned without its fold
 
 
 class _Choice(NamedTuple):

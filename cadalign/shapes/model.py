@@ -14,10 +14,9 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import in_file
-from cadalign.shapes.basis import component_of_basis, component_of_covariance
+from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.examples import Dataset, Example, Table, examples_of
-from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.learning import LEAST_MODELS, LearnOptions, learn_components
 from cadalign.shapes.parts import (
     BOX_ROWS,
@@ -31,8 +30,8 @@ from cadalign.shapes.parts import (
     check_ids,
 )
 from cadalign.shapes.plots import shape_html
-from cadalign.shapes.reflections import symmetric_component
 from cadalign.shapes.shape_file import ShapeFields, read_shape, write_shape
+from cadalign.shapes.tails import FewKeypoints
 
 OnProgress = Callable[[int, int], object]
 """Called with the number of steps that are done and that of all."""
@@ -45,38 +44,6 @@ class ShapeModel:
     `ShapeModel.learn` and `ShapeModel.from_dataset` learn one from models, `ShapeModel.from_basis`
     and `ShapeModel.from_covariance` make one from given numbers, `ShapeModel.open` reads one that
     `ShapeModel.save` wrote.
-
-    Parameters
-    ----------
-    category : str
-    ids : tuple of int or str
-        Semantic ids or names of the m keypoints, in the order of the components' rows; sorted if
-        they were learned.
-    components : tuple of ShapeComponent
-        The mixture; weights sum to 1.
-    has_box : bool
-        Whether the rows of the box were learned or given; otherwise they are the extent of the
-        mean's keypoints and move with these.
-    up_axis : "x", "y", "z" or None
-        The model axis that points up, None where it is not known.
-    reflection : Reflection, optional
-        The mirror symmetry of the category.
-    training : TrainingShapes, optional
-        The models that it was learned from.
-    unit : str
-        Unit of lengths: "diagonal" for KeypointNet's models, "m" for metres.
-    inflation : float
-        Factor of the shapes' standard deviations in stated covariances: the one at which, while it
-        was learned, the regions of held-out models held the truth as often as they said. Estimates
-        don't depend on it.
-    degrees_of_freedom : float, optional
-        Tails of the t distribution that the errors of estimates follow, found likewise: more
-        than 2, None if they are Gaussian. Covariances are those of the errors in any case.
-    few_keypoints : FewKeypoints, optional
-        Decrease of the inflation where few keypoints are given, found likewise; None for none.
-    box_margins : BoxMargins, optional
-        Where the faces of boxes are beyond the keypoints; None if that is not known, and boxes are
-        the learned ones, enlarged by the given keypoints.
 
     Raises
     ------
@@ -100,16 +67,33 @@ class ShapeModel:
 
     category: str
     ids: tuple[KeypointId, ...]
+    """Semantic ids or names of the m keypoints, in the order of the components' rows; sorted if
+    they were learned."""
     components: tuple[ShapeComponent, ...]
+    """The mixture; weights sum to 1."""
     has_box: bool = True
+    """Whether the rows of the box were learned or given; otherwise they are the extent of the
+    mean's keypoints and move with these."""
     up_axis: Literal["x", "y", "z"] | None = None
+    """The model axis that points up, None where it is not known."""
     reflection: Reflection | None = None
+    """The mirror symmetry of the category."""
     training: TrainingShapes | None = None
+    """The models that it was learned from."""
     unit: str = "model units"
+    """Unit of lengths: "diagonal" for KeypointNet's models, "m" for metres."""
     inflation: float = 1.0
+    """Factor of the shapes' standard deviations in stated covariances: the one at which, while it
+    was learned, the regions of held-out models held the truth as often as they said. Estimates
+    don't depend on it."""
     degrees_of_freedom: float | None = None
+    """Tails of the t distribution that the errors of estimates follow, found likewise: more than 2,
+    None if they are Gaussian. Covariances are those of the errors in any case."""
     box_margins: BoxMargins | None = None
+    """Where the faces of boxes are beyond the keypoints; None if that is not known, and boxes are
+    the learned ones, enlarged by the given keypoints."""
     few_keypoints: FewKeypoints | None = None
+    """Decrease of the inflation where few keypoints are given, found likewise; None for none."""
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
@@ -319,12 +303,7 @@ class ShapeModel:
         (2, 6, 3)
         """
         component = component_of_basis(
-            mean,
-            modes,
-            deviations,
-            box=box,
-            residual_sigma=residual_sigma,
-            size_sigma=size_sigma,
+            mean, modes, deviations, box=box, residual_sigma=residual_sigma, size_sigma=size_sigma
         )
         labels = _given_ids(ids, names, len(component.mean) - BOX_ROWS)
         if reflection is not None:

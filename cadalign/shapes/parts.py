@@ -27,27 +27,19 @@ class ShapeComponent:
     Shapes are ``mean + sum_k c_k modes[k] + e``, with coefficients ``c`` of unit variance and a
     residual ``e`` of the same variance in every coordinate.
 
-    Parameters
-    ----------
-    weight : float
-        Its share in the mixture.
-    mean : (m + 2, 3) float
-        The m keypoints, then the least and the greatest corner of the bounding box [model units].
-    modes : (K, m + 2, 3) float
-        Directions of deformation, one standard deviation long, the longest first [model units].
-    residual_sigma : float
-        Standard deviation, per coordinate, of what the modes leave [model units].
-
-    Raises
-    ------
-    InputError
-        If a shape is wrong, a value is NaN, infinite or negative, or the weight is not in (0, 1].
+    Raises InputError if a shape is wrong, a value is NaN, infinite or negative, or the weight is
+    not in (0, 1].
     """
 
-    weight: float
+    weight: float  # its share in the mixture
     mean: FloatArray
+    """(m + 2, 3), the m keypoints, then the least and the greatest corner of the bounding box
+    [model units]."""
     modes: FloatArray
+    """(K, m + 2, 3), directions of deformation, one standard deviation long, the longest first
+    [model units]."""
     residual_sigma: float
+    """Standard deviation, per coordinate, of what the modes leave [model units]."""
 
     def __post_init__(self) -> None:
         mean = as_floats(self.mean, name="mean", shape=(None, 3))
@@ -89,21 +81,12 @@ class ShapeGaussians(NamedTuple):
 
 @dataclass(frozen=True)
 class Reflection:
-    """A category's mirror symmetry: mirrored objects are as likely as the objects themselves.
+    """A category's mirror symmetry: mirrored objects are as likely as the objects themselves."""
 
-    Parameters
-    ----------
-    axis : str
-        "x", "y" or "z": the axis across which the objects are mirrored.
-    offset : float
-        Where the mirror stands on that axis [model units].
-    pairs : tuple of pairs of ids
-        The keypoints that exchange places; the others are their own mirror image.
-    """
-
-    axis: str
-    offset: float
+    axis: str  # "x", "y" or "z": the axis across which the objects are mirrored
+    offset: float  # where the mirror stands on that axis [model units]
     pairs: tuple[tuple[KeypointId, KeypointId], ...]
+    """The keypoints that exchange places; the others are their own mirror image."""
 
     def __post_init__(self) -> None:
         check_axis(self.axis, "axis")
@@ -135,25 +118,14 @@ class Reflection:
 class TrainingShapes:
     """The keypoints of the models that a shape model was learned from.
 
-    Parameters
-    ----------
-    model_ids : tuple of str
-        One for each model.
-    points_3d : (N, m, 3) float32
-        Their keypoints in the order of the shape model's ids [model units]; NaN where a model
-        lacks one.
-    mesh_paths : tuple of Path or None
-        Their meshes.
-
-    Raises
-    ------
-    InputError
-        If lengths or shapes don't match, or a coordinate is infinite.
+    Raises InputError if lengths or shapes don't match, or a coordinate is infinite.
     """
 
-    model_ids: tuple[str, ...]
+    model_ids: tuple[str, ...]  # one for each model
     points_3d: npt.NDArray[np.float32]
-    mesh_paths: tuple[Path | None, ...]
+    """(N, m, 3) float32, their keypoints in the order of the shape model's ids [model units]; NaN
+    where a model lacks one."""
+    mesh_paths: tuple[Path | None, ...]  # their meshes
 
     def __post_init__(self) -> None:
         points = np.ascontiguousarray(self.points_3d, dtype=np.float32)
@@ -174,23 +146,16 @@ class TrainingShapes:
 
 @dataclass(frozen=True, eq=False)
 class NearestShape:
-    """The training model whose keypoints are nearest to given ones.
-
-    Parameters
-    ----------
-    model_id : str
-    points_3d : (m, 3) float
-        Its keypoints in the order of the shape model's ids [model units]; NaN where it lacks one.
-    mesh_path : Path or None
-    distance : float
-        Root of the mean squared distance of the keypoints [model units]; for those that the model
-        lacks the distance expected in the category.
-    """
+    """The training model whose keypoints are nearest to given ones."""
 
     model_id: str
     points_3d: FloatArray
+    """(m, 3), its keypoints in the order of the shape model's ids [model units]; NaN where it lacks
+    one."""
     mesh_path: Path | None
     distance: float
+    """Root of the mean squared distance of the keypoints [model units]; for those that the model
+    lacks the distance expected in the category."""
 
 
 def check_axis(axis: object, where: str) -> None:

@@ -21,8 +21,8 @@ from cadalign.io.documents import Count, Document, Finite, Index, NotNegative, P
 from cadalign.io.files import read_bytes
 from cadalign.io.sealed import Seal
 from cadalign.shapes.box_margins import BoxMargins
-from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent, TrainingShapes
+from cadalign.shapes.tails import FewKeypoints
 
 SEAL = Seal(
     magic=b"cadalign shape\n\0",

@@ -29,11 +29,7 @@ _LEAST_STRETCH = 0.1  # relative to that of all axes together
 
 
 def warp_mesh(
-    mesh: Mesh,
-    source: npt.ArrayLike,
-    target: npt.ArrayLike,
-    *,
-    bounds: npt.ArrayLike | None = None,
+    mesh: Mesh, source: npt.ArrayLike, target: npt.ArrayLike, *, bounds: npt.ArrayLike | None = None
 ) -> Mesh:
     """Warp a mesh such that its keypoints come to given places.
 

@@ -17,7 +17,3 @@ if TYPE_CHECKING:
 __all__ = ["aepnp", "aepnp_paper", "ap4p", "epnp"]
 
 __getattr__ = lazy_names(__name__)
-
-
-def __dir__() -> list[str]:
-    return __all__

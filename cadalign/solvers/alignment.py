@@ -22,15 +22,7 @@ from cadalign.solvers.evidence import (
     scale_prior_cost,
 )
 from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
-from cadalign.solvers.search import (
-    are_same,
-    cost_at,
-    evaluate,
-    move,
-    room_of,
-    score_of,
-    solve,
-)
+from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
 from cadalign.solvers.unknowns import hold_fixed, move_pose, uncenter
 
 _LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one

@@ -15,12 +15,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, fast_sums, inlined, kernel
 from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.linalg import Triple, copy_into
-from cadalign.solvers.projection import (
-    Scalars,
-    project_point,
-    scalars_of,
-    write_derivatives,
-)
+from cadalign.solvers.projection import Scalars, project_point, scalars_of, write_derivatives
 
 BLOCK = 32
 """Points whose derivatives are written before their products are summed."""

@@ -15,7 +15,6 @@ from cadalign.compile import inlined, kernel
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pixels import perspective
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, UNKNOWNS
 from cadalign.solvers.linalg import Triple, cross, dot
 from cadalign.solvers.unknowns import is_pose
@@ -203,25 +202,17 @@ def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignm
     In pixels per rad, model unit, and unit of a logarithm. Refuses points behind the camera.
     """
     in_camera = alignment.apply(points_3d)
-    if not (in_camera[:, 2] > 0).all():
+    if not camera.sees(in_camera).all():
         raise InputError("a point lies behind the camera", where="points_3d")
-    rays = perspective(in_camera)
-    of_rays = np.zeros((len(rays), 2, _OF_A_RESULT))
-    # The kernel knows the first axis, and gives the derivatives by the scales of the other two.
-    for order, last in (([0, 1, 2], [7, 8]), ([2, 0, 1], [6, 7])):
-        ordered = Alignment(
-            alignment.rotation[:, order],
-            alignment.translation,
-            alignment.scale[order],
-            is_valid=True,
-        )
-        of_rays[:, :, [0, 1, 2, 3, 4, 5, *last]] = ray_derivatives(
-            np.ascontiguousarray(points_3d[:, order], float), ordered.packed
-        )
-    to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
-    jacobian = to_pixels @ of_rays
-    jacobian[:, :, 9] = camera.pixels_from_normalized(rays) - (camera.cx, camera.cy)
-    return np.asarray(jacobian)
+    stretched = points_3d * alignment.scale
+    turned = stretched @ alignment.rotation.T
+    jacobian = np.empty((len(points_3d), 2, _OF_A_RESULT))
+    by_point = camera.projection_slopes(in_camera)
+    jacobian[:, :, :3] = np.cross(turned[:, None], by_point)
+    jacobian[:, :, 3:6] = by_point
+    jacobian[:, :, 6:9] = by_point @ (alignment.rotation * stretched[:, None])
+    jacobian[:, :, 9] = camera.pixels_of_rays(in_camera) - (camera.cx, camera.cy)
+    return jacobian
 
 
 def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -14,8 +14,8 @@ from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsen
 from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
 from cadalign.shapes.box_margins import BoxMargins
-from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.tails import FewKeypoints
 
 CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
 LOOK = np.array([[0.8, 0.0, 0.6], [0.36, -0.8, -0.48], [0.48, 0.6, -0.64]])
@@ -409,7 +409,8 @@ def test_a_damaged_result_is_refused_by_field() -> None:
         (lambda: View(CAMERA, [[1, 2]], up=[0, 0, 0]), "up: a direction must not be zero"),
         (
             lambda: align(
-                Model(points_3d=np.eye(3)), View(Camera.without_focal(640, 480), np.eye(3)[:, :2])
+                Model(points_3d=np.eye(3)),
+                View(Camera.without_focal(640, 480), 9 * np.eye(3)[:, :2]),
             ),
             "camera: the focal length is unknown",
         ),

@@ -135,7 +135,10 @@ def test_the_focal_length_of_a_far_flat_object_is_uncertain(model: str, folder: 
     points = np.array(model_of("held", None).points_3d)[rows]  # type: ignore[union-attr]
     pixels = camera.project(far.apply(points)) + np.random.default_rng(0).normal(size=(7, 2))
     view = View(Camera.without_focal(480, 360), pixels, ids=rows)
-    result = align(model_of(model, None), view, focal="estimate")
+    usual = align(model_of(model, None), view, focal="estimate")
+    assert usual.std is not None
+    assert 0.3 < usual.std.focal < 0.7
+    result = align(model_of(model, None), view, focal="estimate", focal_prior=None)
     assert result.std is not None
     assert result.std.focal > 0.5
     assert any("the focal length is known only to" in text for text in result.warnings)

@@ -14,7 +14,19 @@ from scipy.optimize import least_squares
 from support.covariances import of_unknowns
 from support.problems import LENS, assert_same, moved, problem_of, with_outliers
 
-from cadalign import Alignment, Camera, FocalPrior, RansacOptions, Result, fit, fit_batch
+from cadalign import (
+    Alignment,
+    Camera,
+    FocalPrior,
+    Model,
+    RansacOptions,
+    Result,
+    View,
+    align,
+    align_batch,
+    fit,
+    fit_batch,
+)
 from cadalign.datasets import Bundler, Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation import focal_search
@@ -28,7 +40,9 @@ LONG = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 
 
 def fit_unknown(problem: Problem, camera: Camera = UNKNOWN, **options: Any) -> Result:
-    return fit(problem.points_3d, problem.points_2d, camera, focal="estimate", **options)
+    """Fit what keypoints alone say of the focal length."""
+    chosen = {"focal": "estimate", "focal_prior": None, **options}
+    return fit(problem.points_3d, problem.points_2d, camera, **chosen)
 
 
 def whitened(
@@ -72,7 +86,11 @@ def test_errors_reach_the_cramer_rao_bound_of_nine_unknowns() -> None:
     rng = np.random.default_rng(3)
     problems = [simulate_problem(rng, points=50, noise_px=1.0) for _ in range(500)]
     batch = fit_batch(
-        [p.points_3d for p in problems], [p.points_2d for p in problems], UNKNOWN, focal="estimate"
+        [p.points_3d for p in problems],
+        [p.points_2d for p in problems],
+        UNKNOWN,
+        focal="estimate",
+        focal_prior=None,
     )
     assert batch.solved.all()
     errors, limits = [], []
@@ -269,7 +287,9 @@ def test_focal_length_that_nothing_determines_is_said_so() -> None:
     plane = np.random.default_rng(0).uniform(-1, 1, (20, 3)) * [1, 1, 0]
     facing = Alignment(np.eye(3), [0.1, 0.0, 5.0], [1, 1, 1])
     points_2d = LONG.project(facing.apply(plane))
-    result = fit(plane, points_2d, UNKNOWN, focal="estimate", stretch="none", sigma=0.5)
+    result = fit(
+        plane, points_2d, UNKNOWN, focal="estimate", focal_prior=None, stretch="none", sigma=0.5
+    )
     assert result.std is not None
     assert result.std.focal > 1.0
     assert any(
@@ -286,7 +306,7 @@ def test_end_of_the_searched_range_is_said_so() -> None:
     flat = 100 * points[:, :2] + [320, 240]  # seen from infinitely far
     flat += np.random.default_rng(0).normal(size=flat.shape)
     seen = [
-        fit(points, flat + shift, UNKNOWN, focal="estimate")
+        fit(points, flat + shift, UNKNOWN, focal="estimate", focal_prior=None)
         for shift in np.random.default_rng(1).normal(size=(8, 12, 2))
     ]
     ends = [result for result in seen if result.camera.fx == pytest.approx(50 * 640)]
@@ -351,9 +371,61 @@ def test_prior_that_the_keypoints_contradict_is_said_so() -> None:
     result = fit_unknown(problem, sigma=0.1, focal_prior=FocalPrior(220.0, 0.05))
     assert any(
         text.startswith("the keypoints contradict the focal length's prior: 1")
-        and text.endswith(" px instead of 220 px +-5 %")
+        and text.endswith(" px instead of 220 px +- 5 %")
         for text in result.warnings
     )
+
+
+def test_prior_of_usual_lenses_is_the_default_and_is_told() -> None:
+    problem = problem_of(2, points=20, noise_px=1.0, camera=LONG, depth=(6.0, 9.0))
+    usual = FocalPrior.of_usual_lenses(640, 480)
+    result = fit(problem.points_3d, problem.points_2d, UNKNOWN, focal="estimate")
+    assert result.focal_prior == usual
+    assert f"(prior: {usual})" in str(result)
+    assert result.camera == fit_unknown(problem, focal_prior=usual).camera
+    assert result.camera != fit_unknown(problem).camera
+    assert fit(problem.points_3d, problem.points_2d, LONG).focal_prior is None
+    view = View(UNKNOWN, problem.points_2d)
+    learned = align(Model(points_3d=problem.points_3d, shape_sigma=0.01), view, focal="estimate")
+    assert learned.focal_prior == usual
+    (of_batch,) = align_batch(
+        Model(points_3d=problem.points_3d), [view], focal="estimate", focal_prior=None
+    )
+    assert isinstance(of_batch, Result)
+    assert of_batch.focal_prior is None
+
+
+def test_usual_lenses_of_a_batch_are_those_of_each_image() -> None:
+    problems = [
+        problem_of(seed, points=12, camera=Camera.from_fov(width, 480, fov_x=40.0))
+        for seed, width in enumerate((640, 1280))
+    ]
+    cameras = [Camera.without_focal(p.camera.width, 480) for p in problems]
+    points = [p.points_3d for p in problems], [p.points_2d for p in problems]
+    batch = fit_batch(*points, cameras, focal="estimate")
+    for b, camera in enumerate(cameras):
+        single = fit(problems[b].points_3d, problems[b].points_2d, camera, focal="estimate")
+        assert batch.focal_length[b] == single.camera.fx
+        assert single.focal_prior == FocalPrior.of_usual_lenses(camera.width, 480)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("points", [8, 20])
+def test_focal_lengths_with_the_usual_prior_are_as_uncertain_as_stated(points: int) -> None:
+    """Photos whose lenses are those of the distribution that the prior's docstring names."""
+    rng = np.random.default_rng(5)
+    inside = []
+    for seed in range(200):
+        focal = 640 / 36 * min(14 + 17 * float(np.exp(0.8 * rng.normal())), 140.0)
+        distance = 2.5 * focal / 240  # fills a half of the image
+        camera = Camera(640, 480, focal, focal, 319.5, 239.5)
+        depth = (distance, distance + 1)
+        problem = problem_of(seed, points=points, noise_px=1.0, camera=camera, depth=depth)
+        result = fit(problem.points_3d, problem.points_2d, UNKNOWN, focal="estimate")
+        assert result.std is not None
+        inside.append(abs(np.log(result.camera.fx / focal)) < 1.96 * result.std.focal)
+        assert 0.3 * 640 < result.camera.fx < 6 * 640
+    assert 0.90 <= np.mean(inside) <= 0.985
 
 
 def test_prior_with_estimated_noise_counts_by_its_own_deviation() -> None:
@@ -391,12 +463,19 @@ def test_wrong_keypoints_are_found(camera: Camera, points: int, share: float) ->
         problem = problem_of(seed, points=points, noise_px=1.0, camera=camera, depth=depth)
         points_2d, wrong = spoiled(problem, share)
         result = fit(
-            problem.points_3d, points_2d, UNKNOWN, focal="estimate", ransac=RansacOptions()
+            problem.points_3d,
+            points_2d,
+            UNKNOWN,
+            focal="estimate",
+            focal_prior=None,
+            ransac=RansacOptions(),
         )
         assert not result.inliers[wrong].any()
         assert result.inliers[~wrong].mean() > 0.9
         kept = result.inliers
-        alone = fit(problem.points_3d[kept], points_2d[kept], UNKNOWN, focal="estimate")
+        alone = fit(
+            problem.points_3d[kept], points_2d[kept], UNKNOWN, focal="estimate", focal_prior=None
+        )
         assert result.alignment == alone.alignment
         assert result.camera == alone.camera
 
@@ -406,7 +485,7 @@ def test_robust_search_is_reproducible_and_guided() -> None:
     points_2d, wrong = spoiled(problem, 0.8)
     few = RansacOptions(min_iterations=1, max_iterations=10)
     arguments: Any = (problem.points_3d, points_2d, UNKNOWN)
-    options: Any = {"focal": "estimate", "ransac": few}
+    options: Any = {"focal": "estimate", "focal_prior": None, "ransac": few}
     with pytest.raises(NoConsensusError):
         fit(*arguments, **options)
     scores = np.where(wrong, 0.1, 0.9)
@@ -427,6 +506,7 @@ def test_noise_without_a_model_has_no_consensus() -> None:
                 rng.uniform(0, 480, (40, 2)),
                 UNKNOWN,
                 focal="estimate",
+                focal_prior=None,
                 ransac=RansacOptions(max_iterations=500),
             )
 
@@ -453,6 +533,7 @@ def test_batch_solves_each_problem_as_fit_does(ransac: RansacOptions | None) -> 
         [p.points_2d for p in [*problems, short]],
         UNKNOWN,
         focal="estimate",
+        focal_prior=None,
         ransac=ransac,
         workers=2,
     )
@@ -484,7 +565,12 @@ def test_structure_from_motion_with_scales_drawn_at_random(real_data: Path) -> N
         for _ in range(3):
             scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
             result = fit(
-                image.points_3d / scale, image.points_2d, camera, focal="estimate", sigma=None
+                image.points_3d / scale,
+                image.points_2d,
+                camera,
+                focal="estimate",
+                focal_prior=None,
+                sigma=None,
             )
             assert result.std is not None
             off = abs(result.camera.fx / image.camera.fx - 1)
@@ -505,7 +591,14 @@ def test_structure_from_motion_through_lenses(real_data: Path) -> None:
         c = image.camera
         camera = Camera.without_focal(c.width, c.height, cx=c.cx, cy=c.cy, distortion=c.distortion)
         scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
-        result = fit(image.points_3d / scale, image.points_2d, camera, focal="estimate", sigma=None)
+        result = fit(
+            image.points_3d / scale,
+            image.points_2d,
+            camera,
+            focal="estimate",
+            focal_prior=None,
+            sigma=None,
+        )
         assert result.camera.fx == pytest.approx(c.fx, rel=0.01)
         np.testing.assert_allclose(result.alignment.scale, scale, rtol=0.01)
 
@@ -527,7 +620,7 @@ def test_structure_from_motion_through_lenses(real_data: Path) -> None:
         ),
         (
             {"focal": "estimate", "focal_prior": 500.0},
-            "focal_prior: expected a cadalign.FocalPrior, got float",
+            "focal_prior: expected a cadalign.FocalPrior, 'usual' or None, got float",
         ),
         (
             {},
@@ -561,7 +654,13 @@ def test_too_few_keypoints_are_refused() -> None:
 
 def test_keypoints_in_one_place_are_refused() -> None:
     with pytest.raises(DegenerateError):
-        fit(np.ones((8, 3)), np.arange(16.0).reshape(8, 2), UNKNOWN, focal="estimate")
+        fit(
+            np.ones((8, 3)),
+            np.arange(16.0).reshape(8, 2),
+            UNKNOWN,
+            focal="estimate",
+            focal_prior=None,
+        )
 
 
 @pytest.mark.slow
@@ -569,7 +668,13 @@ def test_pixels_that_no_lens_reaches_are_refused() -> None:
     camera = Camera.without_focal(640, 480, distortion=(-5.0, 0.0, 0.0, 0.0))
     points_2d = np.array([[1e7, 1e7], [0, 0], [600, 400], [3, 470], [300, 5], [1e6, 3]])
     with pytest.raises(InputError, match="the lens distortion cannot be undone"):
-        fit(np.random.default_rng(0).uniform(-1, 1, (6, 3)), points_2d, camera, focal="estimate")
+        fit(
+            np.random.default_rng(0).uniform(-1, 1, (6, 3)),
+            points_2d,
+            camera,
+            focal="estimate",
+            focal_prior=None,
+        )
 
 
 def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
@@ -588,6 +693,6 @@ def test_lens_that_cannot_be_undone_at_one_optimum_stops_no_batch(
     monkeypatch.setattr(focal_search, "focal_covariance", fails_once)
     problem = problem_of(3, points=8, noise_px=0.0)
     given = [problem.points_3d] * 2, [problem.points_2d] * 2
-    batch = fit_batch(*given, problem.camera, focal="estimate")
+    batch = fit_batch(*given, problem.camera, focal="estimate", focal_prior=None)
     assert batch.solved.tolist() == [False, True]
     assert isinstance(batch.errors[0], InputError)

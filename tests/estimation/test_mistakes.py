@@ -13,7 +13,7 @@ from support.problems import with_outliers
 
 from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
 from cadalign.errors import CadalignError, NoConsensusError
-from cadalign.estimation.support import Explained, Mistake, find_mistake
+from cadalign.estimation.mistakes import Explained, Mistake, find_mistake
 
 CENTRED = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 OFF_CENTRE = Camera(640, 480, 935.0, 935.0, 190.0, 330.0)

@@ -12,10 +12,12 @@ from cadalign import (
     FocalPrior,
     Model,
     RansacOptions,
+    Result,
     ShapeModel,
     Size,
     View,
     align,
+    align_batch,
     fit,
 )
 from cadalign.errors import DegenerateError, InputError
@@ -99,6 +101,9 @@ def test_a_prior_sharpens_the_focal_length() -> None:
     assert known.std is not None
     assert known.std.focal <= 0.002 < free.std.focal
     assert known.std.rotation_deg <= free.std.rotation_deg
+    (one,) = align_batch(model, [view], focal="estimate", focal_prior=FocalPrior(FOCAL, 0.002))
+    assert isinstance(one, Result)
+    assert one.camera == known.camera
 
 
 def test_a_lens_with_distortion_is_undone_at_the_focal_length_that_is_found() -> None:
@@ -111,7 +116,8 @@ def test_a_lens_with_distortion_is_undone_at_the_focal_length_that_is_found() ->
     assert result.std is not None
     assert abs(np.log(result.camera.fx / FOCAL)) < 3 * result.std.focal
     assert result.rms < 0.2
-    exact = align(Model(points_3d=points), View(unknown, seen, sigma=0.1), focal="estimate")
+    view = View(unknown, seen, sigma=0.1)
+    exact = align(Model(points_3d=points), view, focal="estimate", focal_prior=None)
     assert exact.camera.fx == pytest.approx(FOCAL, rel=1e-6)
 
 

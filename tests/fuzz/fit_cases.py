@@ -120,7 +120,7 @@ def _exact_focal(rng: np.random.Generator) -> Case:
     )
     focal = float(np.exp(rng.uniform(np.log(150), np.log(2000))))
     seen = _pixels(pose, points, Camera(640, 480, focal, focal, 319.5, 239.5))
-    options: dict[str, Any] = {"focal": "estimate"}
+    options: dict[str, Any] = {"focal": "estimate", "focal_prior": None}
     if rng.random() < 0.3:
         options["focal_prior"] = FocalPrior(focal, 0.05)
     return Case("", points, seen, camera, options, pose, focal)

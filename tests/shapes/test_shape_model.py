@@ -20,10 +20,10 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.io.sealed import Seal
 from cadalign.shapes.examples import Example
-from cadalign.shapes.inflation import FewKeypoints
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import Reflection, ShapeComponent
 from cadalign.shapes.shape_file import SEAL
+from cadalign.shapes.tails import FewKeypoints
 
 TABLE = np.array(
     [[-1, 0, -2], [1, 0, -2], [-1, 0, 2], [1, 0, 2], [-1, 1, -2], [1, 1, -2], [0, 1.5, 0]],

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
 
 from cadalign import (
@@ -352,6 +353,12 @@ def _seen(rows: Sequence[int] = SHOWN, *, is_known: bool = True, **fields: Any) 
     return View(camera, CAMERA.project(truth.apply(POINTS[rows])), ids=rows, **fields)
 
 
+def _wide(translation: npt.ArrayLike = TRANSLATION, **fields: Any) -> View:
+    camera = Camera(480, 360, 75.0, 75.0, 239.5, 179.5, lens="fisheye")
+    seen = Alignment(LOOK, translation, np.ones(3)).apply(POINTS[SHOWN])
+    return View(camera, camera.project(seen), ids=SHOWN, **fields)
+
+
 def requests() -> list[Request]:
     """Everything that is refused, with its reason."""
     exact, learned = model_of("exact", None), model_of("learned", None)
@@ -413,11 +420,13 @@ def requests() -> list[Request]:
             lambda: align(exact, _seen([0, 1, 7])),
         ),
         Request(
-            "four keypoints of it, unknown focal length",
+            "four keypoints of it, unknown focal length, `focal_prior=None`",
             "9 unknowns, 8 equations",
             "points_3d: 4 keypoints are too few for 9 unknowns; "
             "give at least 5, fewer unknowns by stretch=, or a prior",
-            lambda: align(exact, _seen([0, 1, 7, 10], is_known=False), focal="estimate"),
+            lambda: align(
+                exact, _seen([0, 1, 7, 10], is_known=False), focal="estimate", focal_prior=None
+            ),
         ),
         Request(
             "keypoints of it in one plane",
@@ -452,6 +461,35 @@ def requests() -> list[Request]:
             "the two contradict",
             'focal_prior: given for a known focal length; give focal="estimate" with it',
             lambda: align(similar, _seen(), focal_prior=FocalPrior(FOCAL)),
+        ),
+        Request(
+            'a fisheye or fov lens, `focal="estimate"`',
+            "the focal length and the lens's coefficients bend the image alike",
+            "focal: the focal length of a fisheye lens is not estimated; "
+            'calibrate it, and give focal="known"',
+            lambda: align(similar, _wide(), focal="estimate"),
+        ),
+        Request(
+            "a mask, fisheye or fov lens",
+            "distances from an outline are measured in a pinhole's image plane",
+            "views[0].mask: the outline of a mask is not measured through a wide lens; "
+            "leave it away, or undistort the photo to a pinhole's",
+            lambda: align(exact, _wide(mask=mask)),
+        ),
+        Request(
+            "depths, fisheye or fov lens",
+            "a depth along the optical axis says nothing of a point beside the camera",
+            "views[0].depth: depths are not measured along the rays of a wide lens; "
+            "leave it away, or undistort the photo to a pinhole's",
+            lambda: align(exact, _wide(depth=np.full(len(SHOWN), 3.0))),
+        ),
+        Request(
+            "keypoints on all sides of a camera",
+            "rays are compared in the image of a pinhole that faces them",
+            "points_2d: the keypoints surround the camera: 6 of 15 lie more than 85 degrees off "
+            "the direction amid them, the first is point 4; give keypoints on one side of the "
+            "camera, or, if these are outliers, ransac",
+            lambda: align(similar, _wide(np.zeros(3))),
         ),
         Request(
             "`cam_from_rig` of some views alone",

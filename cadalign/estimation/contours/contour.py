@@ -178,10 +178,8 @@ def _inside(
 def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
     """The contour of a checked mask (h, w).
 
-    Raises
-    ------
-    InputError
-        If it is empty or covers all of the image, or all of its contour lies at the image's border.
+    Raises InputError if it is empty or covers all of the image, or all of its contour lies at the
+    image's border.
     """
     inside = mask if mask.dtype == bool else mask >= 0.5
     if not inside.any():

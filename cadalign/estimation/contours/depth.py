@@ -14,26 +14,27 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.contours.contour import robust_deviation
-from cadalign.estimation.contours.rows import (
+from cadalign.estimation.contours.surface import (
     Measured,
+    PosedSurface,
+    Surface,
     count_of,
     state_with_points,
     state_without_points,
+    surfaces_of,
     with_measured,
 )
-from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import Minimum
-from cadalign.estimation.uncertainty.evidence import kept_rows
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import model_rays
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.evidence import Evidence, Planes, log_focals_of
+from cadalign.solvers.joint.evidence import Evidence, Planes, kept_rows, log_focals_of
 from cadalign.solvers.joint.search import refine_joint, score_state
 
 _MARGIN = 3  # [px], to the mask's border

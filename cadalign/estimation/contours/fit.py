@@ -12,15 +12,8 @@ import numpy as np
 
 from cadalign.arrays import BoolArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.contours.descent import Masked
-from cadalign.estimation.contours.loop import (
-    ContourFit,
-    Settled,
-    settle,
-    settle_with,
-)
-from cadalign.estimation.contours.rows import with_displacement_modes
-from cadalign.estimation.contours.surface import Surface, surfaces_of
+from cadalign.estimation.contours.descent import ContourFit, Masked, Settled, settle, settle_with
+from cadalign.estimation.contours.surface import Surface, surfaces_of, with_displacement_modes
 from cadalign.estimation.contours.view_contour import ViewContour, contour_view
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
@@ -108,19 +101,10 @@ def fit_masks(
 ) -> MaskFit:
     """Refine the likely minima of the other evidence with the views' masks.
 
-    Parameters
-    ----------
-    model, prior, views
-        Those of `cadalign.align`; without a mask the minima stay as they are.
-    minima : sequence of Minimum
-        Estimates without masks, the likeliest first; starts where these leave something open.
-
-    Raises
-    ------
-    InputError
-        If a mask has no contour, or the model has no mesh.
-    DegenerateError
-        If there is no estimate without the masks and no rim near them.
+    The ``minima`` without masks, the likeliest first, are starts where these leave something open;
+    they stay as they are where no view has a mask. Raises InputError if a mask has no contour, or
+    the model has no mesh; DegenerateError if there is no estimate without the masks and no rim near
+    them.
     """
     contours = [
         contour_view(number, view, f"views[{number}].mask", minima[0].lenses.cameras[number])

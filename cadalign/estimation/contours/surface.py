@@ -4,56 +4,166 @@ For a mesh that is only similar to the object, there is its convex hull, too. Wh
 legs, or a hole, differs from object to object more than the outermost points do, which keypoints
 and the box describe. The silhouette of a convex hull is the convex hull of the silhouette, so that
 masks and meshes compare by their hulls as they do by themselves.
+
+What rims and depth images measure at points of surfaces is evidence as any other: these points
+stand between the keypoints and the box's corners.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
-from cadalign.estimation.contours.rows import PointRows
 from cadalign.estimation.model import Model
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
 from cadalign.io.meshes.load import load_mesh
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.parts import TrainingShapes
 from cadalign.shapes.warp import LinearWarp, linear_warp
-from cadalign.solvers.joint.evidence import Shape, State, points_of
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    Planes,
+    Shape,
+    Sightings,
+    State,
+    points_of,
+    stacked,
+)
 
 _QHULL = "QJ Pp"  # joggled, for a flat mesh has a hull, too
 _MOST_MESHES = 3  # training models that are tried, the nearest ones
 
 
-class PosedSurface(Protocol):
-    """A surface at one state of the shape, before its stretch."""
+class PointRows(NamedTuple):
+    """Mean (n, 3) and modes (K, n, 3) of points of a surface, as in `Shape`."""
 
-    @property
-    def caster(self) -> RayCaster:
-        """The ray hierarchy."""
-
-    def rows(self, points: FloatArray, face: IntArray) -> PointRows:
-        """Rows of ``points`` (n, 3) on the triangles ``face`` (n,)."""
+    mean: FloatArray
+    modes: FloatArray
 
 
-class Surface(Protocol):
-    """A mesh that follows the shape; ``is_exact`` where it is that of the object."""
+class Measured(NamedTuple):
+    """Points of a surface in one view, and what was measured at each.
 
-    @property
-    def is_exact(self) -> bool:
-        """True if rim and contour differ by the errors of the contour alone."""
+    ``table`` has a row for each point, whose number follows. ``own`` (k, n, 3) are further modes of
+    the shape, that move these points alone.
+    """
 
-    def at(self, shape: Shape, state: State) -> PosedSurface:
-        """The mesh at a state."""
+    points: PointRows
+    table: Sightings | Planes
+    own: FloatArray | None = None
+
+
+def count_of(measured: Sequence[Measured]) -> int:
+    """Number of points of all views."""
+    return sum(len(each.points.mean) for each in measured)
+
+
+def with_measured(evidence: Evidence, keypoints: int, measured: Sequence[Measured]) -> Evidence:
+    """The evidence with what was measured at points of surfaces.
+
+    Modes that move the points of one view alone are the last ones, in the order of the views.
+    """
+    shape, total = evidence.shape, count_of(measured)
+    last = len(shape.modes)
+    further = sum(len(each.own) for each in measured if each.own is not None)
+    end = keypoints + total
+    mean = np.concatenate([shape.mean[:keypoints], np.zeros((total, 3)), shape.mean[keypoints:]])
+    modes = np.zeros((last + further, len(mean), 3))
+    modes[:last, :keypoints] = shape.modes[:, :keypoints]
+    modes[:last, end:] = shape.modes[:, keypoints:]
+
+    def moved(points: IntArray) -> IntArray:
+        return np.where(points >= keypoints, points + total, points)
+
+    tables: dict[str, list[Any]] = {
+        name: [table._replace(point=moved(table.point))]
+        for name, table in (("sightings", evidence.sightings), ("planes", evidence.planes))
+    }
+    first = keypoints
+    for points, table, own in measured:
+        there = slice(first, first + len(points.mean))
+        mean[there] = points.mean
+        modes[: len(points.modes), there] = points.modes  # none for a rigid surface
+        if own is not None:
+            modes[last : last + len(own), there] = own
+            last += len(own)
+        name = "sightings" if isinstance(table, Sightings) else "planes"
+        tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
+        first = there.stop
+    spread = np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]])
+    return evidence._replace(
+        shape=Shape(mean, modes, spread),
+        offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
+        **{name: stacked(parts) for name, parts in tables.items()},
+    )
+
+
+def state_with_points(
+    state: State, keypoints: int, total: int, more: FloatArray | None = None
+) -> State:
+    """A copy of a state for evidence with ``total`` more points, see `with_measured`.
+
+    ``more`` are the coefficients of modes that move these alone.
+    """
+    still = state.displacements
+    coefficients = [state.coefficients, np.empty(0) if more is None else more]
+    return State(
+        state.poses.copy(),
+        state.log_focals.copy(),
+        state.log_scales.copy(),
+        np.concatenate(coefficients),
+        np.concatenate([still[:keypoints], np.zeros((total, 3)), still[keypoints:]]),
+    )
+
+
+def state_without_points(
+    state: State, keypoints: int, total: int, modes: int = 0
+) -> tuple[State, FloatArray]:
+    """Invert `state_with_points`: the state without ``total`` points, and the ``modes`` of these.
+
+    The coefficients of modes that move them alone are (modes,).
+    """
+    still, own = state.displacements, len(state.coefficients) - modes
+    bare = state._replace(
+        coefficients=state.coefficients[:own].copy(),
+        displacements=np.concatenate([still[:keypoints], still[keypoints + total :]]),
+    )
+    return bare, state.coefficients[own:].copy()
+
+
+def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+    """The same with the points' own displacements as modes, which a warped surface follows."""
+    shape = evidence.shape
+    rows = np.repeat(np.flatnonzero(shape.spread > 0), 3)
+    if not len(rows):
+        return evidence, state
+    axes = np.tile(np.arange(3), len(rows) // 3)
+    own = np.zeros((len(rows), *shape.mean.shape))
+    own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
+    moved = state.displacements[rows, axes] / shape.spread[rows]
+    return (
+        evidence._replace(
+            shape=Shape(shape.mean, np.concatenate([shape.modes, own]), np.zeros_like(shape.spread))
+        ),
+        state._replace(
+            coefficients=np.concatenate([state.coefficients, moved]),
+            displacements=np.zeros_like(state.displacements),
+        ),
+    )
 
 
 class RigidSurface:
-    """The surface of an exact or stretched model; it is the same at all states."""
+    """The surface of an exact or stretched model; it is the same at all states.
+
+    It ``is_exact``: rim and contour differ by the errors of the contour alone.
+    """
 
     is_exact = True
 
@@ -61,61 +171,70 @@ class RigidSurface:
         self.caster = caster_of(mesh)
 
     def at(self, shape: Shape, state: State) -> PosedSurface:
-        """See `Surface`."""
+        """The mesh at a state."""
         return self
 
     def rows(self, points: FloatArray, face: IntArray) -> PointRows:
-        """See `PosedSurface`."""
+        """Rows of ``points`` (n, 3) on the triangles ``face`` (n,)."""
         return PointRows(points, np.zeros((0, len(points), 3)))
 
 
 class WarpedSurface:
-    """A mesh whose keypoints are warped to the object's.
+    """A mesh whose keypoints are warped to the object's, or its convex hull.
 
     ``source`` (n, 3) are the mesh's keypoints, ``rows`` (n,) their numbers in the shape.
     """
 
     is_exact = False
 
-    def __init__(self, mesh: Mesh, source: FloatArray, rows: IntArray) -> None:
-        self._mesh, self._rows = mesh, rows
-        self._warp = linear_warp(mesh.vertices, mesh.bounds, source)
+    def __init__(
+        self, mesh: Mesh, source: FloatArray, rows: IntArray, *, is_hull: bool = False
+    ) -> None:
+        self._rows, self._faces = rows, None if is_hull else mesh.faces
+        used = np.unique(_hull_faces(mesh.vertices)) if is_hull else slice(None)
+        self._warp = linear_warp(mesh.vertices[used], mesh.bounds, source)
 
     def at(self, shape: Shape, state: State) -> PosedSurface:
-        """See `Surface`."""
+        """See `RigidSurface`."""
         points = points_of(shape, state) / np.exp(state.log_scales)
-        bounds = np.sort(points[-2:], axis=0)
-        vertices = self._warp.apply(points[self._rows], bounds)
-        mesh = Mesh(vertices, self._mesh.faces)
-        return Warped(mesh, self._warp, self._rows, shape.modes, state.coefficients)
+        vertices = self._warp.apply(points[self._rows], np.sort(points[-2:], axis=0))
+        faces = _hull_faces(vertices) if self._faces is None else self._faces
+        return Warped(
+            Mesh(vertices, faces), self._warp, self._rows, shape.modes, state.coefficients
+        )
 
 
+@dataclass(frozen=True, eq=False)
 class Warped:
     """A mesh at one state, its vertices warped; ``modes`` and ``coefficients`` of the shape."""
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        warp: LinearWarp,
-        rows: IntArray,
-        modes: FloatArray,
-        coefficients: FloatArray,
-    ) -> None:
-        self.caster = caster_of(mesh)
-        self._mesh, self._warp, self._rows = mesh, warp, rows
-        self._modes, self._coefficients = modes, coefficients
+    mesh: Mesh
+    warp: LinearWarp
+    keypoints: IntArray
+    modes: FloatArray
+    coefficients: FloatArray
+
+    @cached_property
+    def caster(self) -> RayCaster:
+        """The ray hierarchy."""
+        return caster_of(self.mesh)
 
     def rows(self, points: FloatArray, face: IntArray) -> PointRows:
-        """See `PosedSurface`."""
-        corners = self._mesh.faces[face]
-        shares = _barycentric(self._mesh.vertices[corners], points)[:, :, None]
-        here = LinearWarp(*((shares * each[corners]).sum(axis=1) for each in self._warp))
-        count = len(self._modes)
-        modes = np.zeros((count, len(points), 3))
-        for k, mode in enumerate(self._modes):
-            modes[k] = here.derivative(mode[self._rows], mode[-2:])
+        """See `RigidSurface`."""
+        corners = self.mesh.faces[face]
+        shares = _barycentric(self.mesh.vertices[corners], points)[:, :, None]
+        here = LinearWarp(*((shares * each[corners]).sum(axis=1) for each in self.warp))
+        modes = np.zeros((len(self.modes), len(points), 3))
+        for k, mode in enumerate(self.modes):
+            modes[k] = here.derivative(mode[self.keypoints], mode[-2:])
         # What the keypoints' own displacements move is part of the mean.
-        return PointRows(points - np.tensordot(self._coefficients, modes, axes=1), modes)
+        return PointRows(points - np.tensordot(self.coefficients, modes, axes=1), modes)
+
+
+PosedSurface = RigidSurface | Warped
+"""A surface at one state of the shape, before its stretch."""
+Surface = RigidSurface | WarpedSurface
+"""A mesh that follows the shape."""
 
 
 def caster_of(mesh: Mesh) -> RayCaster:
@@ -137,27 +256,6 @@ def _barycentric(triangles: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
 
-class ConvexSurface:
-    """The convex hull of a mesh whose keypoints are warped to the object's.
-
-    ``source`` (n, 3) are the mesh's keypoints, ``rows`` (n,) their numbers in the shape.
-    """
-
-    is_exact = False
-
-    def __init__(self, mesh: Mesh, source: FloatArray, rows: IntArray) -> None:
-        outer = np.unique(_hull_faces(mesh.vertices))
-        self._rows = rows
-        self._warp = linear_warp(mesh.vertices[outer], mesh.bounds, source)
-
-    def at(self, shape: Shape, state: State) -> PosedSurface:
-        """See `Surface`."""
-        points = points_of(shape, state) / np.exp(state.log_scales)
-        vertices = self._warp.apply(points[self._rows], np.sort(points[-2:], axis=0))
-        mesh = Mesh(vertices, _hull_faces(vertices))
-        return Warped(mesh, self._warp, self._rows, shape.modes, state.coefficients)
-
-
 def _hull_faces(vertices: FloatArray) -> IntArray:
     from scipy.spatial import ConvexHull  # takes longer to import than all that is compiled
 
@@ -174,12 +272,8 @@ class Choice(NamedTuple):
 def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> Choice:
     """Surfaces for a shape whose keypoints are about ``points_3d`` (m, 3), the nearest first.
 
-    Raises
-    ------
-    InputError
-        If there is no mesh; the mask ``where`` wants one.
-    DataError
-        If a mesh cannot be read.
+    Raises InputError where there is no mesh, which the mask ``where`` wants; DataError if one
+    cannot be read.
     """
     if isinstance(model, Model):
         if model.mesh is None:
@@ -189,20 +283,20 @@ def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) ->
             return Choice([RigidSurface(model.mesh)], [])
         points = cast(FloatArray, model.points_3d)
         return _warped([(model.mesh, points, np.arange(len(points)))])
-    nearest = _nearest_with_mesh(model, points_3d, where)
-    return _warped([_of_training(alone) for alone in nearest])
+    return _warped(_nearest_with_mesh(model, points_3d, where))
 
 
 def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> Choice:
     return Choice(
-        [WarpedSurface(*each) for each in given], [ConvexSurface(*each) for each in given]
+        [WarpedSurface(*each) for each in given],
+        [WarpedSurface(*each, is_hull=True) for each in given],
     )
 
 
 def _nearest_with_mesh(
     model: ShapeModel, points_3d: FloatArray, where: str
-) -> list[TrainingShapes]:
-    """Training models with a mesh, each alone, whose keypoints are nearest."""
+) -> list[tuple[Mesh, FloatArray, IntArray]]:
+    """Meshes of training models whose keypoints are nearest; these, and their numbers."""
     training = model.training
     rows = []
     if training is not None:
@@ -216,17 +310,9 @@ def _nearest_with_mesh(
     sums = np.where(known, squares, 0.0).sum(axis=1)
     distances = np.where(known.any(axis=1), sums / np.maximum(known.sum(axis=1), 1), np.inf)
     order = np.argsort(distances, kind="stable")[:_MOST_MESHES]
-    return [
-        TrainingShapes(
-            (training.model_ids[row],),
-            training.points_3d[row : row + 1],
-            (training.mesh_paths[row],),
-        )
-        for row in (rows[k] for k in order)
-    ]
-
-
-def _of_training(alone: TrainingShapes) -> tuple[Mesh, FloatArray, IntArray]:
-    source = alone.points_3d[0].astype(np.float64)
-    known = np.flatnonzero(np.isfinite(source).all(axis=1))
-    return load_mesh(cast(Path, alone.mesh_paths[0])), source[known], known
+    found = []
+    for row in (rows[k] for k in order):
+        source = training.points_3d[row].astype(np.float64)
+        known = np.flatnonzero(np.isfinite(source).all(axis=1))
+        found.append((load_mesh(cast(Path, training.mesh_paths[row])), source[known], known))
+    return found

@@ -20,12 +20,15 @@ from cadalign.estimation.estimates import (
     pose_and_lengths,
     with_box,
 )
+from cadalign.estimation.facing import turned_alignment, turned_covariance
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import ShapePrior, is_exact, prior_of, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
+from cadalign.estimation.wide_views import facing_view
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import needs_facing
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
 from cadalign.io.evidence import LENGTHS, Size
 from cadalign.shapes.model import ShapeModel
@@ -256,28 +259,14 @@ def _advice(kind: str, detail: Hashable, scene: KnownScene) -> Advice:
 
 @dataclass(frozen=True, eq=False)
 class KnownScene:
-    """Views of an object whose pose, stretch and shape are taken as known.
-
-    Parameters
-    ----------
-    model : Model or ShapeModel
-    prior : ShapePrior
-        Its one component is that of the object.
-    views : tuple of View
-    poses : tuple of Alignment
-        The alignment in every view's camera.
-    points_3d : (m, 3) float
-        Keypoints before the stretch.
-    bounds : (2, 3) float
-    size : Size, optional
-    """
+    """Views of an object whose pose, stretch and shape are taken as known."""
 
     model: Model | ShapeModel
-    prior: ShapePrior
+    prior: ShapePrior  # its one component is that of the object
     views: tuple[View, ...]
-    poses: tuple[Alignment, ...]
-    points_3d: FloatArray
-    bounds: FloatArray
+    poses: tuple[Alignment, ...]  # in every view's camera
+    points_3d: FloatArray  # (m, 3) before the stretch
+    bounds: FloatArray  # (2, 3)
     size: Size | None
 
     def with_view(self, added: tuple[View, Alignment]) -> KnownScene:
@@ -296,13 +285,23 @@ class KnownScene:
 
     def covariance(self) -> FloatArray:
         """Covariance (9, 9) of an estimate, as `cadalign.Result.covariance`, linearised."""
+        if needs_facing([view.camera for view in self.views]):
+            views = tuple(facing_view(view, number) for number, view in enumerate(self.views))
+            turns = [view.camera.lens_from_camera for view in views]
+            poses = [
+                turned_alignment(pose, turn.T) for pose, turn in zip(self.poses, turns, strict=True)
+            ]
+            facing = replace(self, views=views, poses=tuple(poses))
+            return turned_covariance(facing.covariance(), turns[0])
         evidence = evidence_of(self.prior, self.views, self.size, loss=LINEAR, loss_scale=1.0)
         evidence, state = widened(evidence, self._state(evidence), self.prior.inflation)
         margins, known = self.prior.box_margins, is_exact(evidence)
         if margins is not None:  # the box that results state of a learned shape
             evidence, state = with_box(evidence, state, len(self.points_3d), margins)
         if isinstance(self.model, Model) and any(view.mask is not None for view in self.views):
-            from cadalign.estimation.contours.bound import with_contours  # with OpenCV and embree
+            from cadalign.estimation.contours.view_contour import (
+                with_contours,  # with OpenCV and embree
+            )
 
             evidence, state = with_contours(self.model, self.views, evidence, state)
         found = joint_covariance(evidence, state)
@@ -333,11 +332,8 @@ def scene_of(
 ) -> KnownScene:
     """The scene of views, a size, and the estimate from them.
 
-    Raises
-    ------
-    InputError
-        If the estimate is neither an Alignment nor a Result, or does not tell shape and all
-        poses, or a view has a mask that is not of an exact model.
+    Raises InputError if the estimate is neither an Alignment nor a Result, or does not tell shape
+    and all poses, or a view has a mask that is not of an exact model.
     """
     if not views:
         raise InputError("none is given", where="views")

@@ -10,7 +10,7 @@ degrees as the piece has redundant equations.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,17 +19,17 @@ from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.evidence import (
     Piece,
     count_equations,
-    depth_factor,
-    kept_rows,
     keypoints_in,
+    measured_factor,
     pieces_of,
     plane_distances,
+    redundancy_of,
     without,
 )
-from cadalign.estimation.uncertainty.held_out import misfits
+from cadalign.estimation.uncertainty.held_out import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import Evidence, State, packed
+from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, packed
 from cadalign.solvers.joint.reduction import reduced
 from cadalign.solvers.joint.search import refine_joint, search_joint
 from cadalign.solvers.joint.system import Joint, joint_cost
@@ -39,8 +39,10 @@ _REFITTING = 12  # iterations that show if a piece contradicts the others
 _LEAST_INFORMATION = 1e-11  # about an unknown, in one that only it is unknown of
 _HIDDEN = 6.0  # [sigma], of a depth from most others of its image
 _WRONG_UNIT = 100.0  # factor between measured and expected depths
+_UNIT = "in another unit (millimetres for metres)?"
 _PER_EQUATION = 3.0  # cost that an equation must save for its piece to be blamed
 _MOST_TESTED = 40  # pieces
+_ALONG = 0.985  # cosine, 10 degrees, between an axis and a direction that may be its own
 _AS_LIKELY = 8.0  # difference of the costs saved by explanations that are both named
 
 
@@ -87,7 +89,8 @@ def contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str, 
     alike = _as_likely(best, suspects, noise)
     names = [name_of(*trial.piece) for trial in alike]
     sigmas = np.sqrt(best.saved / best.misfit / best.equations)
-    unit = next((text for trial in alike if (text := _wrong_unit(evidence, trial))), "")
+    hints = (_wrong_unit(evidence, trial) or _wrong_axis(evidence, trial) for trial in alike)
+    unit = next(filter(None, hints), "")
     if len(names) == 1:
         return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
     listed = f"{', '.join(names[:-1])} or {names[-1]}"
@@ -159,16 +162,28 @@ def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_
 
 
 def _wrong_unit(evidence: Evidence, trial: _Trial) -> str:
-    """A hint at depths that are hundreds of times too large or small; else nothing."""
-    if trial.piece.kind != "depth" or trial.piece.view is None:
+    """A hint at measurements that are hundreds of times too large or small; else nothing."""
+    factor = measured_factor(evidence, trial.state, trial.piece)
+    if factor is None or _is_plausible(factor):
         return ""
-    factor = depth_factor(evidence, trial.state, trial.piece.view)
-    if _is_plausible(factor):
+    return f": {name_of(*trial.piece)} is {factor:.3g} times what is expected, {_UNIT}"
+
+
+def _wrong_axis(evidence: Evidence, trial: _Trial) -> str:
+    """A hint at a direction that another axis of the model has; else nothing."""
+    if trial.piece.kind != "gravity":
         return ""
-    return (
-        f": the depths are {factor:.3g} times what is expected, are they in another unit "
-        "(millimetres for metres)?"
-    )
+    directions, rig = evidence.directions, evidence.rig
+    row = int(np.flatnonzero(directions.image == trial.piece.view)[0])
+    view = directions.image[row]
+    turn = trial.state.poses[rig.pose[view], :9].reshape(3, 3)
+    axes = rig.cam_from_rig[view, :9].reshape(3, 3) @ turn
+    cosines = directions.camera[row] @ axes
+    axis = int(np.argmax(np.abs(cosines)))
+    if directions.model[row, axis] or abs(cosines[axis]) < _ALONG:
+        return ""
+    name, way = "xyz"[axis], "up" if cosines[axis] > 0 else "down"
+    return f": the model's {name} axis points {way} there, is it the up axis (up_axis={name!r})?"
 
 
 def _searched(
@@ -225,56 +240,42 @@ def _rank(hessian: FloatArray) -> int:
 
 
 def warnings_of(
-    evidence: Evidence,
-    state: State,
-    cost: float,
-    *,
-    inflation: float,
-    degrees_of_freedom: float | None,
+    evidence: Evidence, state: State, cost: float, tails: ShapeTails
 ) -> tuple[str, ...]:
     """Warnings about evidence that contradicts the rest, and residuals beyond their sigma.
 
-    ``inflation`` and ``degrees_of_freedom`` are those of the shape's prior.
+    ``tails`` are those of the shape's prior.
     """
     contradicting = contradictions(evidence, state, cost)
     warnings = [*_wrong_units(evidence, state, contradicting), *contradicting]
     if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
-        redundancy = count_equations(evidence) - len(evidence.shape.modes)
-        redundancy -= 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
-        warnings += misfits(
-            cost, redundancy, inflation=inflation, degrees_of_freedom=degrees_of_freedom
-        )
+        warnings += misfits(cost, redundancy_of(evidence), tails)
     return tuple(warnings)
 
 
 def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str]) -> Iterator[str]:
-    """Warnings about depths in another unit than the model and the rest of the evidence.
+    """Warnings about measurements in another unit than the model and the rest of the evidence.
 
-    The estimate may follow the depths, which then makes the object too large, or leave them out.
+    The estimate may follow them, which then makes the object too large, or leave them out.
     """
     size = float(np.exp(state.log_scales.mean()))
-    is_told = not _is_plausible(size) and (contradicting or _is_sized_by_depth_alone(evidence))
-    ask = "are the depths in another unit (millimetres for metres)?"
-    for piece in pieces_of(evidence):
+    factors = [(p, measured_factor(evidence, state, p)) for p in pieces_of(evidence)]
+    measured = [(piece, factor) for piece, factor in factors if factor is not None]
+    is_rig = (np.bincount(evidence.rig.pose) > 1).any()
+    is_alone = len({piece.kind for piece, _ in measured}) == 1 and not is_rig
+    is_told = not _is_plausible(size) and (contradicting or is_alone)
+    for piece, factor in measured:
         name = name_of(*piece)
-        if piece.kind != "depth" or any(name in text for text in contradicting):
+        if any(name in text for text in contradicting):
             continue
-        factor = depth_factor(evidence, state, cast(int, piece.view))
         if not _is_plausible(factor):
-            yield f"{name}: the depths are {factor:.2g} times what is expected: {ask}"
+            yield f"{name}: the measurement is {factor:.2g} times what is expected, {_UNIT}"
         elif is_told:
-            yield f"{name}: the object is {size:.2g} times as large as the model: {ask}"
+            yield f"{name}: the object is {size:.2g} times as large as the model, is it {_UNIT}"
 
 
 def _is_plausible(factor: float) -> bool:
     return 1 / _WRONG_UNIT < factor < _WRONG_UNIT
-
-
-def _is_sized_by_depth_alone(evidence: Evidence) -> bool:
-    has_depth = len(evidence.planes.point) or (evidence.sightings.depths[:, 1] > 0).any()
-    others = len(evidence.offsets.value)
-    is_rig = (np.bincount(evidence.rig.pose) > 1).any()
-    return bool(has_depth and not others and not is_rig)
 
 
 def _best_of(evidence: Evidence) -> tuple[State, float] | None:

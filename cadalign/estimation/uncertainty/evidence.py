@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.estimates import pose_and_lengths
 from cadalign.estimation.evidence_kinds import SIZE, kind_names
+from cadalign.estimation.facing import turned_covariance
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary, Uncertainty
@@ -26,12 +27,12 @@ from cadalign.solvers.joint.evidence import (
     Sightings,
     State,
     distances_of,
+    kept_rows,
     log_focals_of,
     points_of,
 )
 from cadalign.solvers.joint.reduction import reduced
 
-Rows = TypeVar("Rows", bound=tuple[Any, ...])
 _OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
 _WEAKEST = 1e-12  # share of the information about an unknown that counts as none
 _UNKNOWN_ROTATION_DEG = 120.0
@@ -110,12 +111,6 @@ def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, S
     return _without_depth(evidence, view), state
 
 
-def kept_rows(rows: Rows, kept: BoolArray) -> Rows:
-    """Some rows of a table of columns."""
-    columns: list[Any] = [np.ascontiguousarray(column[kept]) for column in rows]
-    return type(rows)(*columns)
-
-
 def _unseen(evidence: Evidence, view: int) -> Sightings:
     """The sightings without a view's keypoints, whose depths stay."""
     hidden = keypoints_in(evidence, view)
@@ -155,6 +150,12 @@ def count_equations(evidence: Evidence) -> int:
     return count
 
 
+def redundancy_of(evidence: Evidence) -> int:
+    """Equations minus unknowns, where all of these are determined."""
+    unknowns = 6 * int(evidence.rig.pose.max() + 1) + int(evidence.scales.free.sum())
+    return count_equations(evidence) - len(evidence.shape.modes) - unknowns
+
+
 def summaries_of(
     evidence: Evidence, state: State, cameras: Sequence[Camera]
 ) -> tuple[EvidenceSummary, ...]:
@@ -192,16 +193,18 @@ def _of_keypoints(
     ratio = np.exp(log_ratio)
     seen_rays = seen[:, :2] / seen[:, 2:]
     errors = seen_rays - (sightings.rays[rows] + log_ratio * sightings.slopes[rows]) / ratio
-    return [summary_of_keypoints(errors, ratio * sightings.whitening[rows], view, camera)]
+    whitening = ratio * sightings.whitening[rows]
+    return [summary_of_keypoints(errors, seen_rays, whitening, view, camera)]
 
 
 def summary_of_keypoints(
-    errors: FloatArray, whitening: FloatArray, view: int, camera: Camera
+    errors: FloatArray, rays: FloatArray, whitening: FloatArray, view: int, camera: Camera
 ) -> EvidenceSummary:
-    """The summary of errors (n, 2) of rays, with their whitening (n, 3)."""
+    """The summary of errors (n, 2) of rays (n, 2), with their whitening (n, 3)."""
     a, b, c = whitening.T
     whitened = np.hypot(a * errors[:, 0] + b * errors[:, 1], c * errors[:, 1])
-    in_pixels = np.hypot(errors[:, 0] * camera.fx, errors[:, 1] * camera.fy)
+    bent = np.einsum("nij,nj->ni", camera.distortion_jacobian(rays), errors)
+    in_pixels = np.hypot(*(bent * (camera.fx, camera.fy)).T)
     return _summary("keypoints", view, in_pixels, whitened, "px", 2)
 
 
@@ -218,10 +221,19 @@ def _of_depths(
     return [_summary("depth", view, errors[counted], (errors * weights)[counted], "")]
 
 
-def depth_factor(evidence: Evidence, state: State, view: int) -> float:
-    """Median of measured over expected depths of a view."""
-    expected, measured, _ = _depths(evidence, state, points_of(evidence.shape, state), view)
-    return float(np.median(measured / expected))
+def measured_factor(evidence: Evidence, state: State, piece: Piece) -> float | None:
+    """Median of a piece's measured over expected depths or distances; None where it has none."""
+    points = points_of(evidence.shape, state)
+    if piece.kind == "depth" and piece.view is not None:
+        expected, measured, _ = _depths(evidence, state, points, piece.view)
+    elif piece.kind in kind_names():
+        rows = _known_in(evidence, piece)[len(evidence.directions.kind) :]
+        offsets = kept_rows(evidence.offsets, rows)
+        expected = distances_of(evidence._replace(offsets=offsets), state.poses, points)
+        measured = offsets.value
+    else:
+        return None
+    return float(np.median(measured / expected)) if len(measured) else None
 
 
 def _depths(
@@ -299,11 +311,13 @@ class Basis:
     """The evidence in the form of the kernels, and the state that was estimated from it.
 
     ``numbers`` are those of its views among all that were given; None where all are used.
+    ``turn`` (3, 3) leads from the first view's frame to that of the result, where it is another.
     """
 
     evidence: Evidence
     state: State
     numbers: tuple[int, ...] | None = None
+    turn: FloatArray | None = None
 
 
 AnyBasis = Basis | SingleBasis
@@ -318,11 +332,11 @@ def contributions_of(basis: AnyBasis) -> tuple[Contribution, ...]:
         view = piece.view
         if view is not None and basis.numbers is not None:
             view = basis.numbers[view]
-        found.append(Contribution(piece.kind, view, _deviations(rest, state)))
+        found.append(Contribution(piece.kind, view, _deviations(rest, state, basis.turn)))
     return tuple(found)
 
 
-def _deviations(evidence: Evidence, state: State) -> Uncertainty:
+def _deviations(evidence: Evidence, state: State, turn: FloatArray | None) -> Uncertainty:
     evidence, state = reduced(evidence, state)  # displacements of several views are modes
     _, information = information_of(evidence, state)
     sizes = np.sqrt(information.diagonal())
@@ -336,6 +350,8 @@ def _deviations(evidence: Evidence, state: State) -> Uncertainty:
     pose, border = 6 * int(evidence.rig.pose[0]), 6 * len(state.poses)
     shown = [*range(pose, pose + 6), *range(border, len(covariance))]
     of_all = pose_and_lengths(evidence, state, covariance[np.ix_(shown, shown)])
+    if turn is not None:
+        of_all = turned_covariance(of_all, turn)
     deviations = np.sqrt(np.maximum(of_all.diagonal(), 0.0))
     distance = float(np.linalg.norm(state.poses[evidence.rig.pose[0], 9:]))
     rotation = float(np.degrees(np.linalg.norm(deviations[:3])))

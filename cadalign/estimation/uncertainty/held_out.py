@@ -25,44 +25,21 @@ _WORTH_TESTING = 1.0  # reduced chi-square
 
 
 class ShapeTails(NamedTuple):
-    """Distribution of held-out objects' errors about a learned shape.
+    """Distribution of held-out objects' errors about a learned shape."""
 
-    Parameters
-    ----------
-    inflation : float
-        Factor on the standard deviations of the shape.
-    degrees_of_freedom : float, optional
-        Tails; None for Gaussian ones.
-    """
-
-    inflation: float = 1.0
-    degrees_of_freedom: float | None = None
+    inflation: float = 1.0  # factor on the standard deviations of the shape
+    degrees_of_freedom: float | None = None  # tails; None for Gaussian ones
 
 
 class SeenShape(NamedTuple):
-    """Keypoints of one view, and the learned shape's Gaussian about them.
+    """Keypoints of one view, and the learned shape's Gaussian about them."""
 
-    Parameters
-    ----------
-    points : (n, 3) float
-        The keypoints of the estimate [model units].
-    mean : (n, 3) float
-    covariance : (3 n, 3 n) float
-        Covariance of the keypoints about the mean.
-    pose : Alignment
-        The estimate, without a stretch.
-    rays : (n, 2) float
-        The observed keypoints, normalised.
-    whitening : (n, 3) float
-        As of `cadalign.solvers.marginal.problem.Seen`.
-    """
-
-    points: FloatArray
-    mean: FloatArray
-    covariance: FloatArray
-    pose: Alignment
-    rays: FloatArray
-    whitening: FloatArray
+    points: FloatArray  # (n, 3) of the estimate [model units]
+    mean: FloatArray  # (n, 3)
+    covariance: FloatArray  # (3 n, 3 n) about the mean
+    pose: Alignment  # the estimate, without a stretch
+    rays: FloatArray  # (n, 2) observed, normalised
+    whitening: FloatArray  # (n, 3), as of `cadalign.solvers.marginal.problem.Seen`
 
 
 def keypoint_misfits(
@@ -87,40 +64,34 @@ def keypoint_misfits(
     worst = int(np.argmax(squares))
     freedom = tails.degrees_of_freedom
     alone, others = float(squares[worst]), None
-    rest = misfits(total - alone, redundancy - 2, degrees_of_freedom=freedom)
+    gaussian_or_t = ShapeTails(degrees_of_freedom=freedom)  # the errors are inflated already
+    fits_without = not misfits(total - alone, redundancy - 2, gaussian_or_t)
     if freedom is not None:
         others = freedom + redundancy - 2
         # The scale of this object's shape, by the prior and by the other keypoints.
         alone *= others / (freedom - 2 + total - alone) * (others - 2) / others
     is_wrong = count * (1 - probability_within(alone, 2, others)) < _FALSE_ALARMS
-    if is_wrong and not rest:  # the others fit together
-        away = np.linalg.solve(_whiteners(seen)[worst], misses[worst])
+    if is_wrong and fits_without:
+        away = np.linalg.solve(whitening_matrices(seen.whitening)[worst], misses[worst])
         pixels = focal * float(np.linalg.norm(away))
         return (
             f"keypoint {quote(names[worst])} is {pixels:.2g} px from where the others and the "
             "learned shapes predict it: a wrong keypoint, or a part that the shapes do not have",
         )
-    return misfits(total, redundancy, degrees_of_freedom=freedom)
+    return misfits(total, redundancy, gaussian_or_t)
 
 
-def misfits(
-    cost: float,
-    redundancy: int,
-    *,
-    inflation: float = 1.0,
-    degrees_of_freedom: float | None = None,
-) -> tuple[str, ...]:
+def misfits(cost: float, redundancy: int, tails: ShapeTails) -> tuple[str, ...]:
     """Report residuals that are too large for their standard deviations.
 
     At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
     prior adds one equation, every other takes one away. Of a learned shape it is distributed as
-    errors of held-out objects are: wider by ``inflation`` and with the tails of so many
-    ``degrees_of_freedom``.
+    errors of held-out objects are, see `ShapeTails`.
     """
     if redundancy <= 0 or cost < redundancy:
         return ()
-    squares = cost / inflation**2
-    if 1 - probability_within(squares, redundancy, degrees_of_freedom) >= _FALSE_ALARMS:
+    squares = cost / tails.inflation**2
+    if 1 - probability_within(squares, redundancy, tails.degrees_of_freedom) >= _FALSE_ALARMS:
         return ()
     ratio = np.sqrt(squares / redundancy)
     return (
@@ -132,11 +103,9 @@ def misfits(
 def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArray]:
     """Whitened errors (2 n,) of the mean shape, and their inverse covariance beside any pose."""
     count = len(seen.rays)
-    whiteners = _whiteners(seen)
-    errors = whiteners @ (perspective(seen.pose.apply(seen.points)) - seen.rays)[:, :, None]
-    by_pose = whiteners @ ray_derivatives(seen.points, seen.pose.packed)[:, :, :_POSE]
+    errors, by_pose = whitened_errors(seen.points, seen.pose, seen.rays, seen.whitening)
     by_point = by_pose[:, :, 3:] @ seen.pose.rotation
-    errors = errors[:, :, 0] - (by_point @ (seen.points - seen.mean)[:, :, None])[:, :, 0]
+    errors = errors - (by_point @ (seen.points - seen.mean)[:, :, None])[:, :, 0]
     by_shape = np.zeros((count, 2, count, 3))
     by_shape[np.arange(count), :, np.arange(count)] = by_point
     rows = by_shape.reshape(2 * count, 3 * count)
@@ -148,8 +117,18 @@ def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArra
     return errors.ravel(), np.asarray(weight)
 
 
-def _whiteners(seen: SeenShape) -> FloatArray:
-    """The whitening as matrices (n, 2, 2)."""
-    whiteners = np.zeros((len(seen.whitening), 2, 2))
-    whiteners[:, 0, 0], whiteners[:, 0, 1], whiteners[:, 1, 1] = seen.whitening.T
-    return whiteners
+def whitened_errors(
+    points: FloatArray, pose: Alignment, rays: FloatArray, whitening: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Whitened errors (n, 2) of points in a view, and their derivatives (n, 2, 6) by the pose."""
+    matrices = whitening_matrices(whitening)
+    errors = matrices @ (perspective(pose.apply(points)) - rays)[:, :, None]
+    by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :_POSE]
+    return errors[:, :, 0], by_pose
+
+
+def whitening_matrices(whitening: FloatArray) -> FloatArray:
+    """Whitening (n, 3) as upper triangular matrices (n, 2, 2)."""
+    matrices = np.zeros((len(whitening), 2, 2))
+    matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1] = whitening.T
+    return matrices

@@ -1,14 +1,16 @@
-"""Tests of the residuals, and of given scales and camera, against the keypoints' stated noise."""
+"""Tests of residuals, and of given scales and camera, against stated noise; outliers among them."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pack_one
@@ -18,17 +20,160 @@ from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihoo
 from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.projection import projection_jacobian
+from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
+_FALSE_OUTLIERS = 0.01
+Rows = npt.NDArray[np.intp]
 _FALSE_ALARMS = 0.004
 _FALSE_STRETCH_ALARMS = 0.002
-_FALSE_CAMERA_ALARMS = 0.002
+_FALSE_CAMERA_ALARMS = 1e-5
 _SCALES = 2  # unknown ones, of an alignment without constraints
 _WORTH_A_SEARCH = 4.0  # linearised decrease of the sum
-_SIZES = (0.25, 0.5, 2.0, 4.0)  # of images, over that of their camera
-Rows = npt.NDArray[np.intp]
 _TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
+
+
+class PoseFit(Protocol):
+    """A fit of keypoints, such as `cadalign.Result`."""
+
+    @property
+    def alignment(self) -> Alignment: ...
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def fisher_covariance(self) -> FloatArray | None: ...
+
+
+FitRows = Callable[[Rows, bool], PoseFit]
+"""Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
+True."""
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """Prior on the keypoints' noise, relative to that of the fits."""
+
+    sigma: float = 1.0  # expected standard deviation
+    equations: float = math.inf  # weight, as of so many equations; infinite for a known noise
+
+    def variance(self, squares: float, redundancy: float) -> float:
+        """The variance, by the prior and a sum of squares with that redundancy."""
+        if math.isinf(self.equations):
+            return self.sigma**2
+        return (squares + self.equations * self.sigma**2) / (redundancy + self.equations)
+
+
+CLICKS = NoiseLevel(2.0, 4)
+"""Hands click to about 2 px, and shapes differ by as much."""
+
+
+def find_outliers(
+    points_3d: FloatArray,
+    points_2d: FloatArray,
+    fit_rows: FitRows,
+    *,
+    unknowns: int,
+    noise: FloatArray | None = None,
+    level: NoiseLevel = CLICKS,
+) -> dict[int, float]:
+    """Find the keypoints that lie farther from the others' prediction than noise explains.
+
+    A forward search (Hadi, "Identifying multiple outliers in multivariate data", 1992): it begins
+    with the better half of the keypoints in a robust fit and adds all that agree, until nothing
+    changes, so that several outliers do not mask each other. ``noise`` (n, 2, 2) are the
+    covariances [px^2] of the fits, by default those of 1 px; unless ``level`` says that it is
+    known, their common factor is estimated from the inliers, since all keypoints of a model that is
+    only similar to the object are some pixels off.
+
+    Returns, by row, the outlier's distance [px] from the prediction of the fit to the inliers; none
+    with too few keypoints: without one, at least two more equations than unknowns must be left.
+    """
+    count = len(points_3d)
+    least = unknowns // 2 + 1
+    if count <= least:
+        return {}
+    if noise is None:
+        noise = np.tile(np.eye(2), (count, 1, 1))
+    search = _Search(points_3d, points_2d, noise, fit_rows, level, unknowns)
+    try:
+        inliers = search.run(least)
+        if inliers.all():
+            return {}
+        result = fit_rows(np.flatnonzero(inliers), False)
+    except CadalignError:  # a subset of the keypoints is degenerate, so that none can be judged
+        return {}
+    lengths = np.linalg.norm(search.residuals(result), axis=1)
+    return {int(row): float(lengths[row]) for row in np.flatnonzero(~inliers)}
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The forward search of `find_outliers`."""
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    noise: FloatArray
+    fit_rows: FitRows
+    level: NoiseLevel
+    unknowns: int
+
+    def run(self, least: int) -> BoolArray:
+        """Find the inliers, (n,) bool, at least so many."""
+        count = len(self.points_3d)
+        start = max(least, count // 2 + 1)
+        robust = self.residuals(self.fit_rows(np.arange(count), True))
+        lengths = _squares(robust, self.noise)
+        rows = np.sort(np.argsort(lengths, kind="stable")[:start])
+        for _ in range(2 * count):
+            statistic, redundancy = self._statistic(rows)
+            quantile = _f_quantile(_FALSE_OUTLIERS / count, redundancy + self.level.equations)
+            agreed = np.flatnonzero(statistic <= quantile)
+            if len(agreed) < start:
+                agreed = np.sort(np.argsort(statistic, kind="stable")[:start])
+            if np.array_equal(agreed, rows):
+                break
+            rows = agreed
+        inliers = np.zeros(count, dtype=bool)
+        inliers[rows] = True
+        return inliers
+
+    def _statistic(self, rows: Rows) -> tuple[FloatArray, int]:
+        """Squared residuals (n,) per equation over their expectation, and the fit's redundancy.
+
+        For keypoints outside the fit, the covariance of the prediction adds to the noise.
+        """
+        result = self.fit_rows(rows, False)
+        residuals = self.residuals(result)
+        redundancy = 2 * len(rows) - self.unknowns
+        total = float(_squares(residuals[rows], self.noise[rows]).sum())
+        expected = self.noise.copy()
+        others = np.setdiff1d(np.arange(len(self.points_3d)), rows)
+        others = others[result.camera.sees(result.alignment.apply(self.points_3d[others]))]
+        covariance = result.fisher_covariance
+        if len(others) and covariance is not None:
+            jacobian = projection_jacobian(self.points_3d[others], result.camera, result.alignment)
+            expected[others] += predicted_covariances(jacobian, covariance)
+        squares = _squares(residuals, expected) / 2
+        return squares / self.level.variance(total, redundancy), redundancy
+
+    def residuals(self, result: PoseFit) -> FloatArray:
+        """Projected minus observed (n, 2) [px]; infinite behind the camera."""
+        in_camera = result.alignment.apply(self.points_3d)
+        return result.camera.project_where_ahead(in_camera) - self.points_2d
+
+
+def _squares(residuals: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Squared lengths (n,) of residuals (n, 2) whitened by their covariances (n, 2, 2)."""
+    finite = np.nan_to_num(residuals, posinf=1e9)
+    squares = np.einsum("na,nab,nb->n", finite, np.linalg.inv(covariances), finite)
+    return np.asarray(squares)
+
+
+def _f_quantile(chance: float, equations: float) -> float:
+    """Value that an F variable with (2, equations) degrees of freedom exceeds by this chance."""
+    if math.isinf(equations):
+        return -math.log(chance)
+    return equations / 2 * (math.pow(chance, -2 / equations) - 1)
 
 
 def find_misfit(result: FittedKeypoints) -> Misfit | None:
@@ -190,7 +335,9 @@ def contradicting_camera(tested: Tested) -> Camera | None:
         return None
     width, height = tested.camera.width, tested.camera.height
     found = [_tried(tested, focal="estimate")]
-    for factor in _SIZES:
+    from cadalign.estimation.mistakes import OTHER_SIZES  # rarely asked
+
+    for factor in OTHER_SIZES:
         sizes = max(1, round(width * factor)), max(1, round(height * factor))
         found.append(_tried(tested, camera=tested.camera.resized(*sizes)))
     fits = [each for each in found if each is not None and each.passes]
@@ -210,8 +357,6 @@ def _tried(tested: Tested, **changes: Any) -> Tested | None:
 
 def _outliers(tested: Tested) -> dict[int, float]:
     """The few keypoints without which the others pass the test, with their distances [px]."""
-
-    from cadalign.estimation.uncertainty.outliers import NoiseLevel, find_outliers  # rarely asked
 
     def fit_rows(rows: Rows, robust: bool) -> FittedKeypoints:
         loss = "cauchy" if robust else "linear"

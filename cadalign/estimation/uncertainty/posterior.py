@@ -10,7 +10,7 @@ centroid, and the logarithms of scales and focal length. The draws are the same 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -18,12 +18,13 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.problems import distinct_rows
 from cadalign.estimation.uncertainty.distributions import chi_square_quantile, f_quantile
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotations_from_vectors
+from cadalign.geometry.camera import Camera, needs_facing
+from cadalign.geometry.rotations import by_rotation, rotations_from_vectors
 from cadalign.geometry.symmetry import Symmetry
 
 MOST_POINTS = 100
@@ -49,17 +50,10 @@ _EFFICIENCY = {"linear": 1.0, "huber": 0.7, "cauchy": 0.7}
 class FittedKeypoints:
     """Keypoints of an exact or stretched model in one view, with the alignment that fits them.
 
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        The keypoints that the view shows, on the model.
-    residuals, inliers, alignment, camera, sigma, symmetry
-        As of `cadalign.Result`.
-    options : FitOptions
-    fisher_covariance : (9, 9) or (10, 10) float, optional
+    Fields without a comment are those of `cadalign.Result`.
     """
 
-    points_3d: FloatArray
+    points_3d: FloatArray  # (n, 3) on the model, of the keypoints that the view shows
     residuals: FloatArray
     inliers: BoolArray
     alignment: Alignment
@@ -77,18 +71,10 @@ class FittedKeypoints:
 
 @dataclass(frozen=True, eq=False)
 class Likelihood:
-    """Negative log likelihoods, times two, of residuals in pixels.
+    """Negative log likelihoods, times two, of residuals in pixels."""
 
-    Parameters
-    ----------
-    information : (2, 2) or (n, 2, 2) float
-        Inverse covariance of the keypoints [1 / px^2].
-    options : FitOptions
-        Loss and priors.
-    """
-
-    information: FloatArray
-    options: FitOptions
+    information: FloatArray  # (2, 2) or (n, 2, 2), inverse covariance of the keypoints [1 / px^2]
+    options: FitOptions  # loss and priors
 
     @classmethod
     def of(cls, result: FittedKeypoints) -> Likelihood:
@@ -127,7 +113,7 @@ class Likelihood:
         excess = np.maximum(np.abs(log_scales) - width, 0.0)
         total = weight * (excess**2).sum(axis=1)
         prior = self.options.focal_prior
-        if prior is not None:
+        if isinstance(prior, FocalPrior):
             total = total + ((log_focals - np.log(prior.focal)) / prior.relative_sigma) ** 2
         return np.asarray(total)
 
@@ -145,6 +131,23 @@ def bent(squares: FloatArray, loss: str, bend: float) -> FloatArray:
 def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
     assert result.fisher_covariance is not None
+    if needs_facing([result.camera]):
+        from cadalign.estimation.facing import (  # wide lenses are rare
+            faced,
+            turned_alignment,
+            turned_covariance,
+        )
+
+        kept = result.points_3d[result.inliers]
+        camera = faced(result.camera, result.camera.project(result.alignment.apply(kept)))
+        turn = camera.lens_from_camera
+        own = replace(
+            result,
+            camera=camera,
+            alignment=turned_alignment(result.alignment, turn.T),
+            fisher_covariance=turned_covariance(result.fisher_covariance, turn.T),
+        )
+        return turned_covariance(posterior_covariance(own), turn)
     options = result.options
     points = result.points_3d[result.inliers]
     widening = 1.0
@@ -188,9 +191,8 @@ class _Chart:
     def jacobian(self) -> FloatArray:
         """Derivatives (10, 10) of the coordinates by the unknowns of a covariance."""
         of_axes = self.alignment.rotation * (self.alignment.scale * self.center)
-        x, y, z = of_axes.sum(axis=1)
         of_center = np.zeros((3, 10))
-        of_center[:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        of_center[:, :3] = by_rotation(of_axes.sum(axis=1))
         of_center[:, 3:6] = np.eye(3)
         of_center[:, 6:9] = of_axes
         u, v, depth = self.in_camera
@@ -229,7 +231,7 @@ def _prior_information(options: FitOptions, size: int) -> FloatArray:
     """Inverse variances (9,) or (10,) of the priors; 0 for none."""
     information = np.zeros(size)
     information[6:9] = options.prior_weight
-    if options.focal_prior is not None:
+    if isinstance(options.focal_prior, FocalPrior):
         information[9] = options.focal_prior.relative_sigma**-2
     return information
 

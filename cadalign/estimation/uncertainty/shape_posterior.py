@@ -15,16 +15,16 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
+from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
+from cadalign.estimation.uncertainty.held_out import whitened_errors
 from cadalign.estimation.view import View
-from cadalign.geometry.projection import perspective
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.evidence import loss_and_root
-from cadalign.solvers.projection import ray_derivatives
 
 _POSE = 6
 
@@ -33,14 +33,10 @@ _POSE = 6
 class ShapePosterior:
     """Knowledge of an object's shape from one image and a shape model.
 
-    Parameters
-    ----------
-    shapes : Gaussians
-        Mixture over the stacked rows: x, y, z of each keypoint of the shape model, then of the
-        least and the greatest corner of the box [model units].
-    log_evidence : float
-        Log of the probability density of the image's whitened keypoints, up to a constant, given
-        that the object is of the category: it compares shape models that have all of them.
+    ``shapes`` is a mixture over the stacked rows: x, y, z of each keypoint of the shape model, then
+    of the least and the greatest corner of the box [model units]. ``log_evidence`` is the log of
+    the probability density of the image's whitened keypoints, up to a constant, given that the
+    object is of the category: it compares shape models that have all of them.
     """
 
     shapes: Gaussians
@@ -120,18 +116,15 @@ def _linearised(
     ids = tuple(name for name, inlier in zip(view.keypoint_ids, kept, strict=True) if inlier)
     names = prior_of(result.model).rows_of(ids, "view.ids")
     pixels = np.require(cast(FloatArray, view.points_2d), requirements="W")
-    rays = rays_of(pixels, view.camera)
-    weights = np.broadcast_to(whitening_of(view.sigma, rays, view.camera), (len(rays), 3))[kept]
-    whitening = np.zeros((len(names), 2, 2))
-    whitening[:, 0, 0], whitening[:, 0, 1], whitening[:, 1, 1] = weights.T
-    pose = result.alignment
+    camera = faced(view.camera, pixels)
+    rays = rays_of(pixels, camera)
+    weights = np.broadcast_to(whitening_of(view.sigma, rays, camera), (len(rays), 3))[kept]
+    pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
     points = result.points_3d[names]
-    errors = perspective(pose.apply(points)) - rays[kept]
-    residuals = np.einsum("nij,nj->ni", whitening, errors)
+    residuals, derivatives = whitened_errors(points, pose, rays[kept], weights)
     squares = (residuals**2).sum(axis=1).tolist()
     roots = np.array([loss_and_root(loss, loss_scale, square)[1] for square in squares])
-    derivatives = ray_derivatives(points, pose.packed)[:, :, :_POSE]
-    by_pose = roots[:, None, None] * (whitening @ derivatives)
+    by_pose = roots[:, None, None] * derivatives
     by_point = by_pose[:, :, 3:]  # a translation moves every point alike
     by_shape = np.zeros((len(names), 2, len(result.points_3d) + len(result.bounds), 3))
     by_shape[np.arange(len(names)), :, names] = by_point @ (pose.rotation * pose.scale)

@@ -23,6 +23,7 @@ from cadalign.estimation.uncertainty.summary import (
     weaknesses_of_keypoints,
 )
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.rotations import by_rotation
 
 if TYPE_CHECKING:
     from cadalign.estimation.consensus import RobustSearch
@@ -89,22 +90,49 @@ class KeypointStatistics(FittedKeypoints):
         mistake = self._mistake()
         if mistake is not None:  # nothing else can be said of the alignment
             return (mistake,)
+        placed = self._placed()
         if self.covariance is None:
-            return ()
+            return placed
         kept, options = self.points_3d[self.inliers], self.options
         is_estimated = options.focal == "estimate"
-        return self._contradictions() + weaknesses_of_keypoints(
-            kept,
-            self.alignment,
-            uncertainty_of(self.covariance),
-            redundancy=2 * len(kept) - options.unknowns,
-            scale_prior_sigma=options.scale_prior_sigma,
-            doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
+        return (
+            placed
+            + self._contradictions()
+            + weaknesses_of_keypoints(
+                kept,
+                self.alignment,
+                uncertainty_of(self.covariance),
+                redundancy=2 * len(kept) - options.unknowns,
+                scale_prior_sigma=options.scale_prior_sigma,
+                doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
+            )
         )
+
+    @property
+    def _observed(self) -> FloatArray:
+        """Keypoints in the image (m, 2) [px], without those that lie behind the camera."""
+        ahead = np.isfinite(self.residuals).all(axis=1)
+        in_camera = self.alignment.apply(self.points_3d[ahead])
+        return np.asarray(self.camera.project_where_ahead(in_camera) - self.residuals[ahead])
+
+    def _placed(self) -> tuple[str, ...]:
+        """Warnings about keypoints outside of the image."""
+        observed = self._observed
+        if self.camera.contains(observed).all():
+            return ()
+        from cadalign.estimation.mistakes import outside_image  # rarely asked
+
+        return outside_image(observed, self.camera, agree=self.misfit is None)
 
     def _mistake(self) -> str | None:
         if self.search is None:
-            return None
+            if self.fisher_covariance is None:
+                return None
+            if self.misfit is None and self.options.sigma is not None:
+                return None
+            from cadalign.estimation.uncertainty.mistaken import mistake_in_fit
+
+            return mistake_in_fit(self, self.misfit)
         from cadalign.estimation.consensus import mistake_in  # with the kernels of the search
 
         return mistake_in(self.search, self.search.explained(self.alignment, self.residuals))
@@ -147,7 +175,6 @@ def points_covariances(
     by_logs = stretched[:, :, None] * np.eye(3)
     of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
     turned = stretched @ alignment.rotation.T
-    by_turn = np.cross(np.eye(3), turned[:, None]).swapaxes(1, 2)  # columns: axis x turned
-    shifts = np.broadcast_to(np.eye(3), by_turn.shape)
-    rows = np.concatenate([by_turn, shifts, alignment.rotation @ by_logs], axis=2)
+    shifts = np.broadcast_to(np.eye(3), by_logs.shape)
+    rows = np.concatenate([by_rotation(turned), shifts, alignment.rotation @ by_logs], axis=2)
     return of_points, rows @ covariance @ rows.swapaxes(1, 2)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.evidence import whole_information
@@ -16,10 +16,10 @@ from cadalign.solvers.joint.arrow import (
     factorize_arrow,
     invert_arrow,
 )
-from cadalign.solvers.joint.blocks import first_scale
 from cadalign.solvers.joint.equations import JointEquations, joint_room
 from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked, unstretched
-from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, sighted_points
+from cadalign.solvers.joint.reduction import reduced_row, sighted_points
+from cadalign.solvers.joint.rows import first_scale
 from cadalign.solvers.joint.system import Joint, evaluate_joint
 
 
@@ -48,15 +48,18 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
     if bound.weight > 0:
         whole = ScalePrior(whole_information(bound), bound.width)
         evidence = evidence._replace(scales=evidence.scales._replace(bound=whole))
-    reduction = reduce_modes(evidence)
-    row = packed(reduced_state(reduction, evidence.shape, state))
+    reduction, row = reduced_row(evidence, state)
     basis = np.ascontiguousarray(reduction.basis[: len(evidence.shape.modes)])
-    return _covariance_of(evidence, reduction.evidence, basis, row)
+    return _covariance_of(evidence, reduction.evidence, basis, row, sighted_points(evidence))
 
 
 @kernel
 def _covariance_of(
-    evidence: Evidence, reduced: Evidence, basis: FloatArray, row: FloatArray
+    evidence: Evidence,
+    reduced: Evidence,
+    basis: FloatArray,
+    row: FloatArray,
+    sighted: BoolArray,
 ) -> JointCovariance:
     """Covariances from those in ``reduced`` modes, whose ``basis`` (K, r) is that of all."""
     system = Joint(reduced, False)
@@ -80,8 +83,8 @@ def _covariance_of(
     for a in range(3):
         if evidence.scales.free[a] == 0.0:
             inverse.border[first + a, first + a] = 0.0
-    covariance = pose_and_border(inverse, evidence.rig.pose[0])
-    by_unknowns, own = _points_by_unknowns(evidence, reduced, state, equations)
+    covariance = _pose_and_border(inverse, evidence.rig.pose[0])
+    by_unknowns, own = _points_by_unknowns(evidence, reduced, state, equations, sighted)
     of_points = _blocks(by_unknowns, covariance) + own
     _turn_and_move(reduced, state, by_unknowns)
     of_seen = _blocks(by_unknowns, covariance)
@@ -98,7 +101,7 @@ def _covariance_of(
 
 
 @kernel
-def pose_and_border(inverse: Arrow, pose: int) -> FloatArray:
+def _pose_and_border(inverse: Arrow, pose: int) -> FloatArray:
     """Covariance (6 + b, 6 + b) of one pose and the border."""
     size = 6 + inverse.border.shape[0]
     found = np.empty((size, size))
@@ -139,7 +142,11 @@ def _border_of_all_modes(border: FloatArray, basis: FloatArray, first: int) -> F
 
 @kernel
 def _points_by_unknowns(
-    evidence: Evidence, reduced: Evidence, state: State, equations: JointEquations
+    evidence: Evidence,
+    reduced: Evidence,
+    state: State,
+    equations: JointEquations,
+    sighted: BoolArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Derivatives (m, 3, 6 + b) of all points by a pose and the border, covariances of the rest.
 
@@ -149,7 +156,7 @@ def _points_by_unknowns(
     first = 6 + first_scale(evidence)
     unknowns = first + 3 + modes
     scale = np.exp(state.log_scales)
-    columns, sighted = equations.columns, sighted_points(evidence)
+    columns = equations.columns
     rows = np.zeros((points, 3, unknowns))
     own = np.zeros((points, 3, 3))
     left_out = evidence.shape.modes.shape[0] > 0

@@ -1,4 +1,20 @@
-"""Room for the normal equations of the joint system, and what they are computed with."""
+"""Normal equations of the joint system, with room for them; what is integrated out of them.
+
+Of the displacement d of a point that one pose sees, with the prior N(0, spread^2 I), the equations
+``r + J dx + D (e - d)``, with e the displacement to find, have the covariance I + spread^2 D D'
+about ``r - D d + J dx``. Whitening them by its Cholesky factor L leaves least squares in x alone,
+and ``e = -spread^2 D' L^-T (whitened residual)`` follows.
+
+Coefficients and displacements that are integrated out leave a log determinant. With the equations
+``r + A z`` of both, z, whose prior is standard normal, it is that of M = I + A A', and its
+derivative is ``2 tr(dA P A')``, P the covariance of z given the rest. Row q of A touches only the
+point i that it is of: with ``y_q = P_i a_q`` the response of this point in the rig's frame, a_q the
+row there, and d the camera's z over the depth, half the derivative by the point is
+
+    h_q = -((a_q . y_q) d + (d . y_q) a_q),
+
+and that by a turn ``X_i x h_q + y_q x a_q``; stretch and focal length scale the rows as well.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +23,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import kernel
+from cadalign.compile import borrowing, kernel
 from cadalign.solvers.joint.arrow import Arrow, empty_arrow
-from cadalign.solvers.joint.evidence import Evidence, count_poses
-from cadalign.solvers.joint.rows import count_equations
+from cadalign.solvers.joint.evidence import Evidence, State, count_poses, unstretched
+from cadalign.solvers.joint.rows import count_equations, exp_of, first_scale, stretched_point
+from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
+from cadalign.solvers.projection import turn, turn_back
 
 
 class JointEquations(NamedTuple):
@@ -90,3 +108,216 @@ def with_turns(one: JointEquations) -> tuple[JointEquations, JointEquations]:
         np.zeros(1),
         one.slopes.copy(),
     )
+
+
+@kernel
+def eliminate(evidence: Evidence, state: State, equations: JointEquations) -> float:
+    """Whiten the equations of points with displacements; returns the cost of their prior."""
+    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
+    last = rows.shape[0] - 4
+    cost = 0.0
+    for i in range(spread.shape[0]):
+        start, end = columns[i, 0], columns[i, 1]
+        if start == end or not spread[i] > 0:
+            continue
+        for a in range(3):
+            displacement = state.displacements[i, a]
+            cost += (displacement / spread[i]) ** 2
+            for c in range(start, end):
+                rows[last, c] -= rows[last + 1 + a, c] * displacement
+        equations.log_determinant[0] += _whiten(
+            rows, start, end, spread[i], np.empty((end - start, end - start))
+        )
+    return cost
+
+
+@borrowing
+def _whiten(rows: FloatArray, start: int, end: int, spread: float, factor: FloatArray) -> float:
+    """Whiten the columns of one point; returns the log determinant of their covariance."""
+    size = end - start
+    last = rows.shape[0] - 3
+    for p in range(size):
+        for q in range(p + 1):
+            total = 1.0 if p == q else 0.0
+            for a in range(last, last + 3):
+                total += spread * spread * rows[a, start + p] * rows[a, start + q]
+            factor[p, q] = total
+    cholesky(factor, size, 0.0)
+    log_determinant = 0.0
+    for p in range(size):
+        log_determinant += 2.0 * np.log(factor[p, p])
+        factor[p, p] = 1.0 / factor[p, p]
+    for k in range(rows.shape[0]):
+        for p in range(size):
+            total = rows[k, start + p]
+            for q in range(p):
+                total -= factor[p, q] * rows[k, start + q]
+            rows[k, start + p] = total * factor[p, p]
+    return log_determinant
+
+
+@borrowing
+def shift_means(evidence: Evidence, equations: JointEquations) -> None:
+    """Move the displacements' prior means as the slopes of the log determinant do."""
+    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
+    unknowns = rows.shape[0] - 4
+    for i in range(spread.shape[0]):
+        if not spread[i] > 0:
+            continue
+        for c in range(columns[i, 0], columns[i, 1]):
+            moved = 0.0
+            for a in range(3):
+                moved -= spread[i] ** 2 * rows[unknowns + 1 + a, c] * equations.slopes[i, a]
+            rows[unknowns, c] += moved
+            for k in range(unknowns):
+                equations.gradient[k] += rows[k, c] * moved
+
+
+@borrowing
+def follow(evidence: Evidence, equations: JointEquations, step: FloatArray, moved: State) -> None:
+    """Write the displacements that are best after a step."""
+    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
+    unknowns = step.shape[0]
+    for i in range(spread.shape[0]):
+        start, end = columns[i, 0], columns[i, 1]
+        if start == end or not spread[i] > 0:
+            continue
+        for a in range(3):
+            moved.displacements[i, a] = -(spread[i] ** 2) * equations.slopes[i, a]
+        for c in range(start, end):
+            residual = rows[unknowns, c]
+            for k in range(unknowns):
+                residual += rows[k, c] * step[k]
+            residual *= -(spread[i] ** 2)
+            for a in range(3):
+                moved.displacements[i, a] += residual * rows[unknowns + 1 + a, c]
+
+
+@kernel
+def add_log_determinant(evidence: Evidence, state: State, equations: JointEquations) -> float:
+    """Add half the derivative of the log determinant; returns that of the coefficients.
+
+    Half the derivatives by the points before the stretch are left in the equations' ``slopes``.
+    """
+    modes, total = evidence.shape.modes.shape[0], equations.seen.shape[1]
+    first = first_scale(evidence) + 3
+    factor = equations.arrow.border[first:, first:].copy()
+    if not factorize(factor):
+        return np.inf
+    volume = 0.0
+    for k in range(modes):
+        volume += 2.0 * np.log(factor[k, k])
+    left = _left_of_displacements(evidence, equations)
+    by_model, response = np.empty((3, total)), np.empty((modes, total))
+    _write_rows(evidence, state, equations, left, by_model, response)
+    solve_factor_rows(factor, response)
+    _add_slopes(evidence, state, equations, left, by_model, response)
+    return volume
+
+
+@kernel
+def _left_of_displacements(evidence: Evidence, equations: JointEquations) -> FloatArray:
+    """Share (m, 3, 3) of each point's displacement that its whitened equations leave open."""
+    spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
+    left = np.zeros((spread.shape[0], 3, 3))
+    last = rows.shape[0] - 3
+    for i in range(spread.shape[0]):
+        for r in range(3):
+            left[i, r, r] = 1.0
+        if spread[i] > 0.0:
+            for k in range(columns[i, 0], columns[i, 1]):
+                for r in range(3):
+                    for c in range(3):
+                        left[i, r, c] -= spread[i] ** 2 * rows[last + r, k] * rows[last + c, k]
+    return left
+
+
+@borrowing
+def _write_rows(
+    evidence: Evidence,
+    state: State,
+    equations: JointEquations,
+    left: FloatArray,
+    by_model: FloatArray,
+    by_modes: FloatArray,
+) -> None:
+    """Write the rows by the point before the stretch (3, N), and by the coefficients (K, N).
+
+    The latter are those that remain where the displacements follow.
+    """
+    sightings, modes, seen = evidence.sightings, evidence.shape.modes, equations.seen
+    scale = exp_of(state.log_scales)
+    column = 0
+    for n in equations.order:
+        i = sightings.point[n]
+        motion = state.poses[evidence.rig.pose[sightings.image[n]]]
+        for _ in range(count_equations(sightings, n)):
+            turned = turn_back(motion, (seen[0, column], seen[1, column], seen[2, column]))
+            row = turned[0] * scale[0], turned[1] * scale[1], turned[2] * scale[2]
+            kept = dot(left[i, 0], row), dot(left[i, 1], row), dot(left[i, 2], row)
+            for c in range(3):
+                by_model[c, column] = row[c]
+            for k in range(modes.shape[0]):
+                by_modes[k, column] = dot(modes[k, i], kept)
+            column += 1
+
+
+@borrowing
+def _add_slopes(
+    evidence: Evidence,
+    state: State,
+    equations: JointEquations,
+    left: FloatArray,
+    by_model: FloatArray,
+    response: FloatArray,
+) -> None:
+    """Add half the derivatives, from the coefficients' ``response`` (K, N) to each equation."""
+    shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
+    seen, slopes, gradient = equations.seen, equations.slopes, equations.gradient
+    start = 6 * equations.arrow.blocks.shape[0]
+    first = start + first_scale(evidence)
+    scale = exp_of(state.log_scales)
+    slopes[:] = 0.0
+    column = 0
+    for n in equations.order:
+        i, v = sightings.point[n], sightings.image[n]
+        p = rig.pose[v]
+        motion, group = state.poses[p], evidence.focals.group[v]
+        turned = turn(motion, stretched_point(shape, state, scale, i))
+        square = shape.spread[i] ** 2
+        for _ in range(count_equations(sightings, n)):
+            row = by_model[0, column], by_model[1, column], by_model[2, column]
+            moved = square * row[0], square * row[1], square * row[2]
+            for k in range(shape.modes.shape[0]):
+                share, mode = response[k, column], shape.modes[k, i]
+                moved = (
+                    moved[0] + share * mode[0],
+                    moved[1] + share * mode[1],
+                    moved[2] + share * mode[2],
+                )
+            moved = dot(left[i, 0], moved), dot(left[i, 1], moved), dot(left[i, 2], moved)
+            along = dot(row, moved)
+            a = seen[0, column], seen[1, column], seen[2, column]
+            d = seen[3, column], seen[4, column], seen[5, column]
+            y = turn(motion, (scale[0] * moved[0], scale[1] * moved[1], scale[2] * moved[2]))
+            farther = dot(d, y)
+            h = (
+                -(along * d[0] + farther * a[0]),
+                -(along * d[1] + farther * a[1]),
+                -(along * d[2] + farther * a[2]),
+            )
+            by_turn, by_row, by_point = cross(turned, h), cross(y, a), turn_back(motion, h)
+            for c in range(3):
+                gradient[6 * p + c] += by_turn[c] + by_row[c]
+                gradient[6 * p + 3 + c] += h[c]
+                gradient[first + c] += row[c] * moved[c]
+                slopes[i, c] += scale[c] * by_point[c]
+            if group >= 0 and (d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0):
+                gradient[start + group] += along
+            column += 1
+    for i in range(slopes.shape[0]):
+        for c in range(3):
+            if slopes[i, c] != 0.0:
+                gradient[first + c] += slopes[i, c] * unstretched(shape, state, i, c)
+                for k in range(shape.modes.shape[0]):
+                    gradient[first + 3 + k] += slopes[i, c] * shape.modes[k, i, c]

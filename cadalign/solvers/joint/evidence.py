@@ -13,13 +13,16 @@ coefficients. Displacements are eliminated.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import inlined, kernel
 from cadalign.solvers.constants import ScalePrior
+
+Table = TypeVar("Table", bound=tuple[Any, ...])
 
 
 class Shape(NamedTuple):
@@ -169,6 +172,17 @@ def unpacked(evidence: Evidence, row: FloatArray) -> State:
     )
 
 
+def kept_rows(table: Table, kept: BoolArray | IntArray) -> Table:
+    """Some rows of a table of columns, such as `Sightings`."""
+    columns: list[Any] = [np.ascontiguousarray(column[kept]) for column in table]
+    return type(table)(*columns)
+
+
+def stacked(tables: Sequence[Table]) -> Table:
+    """The rows of all tables, one after the other."""
+    return type(tables[0])(*map(np.concatenate, zip(*tables, strict=True)))
+
+
 def packed(state: State) -> FloatArray:
     """The state as a row of numbers."""
     return np.concatenate([np.ravel(part) for part in state])
@@ -215,18 +229,3 @@ def count_poses(evidence: Evidence) -> int:
     for v in range(evidence.rig.pose.shape[0]):
         poses = max(poses, evidence.rig.pose[v] + 1)
     return poses
-
-
-@kernel
-def with_shape(evidence: Evidence, shape: Shape) -> Evidence:
-    """The same evidence about another shape."""
-    return Evidence(
-        shape,
-        evidence.sightings,
-        evidence.rig,
-        evidence.focals,
-        evidence.directions,
-        evidence.offsets,
-        evidence.planes,
-        evidence.scales,
-    )

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.compile import fast_sums, kernel
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, count_poses, with_shape
+from cadalign.compile import fast_sums
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed
 
 _LEAST_SQUARE = 1e-14  # of a direction's rest, over the largest
 _LOST = 0.01  # of a direction's square: less asks for a second pass
@@ -32,45 +32,30 @@ class Reduction(NamedTuple):
     displaced: IntArray
 
 
-@kernel
 def reduce_modes(evidence: Evidence) -> Reduction:
     """The evidence with modes in the directions that it tells apart."""
-    shape = evidence.shape
-    modes, points = shape.modes.shape[0], shape.modes.shape[1]
-    used = used_points(evidence)
+    shape, modes = evidence.shape, len(evidence.shape.modes)
+    sighted = sighted_points(evidence)
     displaced = np.empty(0, dtype=np.int64)
-    if count_poses(evidence) > 1:
-        displaced = np.flatnonzero(sighted_points(evidence) & (shape.spread > 0.0))
-    extra = 3 * displaced.shape[0]
-    if 3 * used.sum() >= modes + extra and not extra:
+    if evidence.rig.pose.max() > 0:
+        displaced = np.flatnonzero(sighted & (shape.spread > 0))
+    size = modes + 3 * len(displaced)
+    used = used_points(evidence)
+    is_small = size <= 3 * used.sum()
+    if is_small and not len(displaced):
         return Reduction(evidence, np.eye(modes), displaced)
-    whole = np.zeros((modes + extra, points, 3))
+    whole, spread = np.zeros((size, *shape.mean.shape)), shape.spread.copy()
     whole[:modes] = shape.modes
-    spread = shape.spread.copy()
-    for j in range(displaced.shape[0]):
-        for a in range(3):
-            whole[modes + 3 * j + a, displaced[j], a] = shape.spread[displaced[j]]
-        spread[displaced[j]] = 0.0
-    if 3 * used.sum() >= modes + extra:
-        return Reduction(
-            with_shape(evidence, Shape(shape.mean, whole, spread)), np.eye(modes + extra), displaced
-        )
-    directions = np.empty((3 * used.sum(), modes + extra))
-    row = 0
-    for i in range(points):
-        if used[i]:
-            for a in range(3):
-                for k in range(modes + extra):
-                    directions[row, k] = whole[k, i, a]
-                row += 1
-    basis = directions[: _orthonormalize(directions)]
-    flat = whole.reshape((modes + extra, 3 * points))
-    reduced = (basis @ flat).reshape((basis.shape[0], points, 3))
-    return Reduction(
-        with_shape(evidence, Shape(shape.mean, reduced, spread)),
-        np.ascontiguousarray(basis.T),
-        displaced,
-    )
+    rows, axes = np.repeat(displaced, 3), np.tile(np.arange(3), len(displaced))
+    whole[np.arange(modes, size), rows, axes] = spread[rows]
+    spread[displaced] = 0.0
+    basis = np.eye(size)
+    if not is_small:
+        directions = np.ascontiguousarray(whole[:, used].reshape(size, -1).T)
+        basis = directions[: _orthonormalize(directions)]
+        whole = (basis @ whole.reshape(size, -1)).reshape(-1, *shape.mean.shape)
+    reduced = evidence._replace(shape=Shape(shape.mean, whole, spread))
+    return Reduction(reduced, np.ascontiguousarray(basis.T), displaced)
 
 
 def reduced_state(reduction: Reduction, whole: Shape, state: State) -> State:
@@ -92,6 +77,12 @@ def reduced(evidence: Evidence, state: State) -> tuple[Evidence, State]:
     return reduction.evidence, reduced_state(reduction, evidence.shape, state)
 
 
+def reduced_row(evidence: Evidence, state: State) -> tuple[Reduction, FloatArray]:
+    """The reduction of evidence, and a state in it as a row of numbers."""
+    reduction = reduce_modes(evidence)
+    return reduction, packed(reduced_state(reduction, evidence.shape, state))
+
+
 def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
     """The state in the coefficients and displacements of the shape that was reduced."""
     modes, displaced = len(whole.modes), reduction.displaced
@@ -101,26 +92,17 @@ def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
     return state._replace(coefficients=given[:modes], displacements=displacements)
 
 
-@kernel
 def used_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that a piece of evidence names."""
-    used = sighted_points(evidence)
-    ends = evidence.offsets.ends
-    for i in evidence.planes.point:
-        used[i] = True
-    for j in range(ends.shape[0]):
-        for end in range(2):
-            if ends[j, end] >= 0:
-                used[ends[j, end]] = True
+    used, ends = sighted_points(evidence), evidence.offsets.ends
+    used[evidence.planes.point] = used[ends[ends >= 0]] = True
     return used
 
 
-@kernel
 def sighted_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that are sighted."""
-    sighted = np.zeros(evidence.shape.mean.shape[0], dtype=np.bool_)
-    for i in evidence.sightings.point:
-        sighted[i] = True
+    sighted = np.zeros(len(evidence.shape.mean), dtype=bool)
+    sighted[evidence.sightings.point] = True
     return sighted
 
 

@@ -1,12 +1,18 @@
-"""Residuals of the sightings of one pose and their derivatives."""
+"""Residuals of all evidence and their derivatives, which the normal equations are made of.
+
+Sightings write rows of one pose. Each other block, of priors, directions, offsets and planes, adds
+equations about one pose and the border, by `add_row`: a row (6 + b,) of derivatives by the pose,
+the log focals, the log scales and the coefficients, and a residual. Displacements don't count.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import borrowing, inlined
-from cadalign.solvers.evidence import loss_and_root
+from cadalign.compile import borrowing, inlined, kernel
+from cadalign.solvers.evidence import beyond, loss_and_root
+from cadalign.solvers.joint.arrow import Arrow, add_row
 from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State, unstretched
 from cadalign.solvers.linalg import Triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
@@ -109,3 +115,223 @@ def write_rows(
             rows[last, column] = residuals[q]
             column += 1
     return cost
+
+
+@kernel
+def add_blocks(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add all evidence but sightings; returns its cost."""
+    cost = _add_priors(evidence, state, arrow)
+    cost += _add_directions(evidence, state, arrow)
+    cost += _add_offsets(evidence, state, arrow)
+    cost += _add_planes(evidence, state, arrow)
+    return cost
+
+
+@inlined
+def first_scale(evidence: Evidence) -> int:
+    """Place of the log scales in the border."""
+    return int(evidence.focals.low.shape[0])
+
+
+@kernel
+def bounded_scales(evidence: Evidence) -> FloatArray:
+    """Rows (3, 3) by which log scales give what their bound is on."""
+    free = evidence.scales.free
+    rows = np.diag(free)
+    if free.all():
+        rows -= 1.0 / 3.0
+    return rows
+
+
+@kernel
+def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add the priors on focal lengths, log scales and coefficients."""
+    border, gradient = arrow.border, arrow.gradient[6 * arrow.blocks.shape[0] :]
+    focals = evidence.focals
+    first = first_scale(evidence)
+    cost = 0.0
+    for f in range(first):
+        value = state.log_focals[f] - focals.center[f]
+        cost += focals.weight[f] * value * value
+        gradient[f] += focals.weight[f] * value
+        border[f, f] += focals.weight[f]
+    for a in range(3):
+        for b in range(3):
+            weight = evidence.scales.precision[a, b]
+            cost += weight * state.log_scales[a] * state.log_scales[b]
+            gradient[first + a] += weight * state.log_scales[b]
+            border[first + a, first + b] += weight
+    bound, rows = evidence.scales.bound, bounded_scales(evidence)
+    for a in range(3):
+        bounded = 0.0
+        for b in range(3):
+            bounded += rows[a, b] * state.log_scales[b]
+        if abs(bounded) >= bound.width:
+            excess = beyond(bounded, bound.width)
+            cost += bound.weight * excess * excess
+            for b in range(3):
+                gradient[first + b] += bound.weight * excess * rows[a, b]
+                for c in range(3):
+                    border[first + b, first + c] += bound.weight * rows[a, b] * rows[a, c]
+    for k in range(state.coefficients.shape[0]):
+        value = state.coefficients[k]
+        cost += value * value
+        gradient[first + 3 + k] += value
+        border[first + 3 + k, first + 3 + k] += 1.0
+    return cost
+
+
+@kernel
+def _add_directions(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add directions known in a camera, such as gravity.
+
+    The residual is the whitened difference of two unit vectors: its length is 2 sin(angle / 2).
+    """
+    directions, rig = evidence.directions, evidence.rig
+    cost = 0.0
+    row, seen, by_rig = np.zeros(6 + arrow.border.shape[0]), np.empty(3), np.empty(3)
+    for d in range(directions.image.shape[0]):
+        v = directions.image[d]
+        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+        rotated = np.zeros(3)
+        for r in range(3):
+            for a in range(3):
+                rotated[r] += pose[3 * r + a] * directions.model[d, a]
+        for c in range(3):
+            seen[c] = -directions.camera[d, c]
+            for r in range(3):
+                seen[c] += camera[3 * c + r] * rotated[r]
+        for w in range(3):
+            whitening = directions.whitening[d, w]
+            value = whitening[0] * seen[0] + whitening[1] * seen[1] + whitening[2] * seen[2]
+            cost += value * value
+            for r in range(3):
+                by_rig[r] = (
+                    whitening[0] * camera[r]
+                    + whitening[1] * camera[3 + r]
+                    + whitening[2] * camera[6 + r]
+                )
+            _write_turn(rotated, by_rig, row)
+            add_row(arrow, rig.pose[v], row, value)
+    return cost
+
+
+@kernel
+def _add_offsets(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add known distances along directions of the model.
+
+    A camera's place in the model's frame is ``-R' q``, with the pose (R, t), the camera's (C, c) in
+    the rig and ``q = t + C' c``: along the direction d it is ``-(R d) . q``.
+    """
+    offsets, rig = evidence.offsets, evidence.rig
+    row = np.empty(6 + arrow.border.shape[0])
+    turned, q = np.empty(3), np.empty(3)
+    cost = 0.0
+    for j in range(offsets.value.shape[0]):
+        v, weight = offsets.image[j], offsets.weight[j]
+        p = 0 if v < 0 else rig.pose[v]
+        value = -offsets.value[j]
+        row[:] = 0.0
+        for end in range(2):
+            sign = 2.0 * end - 1.0
+            i = offsets.ends[j, end]
+            if i < 0:
+                camera, pose = rig.cam_from_rig[v], state.poses[p]
+                for r in range(3):
+                    turned[r] = 0.0
+                    q[r] = pose[9 + r]
+                    for a in range(3):
+                        turned[r] += pose[3 * r + a] * offsets.direction[j, a]
+                        q[r] += camera[3 * a + r] * camera[9 + a]
+                _write_turn(turned, q, row)
+                for r in range(3):
+                    value -= sign * turned[r] * q[r]
+                    row[r] *= -sign * weight
+                    row[3 + r] = -sign * weight * turned[r]
+                continue
+            for a in range(3):
+                along = sign * offsets.direction[j, a]
+                if along != 0.0:
+                    stretched = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
+                    value += along * stretched
+                    _add_shape(evidence, state, i, a, weight * along, row)
+        value *= weight
+        cost += value * value
+        add_row(arrow, p, row, value)
+    return cost
+
+
+@kernel
+def _add_planes(evidence: Evidence, state: State, arrow: Arrow) -> float:
+    """Add points that lie in planes known in a camera.
+
+    The residual is ``normal . X / normal . ray - depth`` of the point X in the camera's frame, the
+    depth at which the ray meets the plane through it.
+    """
+    planes, rig = evidence.planes, evidence.rig
+    row = np.empty(6 + arrow.border.shape[0])
+    rotated, normal, stretched = np.empty(3), np.empty(3), np.empty(3)
+    cost = 0.0
+    for j in range(planes.point.shape[0]):
+        v, i = planes.image[j], planes.point[j]
+        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+        for a in range(3):
+            stretched[a] = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
+        group = evidence.focals.group[v]
+        tilt = planes.normal[j, 0] * planes.ray[j, 0] + planes.normal[j, 1] * planes.ray[j, 1]
+        if group >= 0:
+            tilt *= np.exp(-state.log_focals[group])
+        along = planes.normal[j, 2] + tilt
+        met = 0.0
+        for r in range(3):
+            normal[r] = rotated[r] = 0.0
+            for c in range(3):
+                normal[r] += planes.normal[j, c] / along * camera[3 * c + r]
+                rotated[r] += pose[3 * r + c] * stretched[c]
+            met += planes.normal[j, r] / along * camera[9 + r]
+            met += normal[r] * (rotated[r] + pose[9 + r])
+        value = (met - planes.depth[j]) * planes.weight[j]
+        part, root = loss_and_root(planes.loss[j], planes.loss_scale[j], value * value)
+        cost += part
+        weight = root * planes.weight[j]
+        for r in range(3):
+            normal[r] *= weight
+        row[:] = 0.0
+        _write_turn(rotated, normal, row)
+        if group >= 0:
+            row[6 + group] = weight * met * tilt / along
+        for a in range(3):
+            row[3 + a] = normal[a]
+            slope = normal[0] * pose[a] + normal[1] * pose[3 + a] + normal[2] * pose[6 + a]
+            _add_shape(evidence, state, i, a, slope, row)
+        add_row(arrow, rig.pose[v], row, root * value)
+    return cost
+
+
+@inlined
+def _write_turn(rotated: FloatArray, slope: FloatArray, row: FloatArray) -> None:
+    """Write the derivatives by the rotation of ``slope . rotated``."""
+    row[0] = rotated[1] * slope[2] - rotated[2] * slope[1]
+    row[1] = rotated[2] * slope[0] - rotated[0] * slope[2]
+    row[2] = rotated[0] * slope[1] - rotated[1] * slope[0]
+
+
+@inlined
+def _undisplaced(evidence: Evidence, state: State, i: int, a: int) -> float:
+    """Coordinate a of point i, neither stretched nor displaced."""
+    value = evidence.shape.mean[i, a]
+    for k in range(evidence.shape.modes.shape[0]):
+        value += state.coefficients[k] * evidence.shape.modes[k, i, a]
+    return float(value)
+
+
+@inlined
+def _add_shape(
+    evidence: Evidence, state: State, i: int, a: int, slope: float, row: FloatArray
+) -> None:
+    """Add the derivatives by scale and modes of ``slope`` times coordinate a of point i."""
+    first = 6 + first_scale(evidence)
+    scale = slope * np.exp(state.log_scales[a])
+    row[first + a] += scale * _undisplaced(evidence, state, i, a)
+    for k in range(evidence.shape.modes.shape[0]):
+        row[first + 3 + k] += scale * evidence.shape.modes[k, i, a]

@@ -1,4 +1,4 @@
-"""Search and refinement of joint estimates, in the modes that the evidence tells apart."""
+"""Starts, search and refinement of joint estimates, in the modes that the evidence tells apart."""
 
 from __future__ import annotations
 
@@ -6,17 +6,23 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked
-from cadalign.solvers.joint.reduction import reduce_modes, reduced_state, whole_state
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.solvers.constants import UNKNOWNS, ScalePrior
+from cadalign.solvers.joint.evidence import Evidence, State, unpacked
+from cadalign.solvers.joint.reduction import reduce_modes, reduced_row, whole_state
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
+from cadalign.solvers.optimal import optimal_batch
 from cadalign.solvers.search import Effort, descend, refine, room_for_minima, search
+from cadalign.solvers.starts import widen_by_shape
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200
 _FEW_ITERATIONS = 3  # of a start, before the shape is integrated out
 _LESS_LIKELY = 20.0  # excess score of a start that is refined no further
 _UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
+MOST_PER_VIEW = 8
+_LEAST_POINTS = 3
+_UNLIKELY_POSE = 60.0  # excess cost of a pose of the mean shape that is still a start
 
 
 class JointMinima(NamedTuple):
@@ -71,8 +77,7 @@ def refine_joint(
 
     The cost is infinite if a point lies behind a camera at the start.
     """
-    reduction = reduce_modes(evidence)
-    row = packed(reduced_state(reduction, evidence.shape, state))
+    reduction, row = reduced_row(evidence, state)
     system = Joint(reduction.evidence, has_latent(reduction.evidence))
     cost, iterations, converged = refine(system, max_iterations, row)
     if system.integrates and cost < np.inf:
@@ -83,13 +88,65 @@ def refine_joint(
 
 def objective_of(evidence: Evidence, state: State) -> float:
     """Objective of `refine_joint`: the cost, with the log determinant of what is integrated out."""
-    reduction = reduce_modes(evidence)
-    row = packed(reduced_state(reduction, evidence.shape, state))
+    reduction, row = reduced_row(evidence, state)
     return float(joint_cost(Joint(reduction.evidence, has_latent(reduction.evidence)), row))
 
 
 def score_state(evidence: Evidence, state: State) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
-    reduction = reduce_modes(evidence)
-    row = packed(reduced_state(reduction, evidence.shape, state))
+    reduction, row = reduced_row(evidence, state)
     return float(joint_score(Joint(reduction.evidence, False), row, 0.0))
+
+
+class ViewRays(NamedTuple):
+    """Keypoints of one view: points (n, 3) of the mean, rays (n, 2), and whitening (n, 3).
+
+    ``rows`` (n,) are their numbers among all sightings.
+    """
+
+    points: FloatArray
+    rays: FloatArray
+    whitening: FloatArray
+    rows: IntArray
+
+
+def rays_in(evidence: Evidence, view: int) -> ViewRays:
+    """One view's keypoints, the shape's uncertainty in their whitening."""
+    sightings, shape = evidence.sightings, evidence.shape
+    rows = np.flatnonzero((sightings.image == view) & (sightings.whitening[:, 2] > 0))
+    point = sightings.point[rows]
+    given = ViewRays(shape.mean[point], sightings.rays[rows], sightings.whitening[rows], rows)
+    variances = shape.spread[point] ** 2 + (shape.modes[:, point] ** 2).sum(axis=(0, 2)) / 3
+    if len(rows):
+        widen_by_shape(given.points, given.rays, variances, given.whitening)
+    return given
+
+
+def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
+    """Camera poses (S, 12) and log scales (S, 3) from one view's keypoints, the likeliest first."""
+    given = rays_in(evidence, view)
+    sightings, scales = evidence.sightings, evidence.scales
+    if len(given.rows) < _LEAST_POINTS:
+        return np.empty((0, 12)), np.empty((0, 3))
+    # The solvers' first axis is one whose scale is known; the order of the others is cyclic, since
+    # it must not be a reflection.
+    order = (np.argmin(scales.free) + np.arange(3)) % 3
+    weight = scales.precision[order[1], order[1]]
+    prior = ScalePrior(weight, 0.0) if weight > 0 else scales.bound
+    found, costs, _, _, info = optimal_batch(
+        np.ascontiguousarray(given.points[:, order]),
+        given.rays,
+        given.whitening,
+        np.array([0, len(given.rows)]),
+        int(sightings.loss[given.rows[0]]),
+        sightings.loss_scale[given.rows[:1]],
+        np.array([prior.weight]),
+        float(prior.width),
+        np.append(np.ones(UNKNOWNS - 2), scales.free[order[1:]]),
+        _LEAST_POINTS,
+    )
+    own = costs[0, : min(info[0, 0], MOST_PER_VIEW)]
+    poses = found[0, : int((own < costs[0, 0] + _UNLIKELY_POSE).sum())]
+    place = np.argsort(order)
+    rotations = poses[:, :9].reshape(-1, 3, 3)[:, :, place].reshape(-1, 9)
+    return np.concatenate([rotations, poses[:, 9:12]], axis=1), np.log(poses[:, 12 + place])

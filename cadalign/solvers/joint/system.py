@@ -1,9 +1,9 @@
 """The system of all unknowns: poses, focal lengths, scales and shape from all evidence.
 
-Of one pose, displacements of points are eliminated (see `cadalign.solvers.joint.displacements`); of
+Of one pose, displacements of points are eliminated (see `cadalign.solvers.joint.equations`); of
 several, they are modes (see `cadalign.solvers.joint.reduction`), so that poses have no products
 with each other. What is integrated out, coefficients and displacements, leaves its log determinant
-in the objective (see `cadalign.solvers.joint.determinant`).
+in the objective (see `cadalign.solvers.joint.equations`).
 """
 
 from __future__ import annotations
@@ -27,12 +27,25 @@ from cadalign.solvers.joint.arrow import (
     log_determinant,
     solve_arrow,
 )
-from cadalign.solvers.joint.blocks import add_blocks, bounded_scales, first_scale
-from cadalign.solvers.joint.determinant import add_log_determinant
-from cadalign.solvers.joint.displacements import eliminate, follow, shift_means
-from cadalign.solvers.joint.equations import JointEquations, joint_room, with_turns
+from cadalign.solvers.joint.equations import (
+    JointEquations,
+    add_log_determinant,
+    eliminate,
+    follow,
+    joint_room,
+    shift_means,
+    with_turns,
+)
 from cadalign.solvers.joint.evidence import Evidence, State, unpacked
-from cadalign.solvers.joint.rows import count_equations, exp_of, stretched_point, write_rows
+from cadalign.solvers.joint.rows import (
+    add_blocks,
+    bounded_scales,
+    count_equations,
+    exp_of,
+    first_scale,
+    stretched_point,
+    write_rows,
+)
 from cadalign.solvers.projection import shift, turn
 from cadalign.solvers.search import (
     are_same,

@@ -38,14 +38,15 @@ from cadalign.solvers.evidence import (
     score_of_distance,
 )
 from cadalign.solvers.linalg import cholesky, copy_into, dot
-from cadalign.solvers.marginal.correlation import (
+from cadalign.solvers.marginal.problem import (
+    GaussianTarget,
+    Seen,
     factorize_upper,
     invert_upper,
     unwhiten,
     whiten,
     write_covariance,
 )
-from cadalign.solvers.marginal.problem import GaussianTarget, Seen
 from cadalign.solvers.projection import (
     motion_of,
     ray_slopes,

@@ -9,7 +9,6 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, kernel
 from cadalign.solvers.linalg import cholesky, multiply_3, solve_cholesky
-from cadalign.solvers.marginal.correlation import whiten
 from cadalign.solvers.marginal.equations import (
     POSE,
     POSE_UNKNOWNS,
@@ -19,8 +18,14 @@ from cadalign.solvers.marginal.equations import (
     force_of,
     posed_room,
 )
-from cadalign.solvers.marginal.moments import Likely
-from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, shape_at, target_of
+from cadalign.solvers.marginal.problem import (
+    GaussianTarget,
+    Mixture,
+    Seen,
+    shape_at,
+    target_of,
+    whiten,
+)
 from cadalign.solvers.search import Minima
 
 
@@ -34,6 +39,17 @@ class Posterior(NamedTuple):
 
     points: FloatArray
     covariance: FloatArray
+    of_points: FloatArray
+    of_seen: FloatArray
+
+
+class Likely(NamedTuple):
+    """Posteriors of L estimates at ``poses`` (L, 12), and the ``lengths`` (L, 3) of their boxes."""
+
+    poses: FloatArray
+    points: FloatArray
+    lengths: FloatArray
+    covariances: FloatArray
     of_points: FloatArray
     of_seen: FloatArray
 
@@ -133,13 +149,10 @@ def _add_pose(rows: FloatArray, pose: FloatArray, covariance: FloatArray) -> Non
 
 @kernel
 def posteriors_of(
-    mixture: Mixture, seen: Seen, minima: Minima, likelihoods: FloatArray, inflation: float
+    mixture: Mixture, seen: Seen, minima: Minima, count: int, inflation: float
 ) -> Likely:
-    """The posteriors of the first minima, as many as there are ``likelihoods`` (L,).
-
-    The box holds the keypoints that are seen.
-    """
-    count, m = likelihoods.shape[0], mixture.means.shape[1]
+    """The posteriors of the first minima. The box holds the keypoints that are seen."""
+    m = mixture.means.shape[1]
     likely = Likely(
         minima.states[:count, :POSE].copy(),
         np.empty((count, m, 3)),
@@ -147,7 +160,6 @@ def posteriors_of(
         np.empty((count, 9, 9)),
         np.empty((count, m, 3, 3)),
         np.empty((count, m, 3, 3)),
-        likelihoods,
     )
     for k in range(count):
         found = posterior_of(mixture, minima.label[k], seen, minima.states[k], inflation)

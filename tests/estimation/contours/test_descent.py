@@ -12,8 +12,7 @@ from support.scenes import CAMERA, truth_of
 from cadalign import Alignment, Camera, Mesh, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.estimation.contours.contour import Contour
-from cadalign.estimation.contours.descent import Descent, Masked, Place
-from cadalign.estimation.contours.loop import settle
+from cadalign.estimation.contours.descent import Descent, Masked, Place, settle
 from cadalign.estimation.contours.rims import Rims, across_rims
 from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.contours.view_contour import contour_view

@@ -1,0 +1,142 @@
+"""Usual mistakes in a joint estimate's keypoints: undone, and the estimate made anew."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError
+from cadalign.estimation.joint_robust import OUTLIER_COST
+from cadalign.estimation.mistakes import (
+    Explained,
+    Mistake,
+    find_in_all,
+    find_mistake,
+    other_sizes,
+)
+from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.search import (
+    JointProblem,
+    Minimum,
+    minima_at_noise,
+    outlier_areas,
+    thresholds,
+)
+from cadalign.estimation.uncertainty.evidence import redundancy_of
+
+_FEW_REJECTED = 0.9  # share of the keypoints that agree, above which no mistake is searched for
+_LEAST_MISFIT = 2.0  # root of the reduced chi-square at which a mistake is looked for
+_MOST_CORRECTED = 1.6  # the same, without the mistake
+_LEAST_RATIO = 1.7  # of both
+
+
+def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions | None) -> str | None:
+    """Name the mistake without which the keypoints agree better.
+
+    With ``ransac`` where many are rejected, otherwise where the evidence does not agree at all.
+    """
+    if ransac is None:
+        return _mistake_in_all(problem, best)
+    if best.inliers.mean() > _FEW_REJECTED:
+        return None
+
+    def explain(mistake: Mistake) -> Explained | None:
+        minimum = _without(problem, mistake, ransac)
+        return None if minimum is None else _explained(problem, minimum, ransac)
+
+    return find_mistake(_explained(problem, best, ransac), len(best.inliers), explain)
+
+
+def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:
+    """Name the mistake without which all evidence agrees."""
+    given, count = _misfit(best), sum(len(view.keypoint_ids) for view in problem.views)
+    if (
+        not count
+        or problem.lacks_sigma
+        or given < _LEAST_MISFIT
+        or best.evidence.sightings.loss.any()
+    ):
+        return None
+
+    def explain(mistake: Mistake) -> Explained | None:
+        minimum = _without(problem, mistake, None)
+        if minimum is None or _misfit(minimum) > min(_MOST_CORRECTED, given / _LEAST_RATIO):
+            return None
+        return Explained(minimum.score, count, _up(minimum))
+
+    sizes = []
+    has_more = problem.size is not None or any(view.sources for view in problem.views)
+    # Another image size leaves much open, so that other evidence which is wrong would pass for it.
+    is_one = len({(view.camera.width, view.camera.height) for view in problem.views}) == 1
+    if is_one and not has_more:
+        pixels = np.concatenate([cast(FloatArray, view.points_2d) for view in problem.views])
+        sizes = other_sizes(pixels, problem.views[0].camera)
+    found = find_in_all(best.score, count, explain, sizes)
+    if found is None:
+        return None
+    return (
+        f"{found[0]}: corrected, all evidence agrees; as given, the residuals are {given:.2g} "
+        "times what their standard deviations allow"
+    )
+
+
+def _misfit(minimum: Minimum) -> float:
+    """Root of the reduced chi-square; 0 where nothing is redundant."""
+    redundancy = redundancy_of(minimum.evidence)
+    return math.sqrt(minimum.cost / redundancy) if redundancy > 0 else 0.0
+
+
+def _without(
+    problem: JointProblem, mistake: Mistake, ransac: RansacOptions | None
+) -> Minimum | None:
+    """The likeliest minimum after a mistake is undone, if there is one."""
+    unknown = [None] * len(problem.views)  # starts are of the data as given
+    try:
+        minima, _, _ = minima_at_noise(_undone_in(problem, mistake), unknown, ransac)
+    except CadalignError:
+        return None
+    return minima[0] if minima else None
+
+
+def _up(minimum: Minimum) -> float:
+    """The cosine between the model's y axis and the first photo's upwards."""
+    rig = minimum.evidence.rig
+    in_rig = minimum.state.poses[rig.pose[0], :9].reshape(3, 3)
+    in_camera = rig.cam_from_rig[0, :9].reshape(3, 3) @ in_rig
+    return -float(in_camera[1, 1])
+
+
+def _explained(problem: JointProblem, minimum: Minimum, ransac: RansacOptions) -> Explained:
+    """Likelihood of all keypoints at a minimum: outliers of any threshold lie anywhere."""
+    rejected, error = ~minimum.inliers, problem.threshold(ransac)
+    evidence = problem.evidence(minimum.evidence.shape, minimum.lenses)
+    squares = thresholds(evidence, minimum.lenses, error)[rejected] ** 2
+    areas = outlier_areas(problem.views, error)[evidence.sightings.image[rejected]]
+    anywhere = 2 * np.log(areas * squares / (2 * math.pi * error**2))
+    score = minimum.score + float((anywhere - squares - OUTLIER_COST).sum())
+    return Explained(score, int(minimum.inliers.sum()), _up(minimum))
+
+
+def _undone_in(problem: JointProblem, mistake: Mistake) -> JointProblem:
+    """The problem with a mistake in the model or in the keypoints of all views undone."""
+    components = tuple(
+        shape._replace(mean=_undone(mistake, shape.mean), modes=_undone(mistake, shape.modes))
+        for shape in problem.prior.components
+    )
+    views = [
+        replace(each, points_2d=mistake.undo_2d(cast(FloatArray, each.points_2d), each.camera))
+        for each in problem.views
+    ]
+    return problem._replace(prior=replace(problem.prior, components=components), views=views)
+
+
+def _undone(mistake: Mistake, points: FloatArray) -> FloatArray:
+    """Points (..., m, 3) without a mistake; the last two stay the box's least and greatest."""
+    undone = mistake.undo_3d(points)
+    if mistake.mirrored:
+        undone[..., -2:, 0] = undone[..., :-3:-1, 0].copy()
+    return undone

@@ -1,0 +1,196 @@
+"""Usual mistakes in keypoints: each is undone, and named where the keypoints then agree."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
+
+OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
+"""Usual sizes of other images of a photo, over that of its camera."""
+_LEAST_GAIN = 2.0  # of -2 log likelihood, by which corrected data must explain more
+_DECISIVE = 12.0  # the same where nothing is rejected
+_AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
+_UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
+_MOST_INSIDE = 0.8  # of the keypoints lie in their image
+
+
+class Explained(NamedTuple):
+    """Agreement of keypoints with an estimate: -2 log likelihood of all, and number of inliers.
+
+    ``up`` is the cosine between the model's y axis and the photo's upwards.
+    """
+
+    score: float
+    inliers: int
+    up: float
+
+
+class Mistake(NamedTuple):
+    """A usual mistake in keypoints, named by a clause; made again, it is undone.
+
+    The model mirrored across x, u or v counted from the photo's other side, u and v swapped, or
+    pixels of an image ``factor`` times as large as the camera's.
+    """
+
+    clause: str
+    mirrored: bool = False
+    flipped: tuple[bool, bool] = (False, False)
+    swapped: bool = False
+    factor: float = 1.0
+
+    def undo_3d(self, points_3d: FloatArray) -> FloatArray:
+        """Keypoints on the model (n, 3) without the mistake."""
+        return points_3d * [-1.0, 1.0, 1.0] if self.mirrored else points_3d
+
+    def undo_2d(self, points_2d: FloatArray, camera: Camera) -> FloatArray:
+        """Keypoints in the image (n, 2) [px] without the mistake."""
+        if self.swapped:
+            return np.ascontiguousarray(points_2d[:, ::-1])
+        if self.factor != 1:
+            return rescaled_pixels(points_2d, 1 / self.factor)
+        last = np.array([camera.width - 1.0, camera.height - 1.0])
+        return np.where(self.flipped, last - points_2d, points_2d)
+
+
+# About a centred principal point, flips are the same as a mirrored model.
+_MISTAKES = (
+    Mistake("the model is mirrored", mirrored=True),
+    Mistake("u and v are swapped", swapped=True),
+    Mistake("the photo is flipped", flipped=(True, False)),
+    Mistake("v counts from the bottom", flipped=(False, True)),
+)
+Tried = Sequence[tuple[Mistake, Explained]]
+
+
+def try_mistakes(
+    explain: Callable[[Mistake], Explained | None],
+    count: int,
+    mistakes: Iterable[Mistake] = _MISTAKES,
+) -> list[tuple[Mistake, Explained]]:
+    """Explain the best estimate after each mistake is undone, where there is one.
+
+    Scores become those of ``count`` keypoints in the pixels that are given.
+    """
+    pairs = ((mistake, explain(mistake)) for mistake in mistakes)
+    return [
+        (mistake, each._replace(score=each.score + 4 * count * math.log(mistake.factor)))
+        for mistake, each in pairs
+        if each is not None
+    ]
+
+
+def other_sizes(points_2d: FloatArray, camera: Camera) -> list[Mistake]:
+    """Mistakes in the resolution of keypoints (n, 2), of images that hold most of them."""
+    own = f"{camera.width} x {camera.height} px"
+    found = []
+    for factor in OTHER_SIZES:
+        width, height = round(camera.width * factor), round(camera.height * factor)
+        image = camera.resized(max(width, 1), max(height, 1))
+        if image.contains(points_2d).sum() > _MOST_INSIDE * len(points_2d):
+            size = f"{image.width} x {image.height} px"
+            clause = f"the keypoints are of images of {size}, the camera of {own}"
+            found.append(Mistake(clause, factor=factor))
+    return found
+
+
+def larger_sizes(points_2d: FloatArray, camera: Camera) -> list[Mistake]:
+    """Those of `other_sizes`, where the camera's image does not hold most keypoints (n, 2)."""
+    holds_most = camera.contains(points_2d).sum() > _MOST_INSIDE * len(points_2d)
+    return [] if holds_most else other_sizes(points_2d, camera)
+
+
+def find_in_all(
+    score: float,
+    count: int,
+    explain: Callable[[Mistake], Explained | None],
+    sizes: Sequence[Mistake] = (),
+) -> tuple[str, Mistake, float] | None:
+    """Name the mistake without which all keypoints of an estimate without search would agree.
+
+    ``score`` is that of the ``count`` keypoints as given; ``explain`` says None where they do not
+    agree after a mistake is undone. Returns clauses, the likeliest mistake and its score.
+    """
+    tried = try_mistakes(explain, count) + try_mistakes(explain, count, sizes)
+    tried = [each for each in tried if each[1].score < score - _DECISIVE]
+    if not tried:
+        return None
+    mistake, best = min(tried, key=lambda each: each[1].score)
+    return name_likely(tried, best), mistake, best.score
+
+
+def name_likely(tried: Tried, best: Explained) -> str:
+    """Clauses of the mistakes that are as likely as the best; first those of an upright object."""
+    likely = [(m.clause, each) for m, each in tried if each.score < best.score + _AS_LIKELY]
+    upright = [clause for clause, each in likely if each.up > _UPRIGHT]
+    others = [clause for clause, each in likely if each.up <= _UPRIGHT]
+    named = _listed(upright or others)
+    if upright and others:
+        named += f" (or, if y is not up in the photo, {_listed(others)})"
+    return named
+
+
+def find_mistake(
+    found: Explained,
+    given: int,
+    explain: Callable[[Mistake], Explained | None],
+    sizes: Sequence[Mistake] = (),
+) -> str | None:
+    """Name the mistake without which more keypoints of a robust search would agree.
+
+    ``found`` is what the estimate explains of the ``given`` number of keypoints; ``explain`` says
+    what the best estimate explains after a mistake is undone, None where there is none; ``sizes``
+    are mistakes in the resolution, tried where keypoints are rejected. Returns a warning; None
+    where no mistake makes the data likelier.
+    """
+
+    def is_better(each: Explained) -> bool:
+        """Likelier, and by more keypoints: outliers and wrong shapes change the likelihood, too."""
+        more = each.inliers > found.inliers or each.inliers == given
+        return more and each.score < found.score - _LEAST_GAIN
+
+    rejected = given - found.inliers
+    # Where all agree, perspective is so weak that they agree with a mirrored model if with any.
+    first = 2 if rejected else 1
+    tried = try_mistakes(explain, given, (*_MISTAKES[:first], *(sizes if rejected else ())))
+    if not any(is_better(each) for _, each in tried):
+        return None
+    tried += try_mistakes(explain, given, _MISTAKES[first:])
+    best = min((each for _, each in tried if is_better(each)), key=lambda each: each.score)
+    return (
+        f"{name_likely(tried, best)}: corrected, {best.inliers} of {given} keypoints agree; as "
+        f"given, {rejected} ({100 * rejected / given:.0f} %) are rejected"
+    )
+
+
+def _listed(clauses: Sequence[str]) -> str:
+    *some, last = clauses
+    return f"{', '.join(some)} or {last}" if some else last
+
+
+def outside_image(
+    points_2d: FloatArray, camera: Camera, *, agree: bool, where: str = ""
+) -> tuple[str, ...]:
+    """Warn about keypoints (n, 2) that are none of the image's.
+
+    All of them lie beyond one side, or, where they do not ``agree``, most outside: of an object
+    that is hidden or cropped, some may, and they may surround the image.
+    """
+    count = int((~camera.contains(points_2d)).sum())
+    if 2 * count <= len(points_2d):
+        return ()
+    last = np.array([camera.width, camera.height]) - PIXEL_CENTRE
+    beyond = (points_2d < -PIXEL_CENTRE).all(axis=0) | (points_2d > last).all(axis=0)
+    if agree and not beyond.any():
+        return ()
+    return (
+        f"{where}{count} of {len(points_2d)} keypoints lie outside of the image of {camera.width} "
+        f"x {camera.height} px: are they of another resolution than the camera, or of another "
+        "photo?",
+    )

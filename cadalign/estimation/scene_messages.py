@@ -1,0 +1,149 @@
+"""Messages about what the objects of a photo share: Gaussians of focal length, gravity and ground.
+
+The shared unknowns are the logarithm of the focal length, the direction against gravity in the
+camera's frame, by its coordinates along two axes across a reference, and the logarithm of the
+camera's height above the ground.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.view import View
+
+UP = slice(1, 3)
+PARTS = {"focal": slice(0, 1), "gravity": UP, "ground": slice(3, 4)}
+_LEAST_INFORMATION = 1e-9  # below, nothing is said of an unknown
+_WIDEST_UP = 0.5  # standard deviation of a direction that is taken as a prior [rad]
+_OTHERS = "the other objects"
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMessage:
+    """Information (4, 4) and its product with the mean (4,), about a reference.
+
+    The unknowns are the log focal length, the direction's coordinates along two axes across the
+    reference's, and the log height.
+    """
+
+    information: FloatArray
+    weighted: FloatArray
+
+    def __add__(self, other: SceneMessage) -> SceneMessage:
+        return SceneMessage(self.information + other.information, self.weighted + other.weighted)
+
+    def __sub__(self, other: SceneMessage) -> SceneMessage:
+        return SceneMessage(self.information - other.information, self.weighted - other.weighted)
+
+    @classmethod
+    def of(cls, mean: FloatArray, information: FloatArray) -> SceneMessage:
+        return cls(information, information @ mean)
+
+    @property
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (4,) and covariance (4, 4), infinite variances where nothing is said."""
+        said = self.information.diagonal() > _LEAST_INFORMATION
+        mean, covariance = np.zeros(4), np.diag(np.where(said, 0.0, np.inf))
+        if said.any():
+            inverse = np.linalg.pinv(self.information[np.ix_(said, said)], hermitian=True)
+            covariance[np.ix_(said, said)] = inverse
+            mean[said] = inverse @ self.weighted[said]
+        return mean, covariance
+
+    def positive(self, rows: Sequence[int]) -> SceneMessage:
+        """The message without directions in which an object is less certain than its prior was."""
+        values, axes = np.linalg.eigh(self.information[np.ix_(rows, rows)])
+        kept = axes[:, values > _LEAST_INFORMATION]
+        projection = np.zeros((4, 4))
+        projection[np.ix_(rows, rows)] = kept @ kept.T
+        return SceneMessage(projection @ self.information @ projection, projection @ self.weighted)
+
+    def tilted(self, tilt: float) -> SceneMessage:
+        """The message about gravity of one about an object's up axis."""
+        noise = np.diag([0.0, tilt**2, tilt**2, 0.0])
+        factor = np.linalg.inv(np.eye(4) + self.information @ noise)
+        return SceneMessage(factor @ self.information, factor @ self.weighted)
+
+
+NOTHING = SceneMessage(np.zeros((4, 4)), np.zeros(4))
+
+
+@dataclass(frozen=True, eq=False)
+class SharedUnknowns:
+    """Values of the shared unknowns: the reference of messages, and the prior of an object.
+
+    ``covariance`` (4, 4) is that of their deviations; infinite where nothing is known.
+    """
+
+    focal: float
+    up: FloatArray
+    height: float
+    covariance: FloatArray
+
+    @property
+    def across(self) -> FloatArray:
+        """Two axes (2, 3) across the direction."""
+        _, _, axes = np.linalg.svd(self.up[None])
+        return np.asarray(axes[1:])
+
+    def deviations(self, focal: float, up: FloatArray, height: float) -> FloatArray:
+        """Deviations (4,) of values from these."""
+        sine, cosine = self.across @ up, float(self.up @ up)
+        angle = math.atan2(float(np.linalg.norm(sine)), cosine)
+        turned = sine * (angle / max(float(np.linalg.norm(sine)), 1e-300))
+        return np.array([math.log(focal / self.focal), *turned, math.log(height / self.height)])
+
+    def moved(self, mean: FloatArray, covariance: FloatArray) -> SharedUnknowns:
+        """The values at deviations from these, with their covariance."""
+        turn = self.across.T @ mean[UP]
+        angle = float(np.linalg.norm(turn))
+        up = math.cos(angle) * self.up + np.sinc(angle / math.pi) * turn
+        focal, height = self.focal * math.exp(mean[0]), self.height * math.exp(mean[3])
+        return SharedUnknowns(focal, up / np.linalg.norm(up), height, covariance)
+
+    def tilted(self, tilt: float) -> SharedUnknowns:
+        """The values for the up axis of one object, which deviates from gravity's."""
+        return replace(self, covariance=self.covariance + np.diag([0, tilt**2, tilt**2, 0]))
+
+    @property
+    def focal_prior(self) -> FocalPrior | None:
+        """The prior on the focal length, where one is known."""
+        variance = self.covariance[0, 0]
+        return FocalPrior(self.focal, math.sqrt(variance), _OTHERS) if variance < np.inf else None
+
+    def seen_by(self, view: View, wanted: Collection[str]) -> View:
+        """A view with what is known of gravity and ground."""
+        if "gravity" in wanted and self.std("gravity") < _WIDEST_UP:
+            turned = self.across.T @ self.covariance[UP, UP] @ self.across
+            view = replace(view, up=self.up, up_sigma_deg=np.degrees(np.degrees(turned)))
+        if "ground" in wanted and np.isfinite(self.covariance[3, 3]):
+            sigma = math.sqrt(self.covariance[3, 3])
+            view = replace(view, camera_height=self.height, camera_height_sigma=sigma)
+        return view
+
+    def std(self, part: str) -> float:
+        """The largest standard deviation of a part."""
+        block = self.covariance[PARTS[part], PARTS[part]]
+        if not np.isfinite(block).all():
+            return math.inf
+        return float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0)))
+
+
+def as_prior(
+    values: SharedUnknowns, reference: SharedUnknowns, rows: Sequence[int] = range(4)
+) -> SceneMessage:
+    """The message of separate priors on focal length, direction and height, on some rows."""
+    information = np.zeros((4, 4))
+    for part in PARTS.values():
+        block = values.covariance[part, part]
+        if np.isfinite(block).all() and block.any():
+            information[part, part] = np.linalg.inv(block)
+    chosen = np.isin(np.arange(4), list(rows))
+    mean = reference.deviations(values.focal, values.up, values.height)
+    return SceneMessage.of(mean, np.where(np.outer(chosen, chosen), information, 0.0))

@@ -1,0 +1,128 @@
+"""`fit` with an unknown principal point, of photos that may be cropped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cadalign import Camera, RansacOptions, Result, fit, fit_batch
+from cadalign.cli import main
+from cadalign.errors import InputError
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.geometry.metrics import rotation_error
+from cadalign.io.observation import Observation
+
+CENTERED = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+SIGMA = 40.0
+
+
+def cropped(seed: int, points: int, noise_px: float = 1.0) -> Problem:
+    """A problem whose principal point is off the image's centre as the prior says."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.normal(0.0, SIGMA, 2)
+    camera = Camera(640, 480, 600.0, 600.0, 319.5 + x, 239.5 + y)
+    return simulate_problem(rng, points=points, noise_px=noise_px, camera=camera)
+
+
+def fitted(problem: Problem, **options: object) -> Result:
+    chosen = {"principal_sigma": SIGMA, **options}
+    return fit(problem.points_3d, problem.points_2d, CENTERED, **chosen)  # type: ignore[arg-type]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("points", [8, 20, 60])
+def test_principal_point_is_found_as_well_as_stated(points: int) -> None:
+    inside, errors, ratios, without = [], [], [], []
+    for seed in range(60):
+        problem = cropped(seed, points)
+        result = fitted(problem)
+        assert result.principal_std is not None
+        assert result.std is not None
+        truth = problem.camera
+        off = [result.camera.cx - truth.cx, result.camera.cy - truth.cy]
+        inside += (np.abs(off) < 1.96 * np.array(result.principal_std)).tolist()
+        errors.append(rotation_error(est=result.alignment, gt=problem.alignment))
+        ratios.append(errors[-1] / result.std.rotation_deg)
+        plain = fit(problem.points_3d, problem.points_2d, CENTERED)
+        without.append(rotation_error(est=plain.alignment, gt=problem.alignment))
+    assert 0.90 <= np.mean(inside) <= 0.99
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.25
+    assert np.median(errors) < 0.85 * np.median(without)
+
+
+def test_result_is_the_minimum_over_the_principal_point() -> None:
+    problem = cropped(3, 20)
+    result = fitted(problem)
+
+    def cost(camera: Camera) -> float:
+        known = fit(problem.points_3d, problem.points_2d, camera)
+        off = np.array([camera.cx - CENTERED.cx, camera.cy - CENTERED.cy]) / SIGMA
+        return float((known.residuals**2).sum() + (off**2).sum())
+
+    here = cost(result.camera)
+    for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        moved = Camera(640, 480, 600, 600, result.camera.cx + x, result.camera.cy + y)
+        assert cost(moved) > here
+
+
+def test_exact_keypoints_give_it_back() -> None:
+    problem = cropped(5, 30, noise_px=0.0)
+    result = fitted(problem, sigma=1e-3)
+    assert result.camera.cx == pytest.approx(problem.camera.cx, abs=1e-2)
+    assert result.camera.cy == pytest.approx(problem.camera.cy, abs=1e-2)
+    assert "  principal    (" in str(result)
+
+
+def test_it_goes_with_focal_length_noise_outliers_and_batches() -> None:
+    problem = cropped(6, 40)
+    both = fitted(problem, focal="estimate")
+    assert both.std is not None
+    assert abs(np.log(both.camera.fx / 600)) < 4 * both.std.focal
+    assert fitted(problem, sigma=None).sigma == pytest.approx(1.0, rel=0.35)
+    assert fitted(problem, loss="huber").principal_std is not None
+    spoiled = problem.points_2d.copy()
+    spoiled[:6] += 150.0
+    robust = fit(
+        problem.points_3d,
+        spoiled,
+        CENTERED,
+        principal_sigma=SIGMA,
+        ransac=RansacOptions(max_reproj_error=12.0),
+    )
+    assert not robust.inliers[:6].any()
+    (one,) = fit_batch([problem.points_3d], [problem.points_2d], CENTERED, principal_sigma=SIGMA)
+    assert isinstance(one, Result)
+    assert one.camera == fitted(problem).camera
+
+
+def test_result_and_option_survive_their_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = cropped(7, 15)
+    result = fitted(problem)
+    again = Result.from_json(result.to_json())
+    assert again.principal_std == result.principal_std
+    assert again.options is not None
+    assert again.options.principal_sigma == SIGMA
+    path = tmp_path / "crop.json"
+    Observation(problem.points_3d, problem.points_2d, CENTERED).save(path)
+    assert main(["fit", str(path), "--principal-sigma", "40", "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert written["principal_std"] == pytest.approx(result.principal_std)
+    assert main(["fit", str(path), "--shape-sigma", ".1", "--principal-sigma", "40"]) in (0, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"principal_sigma": -1.0}, "principal_sigma: "),
+        ({"method": "aepnp"}, "method: the method 'aepnp' supports neither loss, stretch, scale"),
+    ],
+)
+def test_wrong_options_are_refused(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError) as caught:
+        fitted(cropped(0, 10), **options)
+    assert str(caught.value).startswith(message)

@@ -1,0 +1,234 @@
+"""`align_scene`: objects of one photo share its camera, gravity and the ground."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign import (
+    Camera,
+    FocalPrior,
+    Model,
+    Result,
+    SceneObject,
+    Size,
+    View,
+    align,
+    align_scene,
+)
+from cadalign.cli import main
+from cadalign.errors import InputError
+from cadalign.evaluation.simulation.problems import StandingBoxes, simulate_standing_boxes
+from cadalign.geometry.metrics import rotation_error
+from cadalign.io.observation import Observation
+
+FOCAL, HEIGHT = 700.0, 1.6
+CAMERA = Camera(640, 480, FOCAL, FOCAL, 319.5, 239.5)
+UNKNOWN = Camera.without_focal(640, 480)
+
+
+class Simulated:
+    """Boxes of unknown stretch that stand on the ground, seen by a camera that looks down."""
+
+    def __init__(self, seed: int, count: int, noise: float = 1.0, points: int = 10) -> None:
+        rng = np.random.default_rng(seed)
+        boxes = simulate_standing_boxes(
+            rng, objects=count, camera=CAMERA, camera_height=HEIGHT, points=points, noise_px=noise
+        )
+        self.up = boxes.up
+        self.points = [each.points_3d for each in boxes.problems]
+        self.poses = [each.alignment for each in boxes.problems]
+        self.pixels = [each.points_2d for each in boxes.problems]
+
+    def objects(self, camera: Camera, *, sized: int = 0, **evidence: Any) -> list[SceneObject]:
+        return [
+            SceneObject(
+                Model(points_3d=points, bounds=StandingBoxes.BOUNDS, scale_prior_sigma=0.3),
+                View(camera, pixels, **evidence),
+                size=Size(width=1.0) if number < sized else None,
+            )
+            for number, (points, pixels) in enumerate(zip(self.points, self.pixels, strict=True))
+        ]
+
+
+@pytest.mark.long
+def test_objects_share_their_focal_length_and_it_is_as_uncertain_as_stated() -> None:
+    errors: dict[int, list[float]] = {1: [], 2: [], 4: []}
+    stated: dict[int, list[float]] = {1: [], 2: [], 4: []}
+    for seed in range(60):
+        for count, found in errors.items():
+            scene = align_scene(Simulated(seed, count).objects(UNKNOWN))
+            assert not scene.warnings
+            found.append(np.log(scene.camera.fx / FOCAL))
+            stated[count].append(scene.focal_std)
+            for result in scene.results:
+                assert isinstance(result, Result)
+                assert abs(np.log(result.camera.fx / scene.camera.fx)) < 0.5 * scene.focal_std
+    rms = {count: np.sqrt(np.mean(np.square(found))) for count, found in errors.items()}
+    assert rms[4] < 0.55 * rms[1]
+    assert rms[2] < 0.85 * rms[1]
+    for count, found in errors.items():
+        inside = np.abs(found) < 1.96 * np.array(stated[count])
+        assert inside.mean() >= 0.88
+
+
+def test_one_object_is_aligned_as_alone() -> None:
+    (given,) = Simulated(1, 1).objects(UNKNOWN)
+    scene = align_scene([given])
+    alone = align(given.model, given.view, focal="estimate")
+    assert isinstance(scene.results[0], Result)
+    assert scene.results[0].alignment == alone.alignment
+    assert scene.camera.fx == pytest.approx(alone.camera.fx, rel=1e-6)
+    assert alone.std is not None
+    assert scene.focal_std == pytest.approx(alone.std.focal, rel=1e-3)
+
+
+def test_gravity_and_ground_are_shared_where_asked() -> None:
+    simulated = Simulated(3, 3)
+    scene = align_scene(simulated.objects(CAMERA, sized=1), share=("gravity", "ground"))
+    assert scene.camera == CAMERA
+    assert scene.focal_std == 0.0
+    assert scene.up is not None
+    off = np.degrees(np.arccos(scene.up @ simulated.up))
+    assert off < 3 * scene.up_std_deg < 6.0
+    assert scene.camera_height is not None
+    assert abs(np.log(scene.camera_height / HEIGHT)) < 3 * scene.camera_height_std < 0.3
+    # The size of the objects without a known length follows from the ground.
+    for result, truth in zip(scene.results, simulated.poses, strict=True):
+        assert isinstance(result, Result)
+        assert result.std is not None
+        off = np.abs(np.log(result.alignment.scale / truth.scale))
+        assert (off < 4 * np.array(result.std.scale) + 1e-3).all()
+    assert "above the ground" in str(scene)
+    without = align_scene(simulated.objects(CAMERA), share=("gravity",))
+    assert without.camera_height is None
+
+
+def test_known_camera_height_tells_the_size_of_all() -> None:
+    simulated = Simulated(4, 2)
+    known = simulated.objects(CAMERA, up=simulated.up, camera_height=HEIGHT)
+    scene = align_scene(known, share=("gravity", "ground"))
+    assert scene.camera_height == pytest.approx(HEIGHT, rel=0.1)
+    for result in scene.results:
+        assert isinstance(result, Result)
+        assert result.alignment.scale[0] == pytest.approx(1.0, rel=0.15)
+
+
+@pytest.mark.long
+def test_object_that_contradicts_the_others_is_named_and_left_alone() -> None:
+    named = 0
+    for seed in range(10):
+        simulated = Simulated(seed, 4, noise=0.3, points=14)
+        objects = simulated.objects(UNKNOWN, sigma=0.3)
+        wide = Camera(640, 480, 2100.0, 2100.0, 319.5, 239.5)
+        pose = replace(simulated.poses[1], translation=3 * simulated.poses[1].translation)
+        other = wide.project(pose.apply(simulated.points[1]))
+        objects[1] = replace(objects[1], view=View(UNKNOWN, other, sigma=0.3), name="poster")
+        scene = align_scene(objects)
+        named += any(
+            text.startswith("poster contradicts the focal length") for text in scene.warnings
+        )
+        assert not any("objects[" in text for text in scene.warnings)
+        assert abs(np.log(scene.camera.fx / FOCAL)) < 4 * scene.focal_std
+    assert named >= 8
+
+
+def test_bad_object_stops_no_other() -> None:
+    objects = Simulated(5, 3).objects(UNKNOWN)
+    few = View(UNKNOWN, np.asarray(objects[1].view.points_2d)[:2])
+    scene = align_scene([objects[0], replace(objects[1], view=few), objects[2]])
+    assert list(scene.results.errors) == [1]
+    assert isinstance(scene.results[2], Result)
+
+
+def test_prior_on_the_focal_length_counts_once() -> None:
+    objects = Simulated(6, 3).objects(UNKNOWN)
+    tight = FocalPrior(FOCAL, 0.001)
+    scene = align_scene(objects, focal_prior=tight)
+    assert scene.focal_std == pytest.approx(0.001, rel=0.05)
+    assert scene.focal_std < 0.001
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"share": ("size",)}, "share: ('size',) is not what objects share; give some of focal"),
+        ({"share": "focal"}, "share: 'focal' is not what objects share"),
+        ({"objects": []}, "objects: expected at least one object"),
+        ({"objects": [1]}, "objects[0]: expected a cadalign.SceneObject, got int"),
+        ({"tilt_sigma_deg": -1}, "tilt_sigma_deg: "),
+    ],
+)
+def test_wrong_arguments_are_refused(changes: dict[str, Any], message: str) -> None:
+    arguments = {"objects": Simulated(0, 2).objects(UNKNOWN), **changes}
+    with pytest.raises(InputError) as caught:
+        align_scene(**arguments)
+    assert str(caught.value).startswith(message)
+
+
+def test_objects_of_two_photos_are_refused() -> None:
+    first, second = Simulated(0, 2).objects(UNKNOWN)
+    moved = replace(second, view=replace(second.view, camera=CAMERA))
+    with pytest.raises(InputError, match="the camera differs from the first object's"):
+        align_scene([first, moved])
+    flat = replace(first, model=Model(points_3d=first.model.points_3d, up_axis=None))  # type: ignore[union-attr]
+    with pytest.raises(InputError, match="the model has no up axis"):
+        align_scene([flat, second], share=("gravity",))
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+def write_scene(folder: Path, *, names: tuple[str, ...] = ("left", "right")) -> Path:
+    simulated = Simulated(7, 2)
+    objects = []
+    for number, (points, pixels) in enumerate(zip(simulated.points, simulated.pixels, strict=True)):
+        seen = Observation(points, pixels, UNKNOWN, object_name=names[number]).to_dict()
+        camera = seen.pop("camera")
+        objects.append(seen)
+    path = folder / "scene.json"
+    path.write_text(json.dumps({"camera": camera, "objects": objects, "share": ["focal"]}))
+    return path
+
+
+def test_file_of_several_objects_is_aligned_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_scene(tmp_path)
+    assert main(["fit", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert printed.startswith("scene of 2 objects\n  focal length ")
+    written = json.loads((tmp_path / "scene_fit" / "scene.json").read_text())
+    assert [each["name"] for each in written["objects"]] == ["left", "right"]
+    results = [
+        Result.from_json((tmp_path / "scene_fit" / name / "fit.json").read_text())
+        for name in ("left", "right")
+    ]
+    for result, truth in zip(results, Simulated(7, 2).poses, strict=True):
+        assert rotation_error(est=result.alignment, gt=truth) < 10
+        assert result.camera.fx == pytest.approx(written["camera"]["params"][0], rel=0.05)
+    assert (tmp_path / "scene_fit" / "left" / "overlay.png").is_file()
+    document = json.loads((tmp_path / "scene_fit" / "left" / "fit.json").read_text())
+    assert document["observation"] == "observation.json"
+
+
+def test_file_of_several_objects_names_what_is_wrong(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_scene(tmp_path, names=("box", "box"))
+    assert main(["fit", str(path)]) == 1
+    assert "objects[1]: two objects are named 'box'" in capsys.readouterr().err
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(data | {"objects": []}))
+    assert main(["fit", str(path)]) == 1
+    assert "objects: expected a list of objects" in capsys.readouterr().err
+    path.write_text(json.dumps(data | {"share": ["colour"]}))
+    data["objects"][1]["object"] = "other"
+    path.write_text(json.dumps(data | {"share": ["colour"]}))
+    assert main(["fit", str(path)]) == 1
+    assert "share: ['colour'] is not what objects share" in capsys.readouterr().err

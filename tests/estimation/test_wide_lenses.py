@@ -1,0 +1,331 @@
+"""Estimates with fisheye and fov lenses: objects beside and behind the camera's plane too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from cadalign import (
+    Alignment,
+    Camera,
+    FocalPrior,
+    Model,
+    RansacOptions,
+    Result,
+    ShapeModel,
+    View,
+    align,
+    fit,
+    fit_batch,
+)
+from cadalign.annotate.photos import PhotoFile, intrinsics_of
+from cadalign.errors import DataError, InputError
+from cadalign.estimation.uncertainty.advice import rank_evidence
+from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
+from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.retrieval.candidates import observe
+from cadalign.retrieval.options import RetrievalOptions
+
+FISHEYE = Camera(
+    1000, 1000, 280.0, 285.0, 499.5, 498.0, (0.01, -0.003, 0.0005, 0.0), lens="fisheye"
+)
+PRISM = Camera(
+    *(1000, 1000, 280.0, 285.0, 499.5, 498.0),
+    (0.01, -0.003, 0.001, -0.001, 0.0005, 0.0, 0.002, -0.001),
+    lens="fisheye",
+)
+FOV = Camera(1000, 1000, 280.0, 285.0, 499.5, 498.0, (0.9,), lens="fov")
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+_FREE = [0, 1, 2, 3, 4, 5, 7, 8]
+
+
+def towards(angle: float, *, distance: float = 5.0, about: float = 1.0) -> np.ndarray:
+    """The place at an angle off the optical axis [degrees]."""
+    theta = np.radians(angle)
+    across = np.sin(theta) * np.array([np.cos(about), np.sin(about)])
+    return distance * np.append(across, np.cos(theta))
+
+
+def placed(angle: float, seed: int = 0, scale: tuple[float, ...] = (1, 1.2, 0.8)) -> Alignment:
+    turn = rotation_from_vector(np.random.default_rng(seed).normal(size=3))
+    return Alignment(turn, towards(angle), scale)
+
+
+def points_of(seed: int, count: int = 20) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (count, 3))
+
+
+def errors_of(result: Result, truth: Alignment) -> np.ndarray:
+    """Errors (9,) in the terms of a result's covariance."""
+    turn = vector_from_rotation(result.alignment.rotation @ truth.rotation.T)
+    shift = result.alignment.translation - truth.translation
+    return np.concatenate([turn, shift, np.log(result.alignment.scale / truth.scale)])
+
+
+def degrees_off(result: Result, truth: Alignment) -> float:
+    return float(np.degrees(np.linalg.norm(errors_of(result, truth)[:3])))
+
+
+@pytest.mark.parametrize("angle", [0, 70, 90, 110])
+@pytest.mark.parametrize("camera", [FISHEYE, PRISM, FOV], ids=["fisheye", "prism", "fov"])
+def test_fit_recovers_exact_keypoints(camera: Camera, angle: float) -> None:
+    points, truth = points_of(1), placed(angle)
+    pixels = camera.project(truth.apply(points))
+    for method in ("optimal", "aepnp", "aepnp-paper"):
+        result = fit(points, pixels, camera, method=method)
+        np.testing.assert_allclose(errors_of(result, truth), 0, atol=1e-6)
+        assert result.camera == camera
+        assert result.rms < 1e-6
+
+
+def test_the_projection_of_a_fisheye_with_a_narrow_field_is_a_pinholes_estimate() -> None:
+    """The same noise in the same rays: a pinhole and a fisheye state the same."""
+    points, truth = points_of(2), placed(10)
+    pinhole = Camera(1000, 1000, 280, 280, 499.5, 499.5)
+    wide = Camera(1000, 1000, 280, 280, 499.5, 499.5, lens="fisheye")
+    noisy = pinhole.project(truth.apply(points)) + np.random.default_rng(0).normal(size=(20, 2))
+    rays = pinhole.unproject(noisy)
+    slopes = wide.projection_slopes(rays)[:, :, :2]  # of pixels by (u, v), at other depths
+    to_wide = slopes * rays[:, 2, None, None] / 280
+    covariances = to_wide @ to_wide.swapaxes(1, 2)
+    first = fit(points, noisy, pinhole)
+    second = fit(points, wide.project(rays), wide, sigma=covariances)
+    np.testing.assert_allclose(errors_of(second, first.alignment), 0, atol=1e-4)
+    assert first.covariance is not None
+    assert second.covariance is not None
+    np.testing.assert_allclose(second.covariance, first.covariance, rtol=0.05, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", [0, 60, 90, 98])
+def test_errors_are_as_stated_and_at_the_cramer_rao_bound(angle: float) -> None:
+    rng = np.random.default_rng(angle)
+    ratios, squares = [], []
+    for seed in range(60):
+        points, truth = points_of(seed), placed(angle, seed, (1, *rng.uniform(0.7, 1.4, 2)))
+        pixels = FISHEYE.project(truth.apply(points)) + rng.normal(size=(20, 2))
+        result = fit(points, pixels, FISHEYE)
+        bound = cramer_rao_bound(points, FISHEYE, truth, sigma=1.0, focal="known")
+        errors = errors_of(result, truth)
+        ratios.append((errors[:3] ** 2).sum() / np.trace(bound[:3, :3]))
+        assert result.covariance is not None
+        own = result.covariance[np.ix_(_FREE, _FREE)]
+        squares.append(errors[_FREE] @ np.linalg.solve(own, errors[_FREE]) / 8)
+    assert 0.75 < np.sqrt(np.mean(ratios)) < 1.25  # 60 draws: 1 +- .09
+    assert 0.7 < np.mean(squares) < 1.3
+
+
+def test_a_batch_is_each_fit(tmp_path) -> None:
+    cameras = [FISHEYE, FOV, Camera(640, 480, 500, 500, 319.5, 239.5)]
+    angles = [95, 60, 3]
+    points = [points_of(seed) for seed in range(3)]
+    rng = np.random.default_rng(0)
+    pixels = [
+        camera.project(placed(angle).apply(own)) + rng.normal(size=(20, 2))
+        for camera, angle, own in zip(cameras, angles, points, strict=True)
+    ]
+    batch = fit_batch(points, pixels, cameras)
+    for k, own in enumerate(batch):
+        assert isinstance(own, Result)
+        single = fit(points[k], pixels[k], cameras[k])
+        np.testing.assert_array_equal(own.alignment.packed, single.alignment.packed)
+        np.testing.assert_allclose(batch.rotation[k], single.alignment.rotation)
+        assert own.covariance is not None
+        assert single.covariance is not None
+        np.testing.assert_allclose(own.covariance, single.covariance)
+
+
+@pytest.mark.parametrize("angle", [20, 95])
+def test_robust_fit_rejects_keypoints_all_over_the_field(angle: float) -> None:
+    points, truth = points_of(3, 30), placed(angle)
+    rng = np.random.default_rng(1)
+    pixels = FISHEYE.project(truth.apply(points)) + rng.normal(size=(30, 2))
+    pixels[:12] = rng.uniform(150, 850, (12, 2))
+    result = fit(points, pixels, FISHEYE, ransac=RansacOptions(max_reproj_error=5.0))
+    assert result.inliers[12:].all()
+    assert result.inliers[:12].sum() <= 1
+    assert degrees_off(result, truth) < 2
+    np.testing.assert_allclose(
+        result.residuals, FISHEYE.project(result.alignment.apply(points)) - pixels
+    )
+
+
+def view_of(camera: Camera, points: np.ndarray, seed: int, **more: object) -> View:
+    noise = np.random.default_rng(seed).normal(size=(len(points), 2))
+    return View(camera, camera.project(points) + noise, **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("angle", [30, 98])
+def test_align_exact_similar_and_learned_shapes(angle: float) -> None:
+    truth = placed(angle, scale=(1, 1, 1))
+    points = np.concatenate([CORNERS, points_of(5, 8)])
+    view = view_of(FISHEYE, truth.apply(points), 0)
+    models = (
+        Model(points_3d=points),
+        Model(points_3d=points, shape_sigma=0.02),
+        ShapeModel.from_basis(points, [points * [1, 0, 0], points * [0, 1, 0]], [0.1, 0.1]),
+    )
+    for model in models:
+        result = align(model, view)
+        assert degrees_off(result, truth) < 3
+        assert result.camera == FISHEYE
+        errors = errors_of(result, truth)[:6]
+        assert result.covariance is not None
+        square = errors @ np.linalg.solve(result.covariance[:6, :6], errors)
+        assert square < 22.5  # 99.9 %
+        assert result.rms < 2
+        again = Result.from_json(result.to_json())
+        assert again.camera == FISHEYE
+        np.testing.assert_allclose(again.alignment.packed, result.alignment.packed)
+
+
+def test_robust_alignment_of_a_learned_shape() -> None:
+    truth = placed(95, scale=(1, 1, 1))
+    points = np.concatenate([CORNERS, points_of(5, 12)])
+    clean = view_of(FISHEYE, truth.apply(points), 0)
+    pixels = np.array(clean.points_2d)
+    pixels[:4] = [[150, 500], [850, 480], [500, 200], [480, 800]]
+    model = ShapeModel.from_basis(points, [points * [1, 0, 0], points * [0, 1, 0]], [0.1, 0.1])
+    result = align(model, replace(clean, points_2d=pixels), ransac=RansacOptions())
+    assert not result.inliers[:4].any()
+    assert result.inliers[4:].sum() >= 14
+    assert degrees_off(result, truth) < 4
+
+
+def motion(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_from_vector(np.array(turn)), shift
+    return matrix
+
+
+@pytest.mark.parametrize("is_known", [True, False], ids=["known motion", "unknown motion"])
+def test_several_views_of_wide_lenses_and_pinholes(is_known: bool) -> None:
+    truth, points = placed(95), points_of(4, 14)
+    in_rig = truth.apply(points)
+    pinhole = Camera(1000, 800, 700, 700, 499.5, 399.5)
+    look = -towards(95)
+    look = -look / np.linalg.norm(look)
+    across = np.cross([0, 1, 0], look)
+    across /= np.linalg.norm(across)
+    facing = np.eye(4)
+    facing[:3, :3] = [across, np.cross(look, across), look]
+    facing[:3, 3] = [0.3, 0.1, 0.5]
+    rigs = [np.eye(4), motion((0.2, -0.4, 0.1), (1.0, 0.2, 0.0)), facing]
+    cameras = [FISHEYE, FOV, pinhole]
+    views = [
+        view_of(
+            camera,
+            in_rig @ rig[:3, :3].T + rig[:3, 3],
+            number,
+            cam_from_rig=rig if is_known else None,
+        )
+        for number, (camera, rig) in enumerate(zip(cameras, rigs, strict=True))
+    ]
+    result = align(Model(points_3d=points), views)
+    assert result.cameras == tuple(cameras)
+    assert degrees_off(result, truth) < 2
+    for rig, pose in zip(rigs, result.poses, strict=True):
+        seen = pose.apply(points)
+        if is_known:
+            np.testing.assert_allclose(seen, in_rig @ rig[:3, :3].T + rig[:3, 3], atol=0.1)
+    if is_known:
+        assert result.rig_from_model is not None
+        np.testing.assert_allclose(result.rig_from_model.apply(points), in_rig, atol=0.1)
+    assert result.rms < 2
+    for view, own in zip(views, result.views, strict=True):
+        predicted = own.camera.project(own.alignment.apply(points))
+        np.testing.assert_allclose(own.residuals, predicted - view.points_2d, atol=1e-9)
+
+
+def test_gravity_is_told_in_the_lenses_frame() -> None:
+    truth = placed(95)
+    points = points_of(6, 6)
+    view = view_of(FISHEYE, truth.apply(points), 3)
+    up = truth.rotation @ [0, 1, 0]
+    model = Model(points_3d=points)
+    plain, told = align(model, view), align(model, replace(view, up=up, up_sigma_deg=0.1))
+    assert plain.std is not None
+    assert told.std is not None
+    assert degrees_off(told, truth) < 4
+    for each in told.contributions():  # in the result's frame: far and near lie along x and y
+        if each.kind == "gravity":
+            assert each.without.translation[2] < min(each.without.translation[:2])
+    tilt = np.degrees(np.arccos(np.clip(told.alignment.rotation @ [0, 1, 0] @ up, -1, 1)))
+    assert tilt < 0.4
+    assert told.std.rotation_deg < plain.std.rotation_deg
+
+
+def test_a_start_is_given_in_the_lenses_frame() -> None:
+    truth = placed(95, scale=(1, 1, 1))
+    points = np.concatenate([CORNERS, points_of(5, 8)])
+    model = Model(points_3d=points, shape_sigma=0.02)
+    view = view_of(FISHEYE, truth.apply(points), 0)
+    assert degrees_off(align(model, view, init=truth), truth) < 3
+
+
+def test_next_best_evidence_of_a_wide_view() -> None:
+    truth, points = placed(95), points_of(4, 10)
+    ids = tuple(range(8))
+    view = view_of(FISHEYE, truth.apply(points[:8]), 0, ids=ids)
+    model = Model(points_3d=points)
+    result = align(model, view)
+    best = rank_evidence(model, [view], result, candidates=[8, 9])
+    assert {8, 9} <= {advice.detail for advice in best}
+    assert result.covariance is not None
+
+
+def test_misfit_and_warnings_are_those_of_pixels() -> None:
+    truth, points = placed(95), points_of(4, 12)
+    pixels = np.array(view_of(FISHEYE, truth.apply(points), 0).points_2d)
+    pixels[3] += [40, -30]
+    result = fit(points, pixels, FISHEYE)
+    assert result.misfit is not None
+    assert "keypoint 3" in str(result.misfit) or 3 in getattr(result.misfit, "outliers", (3,))
+
+
+def test_keypoints_all_around_the_camera_are_refused() -> None:
+    points = CORNERS * [2, 2, 2]
+    around = points @ rotation_from_vector(np.array([0.1, 0.2, 0.3])).T
+    wide = Camera(1000, 1000, 150, 150, 499.5, 499.5, lens="fisheye")
+    pixels = wide.project(around)
+    with pytest.raises(InputError, match="points_2d: the keypoints surround the camera: "):
+        fit(points, pixels, wide)
+    with pytest.raises(InputError, match="points_2d: the keypoints surround the camera: "):
+        align(Model(points_3d=points, shape_sigma=0.1), View(wide, pixels))
+
+
+def test_what_wide_lenses_do_not_go_with_is_refused() -> None:
+    points, truth = points_of(1), placed(20)
+    pixels = FISHEYE.project(truth.apply(points))
+    text = (
+        r"focal: the focal length of a fisheye lens is not estimated; "
+        r'calibrate it, and give focal="known"'
+    )
+    with pytest.raises(InputError, match=text):
+        fit(points, pixels, FISHEYE, focal="estimate")
+    with pytest.raises(InputError, match=text):
+        fit(points, pixels, FISHEYE, focal="estimate", focal_prior=FocalPrior(280.0))
+    with pytest.raises(InputError, match=text):
+        fit(points, pixels, FISHEYE, focal="estimate", ransac=RansacOptions())
+    model = Model(points_3d=points, shape_sigma=0.1)
+    with pytest.raises(InputError, match=text):
+        align(model, View(FISHEYE, pixels), focal="estimate")
+    mask = np.zeros((1000, 1000), dtype=bool)
+    mask[400:600, 400:600] = True
+    with pytest.raises(InputError, match=r"^views\[0\].mask: the outline of a mask is not"):
+        align(model, View(FISHEYE, pixels, mask=mask))
+    with pytest.raises(InputError, match=r"^views\[0\].depth: depths are not measured along"):
+        align(model, View(FISHEYE, pixels, depth=np.full(20, 5.0)))
+
+
+def test_retrieval_and_the_annotator_take_no_wide_lens(tmp_path) -> None:
+    fix = "undistort the photo, or crop it to a pinhole's view"
+    with pytest.raises(InputError) as caught:
+        observe([[500, 500]], [0], FISHEYE, RetrievalOptions())
+    assert str(caught.value) == f"camera.lens: retrieval takes no fisheye lens; {fix}"
+    Image.new("RGB", (1000, 1000)).save(tmp_path / "photo.png")
+    with pytest.raises(DataError, match=rf"photo.png.*: the annotator takes no fov lens; {fix}$"):
+        intrinsics_of(PhotoFile.open(tmp_path / "photo.png"), FOV)

@@ -5,10 +5,18 @@ from typing import TYPE_CHECKING
 from cadalign.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.batch.fits import fit_many, run_fits, stream_fits
+    from cadalign.batch.fits import fit_many, run_many, stream_fits
     from cadalign.batch.options import FitRunOptions
+    from cadalign.batch.retrievals import RetrieveRunOptions
     from cadalign.io.input_kinds import DetectorOptions
 
-__all__ = ["DetectorOptions", "FitRunOptions", "fit_many", "run_fits", "stream_fits"]
+__all__ = [
+    "DetectorOptions",
+    "FitRunOptions",
+    "RetrieveRunOptions",
+    "fit_many",
+    "run_many",
+    "stream_fits",
+]
 
 __getattr__ = lazy_names(__name__)

@@ -1,4 +1,4 @@
-"""Alignment of many observations, as the engine of runs sees it: observations become rows."""
+"""Estimates of many observations, as the engine of runs sees them: observations become rows."""
 
 from __future__ import annotations
 
@@ -12,22 +12,15 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from cadalign.batch.options import FitRunOptions
+from cadalign.batch.options import Estimated, ManyOptions
 from cadalign.batch.sources import ObservationTask, read_sources
-from cadalign.batch.table import (
-    COLUMNS,
-    RECORD_COLUMNS,
-    TIMING_COLUMNS,
-    naming_row,
-    result_row,
-)
+from cadalign.batch.table import COLUMNS, RECORD_COLUMNS, TIMING_COLUMNS, naming_row, result_row
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints, join_keypoints
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
-from cadalign.estimation.result import Result
 from cadalign.evaluation.outcome import FAILED
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import Plan, Rows
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, parse_json
@@ -36,40 +29,48 @@ from cadalign.io.images import photo_size
 from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 
-_LARGEST_CHUNK = 256
+LARGEST_CHUNK = 256
+"""Most observations that a worker gets at a time, as of every long run."""
 _LEAST_CHUNKS = 64  # of a run, such that workers share the last ones evenly
 # Several times as fast as the standard library's; numbers that are not finite become null.
 _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 
 
 @dataclass(frozen=True)
-class ManyFits:
-    """Alignments of observations; see `cadalign.evaluation.runs.work.Experiment`.
+class ManyEstimates:
+    """Estimates of observations; see `cadalign.evaluation.runs.work.Experiment`.
 
     Parameters
     ----------
-    options : FitRunOptions
+    options : ManyOptions
     model : ModelKeypoints, optional
         That keypoints of detectors are paired with.
     folder : RunFolder, optional
         The folder that pictures go to; none are drawn without.
     """
 
-    options: FitRunOptions
+    options: ManyOptions
     model: ModelKeypoints | None = None
     folder: RunFolder | None = field(default=None, repr=False)
 
-    columns = COLUMNS
     timing_columns = TIMING_COLUMNS
-    record_columns = RECORD_COLUMNS
+
+    @property
+    def columns(self) -> Columns:
+        """The columns of the table."""
+        return COLUMNS + self.options.columns
+
+    @property
+    def record_columns(self) -> Columns:
+        """The columns of the table of observations and results."""
+        return RECORD_COLUMNS + self.options.record_columns
 
     def warm_up(self) -> None:
         """Compile the kernels."""
         points = np.random.default_rng(0).uniform(-0.3, 0.3, (9, 3))
         camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
         seen = Observation(points, camera.project(points + [0.0, 0.0, 2.0]), camera)
-        estimate = replace(self.options.estimate, shape=None)
-        result_row(estimate.fit(seen, "warm-up")[0])
+        result_row(self.options.warm_up(seen))
 
     def evaluate(self, tasks: Sequence[ObservationTask]) -> Rows:
         """The rows of some observations."""
@@ -83,10 +84,11 @@ class ManyFits:
         start, seen = time.perf_counter(), None
         try:
             seen = self.observation(task)
-            result, _ = self.options.estimate.fit(seen, task.name)
+            found = self.options.estimate_of(seen, task.name)
         except CadalignError as error:
             return _failed(task, str(error), seen)
-        row = naming_row(task.row, task.name, seen) | result_row(result)
+        seen, result = found.observation, found.result
+        row = naming_row(task.row, task.name, seen) | result_row(result) | found.cells
         if self.folder is not None and task.row < self.options.pictures:
             from cadalign.batch.pictures import draw_fit
 
@@ -94,7 +96,7 @@ class ManyFits:
             row["warning_count"] += len(troubles)
             row["warnings"] = "; ".join(filter(None, (row["warnings"], *troubles)))
         timing = {"row": task.row, "seconds": time.perf_counter() - start}
-        return Rows([row], [timing], [_record(task.row, seen, result)])
+        return Rows([row], [timing], [_record(task.row, seen, found)])
 
     def observation(self, task: ObservationTask) -> Observation:
         """The observation of a task, with the shape that is to be fitted.
@@ -104,7 +106,7 @@ class ManyFits:
         CadalignError
             If it cannot be read.
         """
-        seen, shape = self._read(task), self.options.estimate.shape
+        seen, shape = self._read(task), self.options.learned
         return seen if shape is None else replace(seen, shape=shape.absolute())
 
     def _read(self, task: ObservationTask) -> Observation:
@@ -115,9 +117,7 @@ class ManyFits:
             data = parse_json(read_text(Path(task.name)), task.name)
         else:
             data = _parsed(task.content, task.name)
-        return options.estimate.read(
-            data, task.name, folder=Path(task.folder), changes=options.changes
-        )
+        return options.read(data, task.name, folder=Path(task.folder))
 
     def _detected(self, found: ImageKeypoints, folder: Path) -> Observation:
         """A detector's keypoints paired with the model's."""
@@ -142,8 +142,8 @@ class ManyFits:
             return replace(changes, camera=None).applied_to(joined)
 
 
-def plan_fits(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask]:
-    """Plan the alignment of the observations of all inputs.
+def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
+    """Plan the estimates of the observations of all inputs.
 
     Raises
     ------
@@ -152,23 +152,22 @@ def plan_fits(options: FitRunOptions, folder: RunFolder) -> Plan[ObservationTask
     """
     tasks = read_sources(options.inputs)
     model = _model_keypoints(options) if tasks.has_detections else None
-    shape = options.estimate.shape
     config = {
         **options.as_config(),
         "experiment": options.experiment,
         "contents": tasks.fingerprint(),
-        "shapes": None if shape is None else ShapeModel.open(shape).category,
+        **options.contents(),
     }
     drawn_in = folder.made_for_pictures() if options.pictures else None
-    chunk = max(1, min(_LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
-    return Plan(ManyFits(options, model, drawn_in), tasks, config, chunk)
+    chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
+    return Plan(ManyEstimates(options, model, drawn_in), tasks, config, chunk)
 
 
-def _model_keypoints(options: FitRunOptions) -> ModelKeypoints:
+def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
     """The keypoints that a detector's are paired with: the model's, or else the shape's."""
     if options.detector.model is not None:
         return ModelKeypoints.load(options.detector.model)
-    shape = options.estimate.shape
+    shape = options.learned
     if shape is None:
         raise InputError(
             "the keypoints of the model are not known",
@@ -212,13 +211,13 @@ def _failed(task: ObservationTask, reason: str, seen: Observation | None) -> Row
     return Rows([row], [{"row": task.row}], [_record(task.row, seen, None)])
 
 
-def _record(row: int, seen: Observation | None, result: Result | None) -> Row:
+def _record(row: int, seen: Observation | None, found: Estimated | None) -> Row:
     """Observation and result as JSON, but for its time, on which no two runs agree."""
-    record = {"row": row, "observation": "", "result": ""}
+    record: Row = {"row": row, "observation": "", "result": ""}
     if seen is not None:
         record["observation"] = _ENCODER.encode(seen.to_dict(states_origins=True)).decode()
-    if result is not None:
-        data = result.to_dict()
+    if found is not None:
+        data = found.result.to_dict()
         data["stats"]["seconds"] = 0.0
-        record["result"] = _ENCODER.encode(data).decode()
+        record |= {"result": _ENCODER.encode(data).decode(), **found.record}
     return record

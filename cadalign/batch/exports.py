@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,12 @@ from cadalign.batch.exported import exported_object
 from cadalign.batch.table import RECORD_COLUMNS
 from cadalign.datasets.detections.coco import write_coco_keypoints
 from cadalign.datasets.photos import bop_files
+from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.datasets.photos.formats import write_photos
 from cadalign.datasets.photos.photo import Photo
-from cadalign.datasets.photos.poses import PoseEstimate
 from cadalign.datasets.sfm.colmap import write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView
-from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.errors import CadalignError, DataError, InputError, RenderError, quote
 from cadalign.estimation.result import Result
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_groups
@@ -27,9 +28,12 @@ from cadalign.export.formats import export_object, format_of
 from cadalign.export.photo_sets import FORMS
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import parse_json
-from cadalign.io.files import writing
+from cadalign.io.files import write_json, writing
+from cadalign.io.images import write_image
 from cadalign.io.meshes.join import join
 from cadalign.io.observation import Observation
+from cadalign.render import OverlayStyle, Scene, overlay_model
+from cadalign.render.frame import LIGHT_GREY
 
 _MILLIMETRES = 1e-3
 _SAME = 1e-9
@@ -54,7 +58,15 @@ class Exported:
     left_out: tuple[CadalignError, ...]
 
 
-def export_run(run: Path, to: Path, *, format: str | None = None, metres: float = 1.0) -> Exported:
+def export_run(
+    run: Path,
+    to: Path,
+    *,
+    format: str | None = None,
+    metres: float = 1.0,
+    rows: Collection[int] = (),
+    style: OverlayStyle | None = None,
+) -> Exported:
     """Write the alignments of a finished run for another tool.
 
     Parameters
@@ -66,6 +78,8 @@ def export_run(run: Path, to: Path, *, format: str | None = None, metres: float 
     format : str, optional
         By default the name ``to`` itself where that is a format's, or else what its ending means:
 
+        - ``json``: the observation of each, and its ``fit.json`` in a folder beside it;
+        - ``overlay``: each model drawn over its photo, further views as ``000000_1.png``;
         - ``glb``: one file of each object, in a folder; or all in one, in the camera's frame;
         - ``coco``: keypoints and poses as COCO's annotations;
         - ``bop-results``: poses as BOP's CSV, each object's stretched mesh beside it;
@@ -73,6 +87,10 @@ def export_run(run: Path, to: Path, *, format: str | None = None, metres: float 
         - ``bop``, ``kitti``, ``pix3d``, ``scan2cad``, ``objectron``: a data set with its photos.
     metres : float
         Length of one unit of the model [m].
+    rows : collection of int
+        Numbers of the observations to write; by default all.
+    style : OverlayStyle, optional
+        Style of ``overlay``.
 
     Raises
     ------
@@ -81,15 +99,21 @@ def export_run(run: Path, to: Path, *, format: str | None = None, metres: float 
     DataError
         If the run cannot be read, or the files cannot be written.
     """
-    name = format or (str(to) if str(to) in RUN_FORMATS else format_of(to))
-    if name not in RUN_FORMATS:
-        fix = f"of a run, give one of {', '.join(RUN_FORMATS)}"
+    known = (DOCUMENTS, *RUN_FORMATS)
+    name = format or (str(to) if str(to) in known else format_of(to))
+    if name not in known:
+        fix = f"of a run, give one of {', '.join(known)}"
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
     left_out: list[CadalignError] = []
-    objects = run_objects(RunFolder(run), metres, left_out)
+    results = run_results(RunFolder(run), rows)
     with writing(to.parent):
         to.parent.mkdir(parents=True, exist_ok=True)
-    count = RUN_FORMATS[name](to, objects, left_out)
+    if name == DOCUMENTS:
+        count = _write_documents(to, results)
+    else:
+        objects = run_objects(results, metres, left_out)
+        write = RUN_FORMATS[name] if style is None else partial(_write_overlays, style=style)
+        count = write(to, objects, left_out)
     if not count:
         if left_out:
             raise left_out[0]
@@ -97,29 +121,55 @@ def export_run(run: Path, to: Path, *, format: str | None = None, metres: float 
     return Exported(to, count, tuple(left_out))
 
 
-def run_objects(
-    folder: RunFolder, metres: float, left_out: list[CadalignError]
-) -> Iterator[RunObject]:
-    """The aligned objects of a run, one at a time; those that lack something are left out."""
+def run_results(
+    folder: RunFolder, rows: Collection[int] = ()
+) -> Iterator[tuple[Path, int, Observation, Result]]:
+    """The results of a finished run with their observations, one at a time.
+
+    Each comes with its name in messages and its number; ``rows`` are those to read, by default all.
+    """
     if not folder.is_finished:
         fix = "start the command that made it again: it goes on"
         raise DataError("not a finished run of fits", where=str(folder.path), fix=fix)
     for table in read_groups(folder.records, fix="do the run again"):
-        if table.column_names != [name for name, _ in RECORD_COLUMNS]:
+        if not {name for name, _ in RECORD_COLUMNS} <= set(table.column_names):
             raise DataError("not a run of fits", where=str(folder.path))
         for record in table.to_pylist():
-            if not record["result"]:
+            row = record["row"]
+            if not record["result"] or (rows and row not in rows):
                 continue
-            where = Path(f"{folder.path}, row {record['row']}")
+            where = Path(f"{folder.path}, row {row}")
             seen = Observation.from_dict(parse_json(record["observation"], str(where)))
-            try:
-                result = Result.from_json(record["result"])
-                exported = exported_object(result, seen, where, metres=metres)
-            except CadalignError as error:
-                left_out.append(error)
-                continue
-            category = seen.shape.stem if seen.shape is not None else exported.name
-            yield RunObject(record["row"], category, exported)
+            yield where, row, seen, Result.from_json(record["result"])
+
+
+def run_objects(
+    results: Iterator[tuple[Path, int, Observation, Result]],
+    metres: float,
+    left_out: list[CadalignError],
+) -> Iterator[RunObject]:
+    """The aligned objects of results; those that lack something are left out."""
+    for where, row, seen, result in results:
+        try:
+            exported = exported_object(result, seen, where, metres=metres)
+        except CadalignError as error:
+            left_out.append(error)
+            continue
+        category = seen.shape.stem if seen.shape is not None else exported.name
+        yield RunObject(row, category, exported)
+
+
+def _write_documents(folder: Path, results: Iterator[tuple[Path, int, Observation, Result]]) -> int:
+    """Write each observation and its fit.json, as `cadalign fit` of the single file does."""
+    count = 0
+    for _, row, seen, result in results:
+        path, fit = folder / f"{row:06d}.json", folder / f"{row:06d}_fit"
+        with writing(fit):
+            fit.mkdir(parents=True, exist_ok=True)
+        seen.save(path)
+        write_json(fit / "fit.json", result.to_dict() | {"observation": f"../{path.name}"})
+        count += 1
+    return count
 
 
 _Writer = Callable[[Path, Iterator[RunObject], list[CadalignError]], int]
@@ -148,6 +198,37 @@ def _write_each(folder: Path, objects: Iterator[RunObject], left_out: list[Cadal
         try:
             export_object(folder / f"{each.row:06d}.glb", each.exported)
         except InputError as error:
+            left_out.append(error)
+        else:
+            count += 1
+    return count
+
+
+def _write_overlays(
+    folder: Path,
+    objects: Iterator[RunObject],
+    left_out: list[CadalignError],
+    *,
+    style: OverlayStyle | None = None,
+) -> int:
+    """Draw each model over its photos, grey where there is none."""
+    with writing(folder):
+        folder.mkdir(exist_ok=True)
+    count = 0
+    for each in objects:
+        try:
+            if each.exported.mesh is None:
+                raise InputError("no mesh of the object is known", where=f"row {each.row}")
+            scene = Scene(each.exported.mesh)
+            for number, view in enumerate(each.exported.views):
+                camera, photo = view.camera, view.read_image()
+                if photo is None:
+                    size = (camera.height, camera.width, 3)
+                    photo = np.full(size, LIGHT_GREY, dtype=np.uint8)
+                drawn = overlay_model(photo, camera, scene, view.cam_from_model, style=style)
+                ending = f"_{number}" if number else ""
+                write_image(folder / f"{each.row:06d}{ending}.png", drawn)
+        except (InputError, DataError, RenderError) as error:
             left_out.append(error)
         else:
             count += 1
@@ -258,7 +339,10 @@ def _write_data_set(form: str) -> _Writer:
 
 
 _NOT_MOVED = Alignment(np.eye(3), np.zeros(3), np.ones(3))
+DOCUMENTS = "json"
+"""The format that needs no mesh, nor anything else that a file must be read for."""
 RUN_FORMATS: dict[str, _Writer] = {
+    "overlay": _write_overlays,
     "glb": _write_glb,
     "coco": _write_coco,
     "colmap": _write_cameras(write_colmap),
@@ -266,4 +350,4 @@ RUN_FORMATS: dict[str, _Writer] = {
     "bop-results": _write_bop_results,
     **{form: _write_data_set(form) for form in FORMS},
 }
-"""The formats by name."""
+"""The other formats by name."""

@@ -15,8 +15,8 @@ from typing import Any
 import msgspec
 import pyarrow.compute as pc
 
-from cadalign.batch.experiment import ManyFits, plan_fits
-from cadalign.batch.options import FitRunOptions
+from cadalign.batch.experiment import ManyEstimates, plan_run
+from cadalign.batch.options import FitRunOptions, ManyOptions
 from cadalign.batch.sources import ObservationTask
 from cadalign.batch.table import write_csv
 from cadalign.errors import CadalignError, DataError, InputError
@@ -26,7 +26,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import Chunk
+from cadalign.evaluation.runs.parallel import Chunk, Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.io.files import write_whole
@@ -119,7 +119,7 @@ def fit_many(
         folder = RunFolder(Path(out))
         chosen = replace(options_of(options), inputs=_inputs(observations, folder))
         chosen = replace(chosen, pictures=pictures)
-        run_fits(chosen, folder, workers=workers, dask=dask, on_progress=on_progress)
+        run_many(chosen, folder, workers=workers, dask=dask, on_progress=on_progress)
         return Results.open(folder.path, in_memory=not is_kept)
 
 
@@ -151,7 +151,7 @@ def stream_fits(
     >>> for number, found in stream_fits(camera_feed(), similar=True):  # doctest: +SKIP
     ...     print(number, found.alignment.translation)
     """
-    experiment = ManyFits(options_of(options))
+    experiment = ManyEstimates(options_of(options))
     pool = workers_of(workers, dask)
     size = 1 if not workers and dask is None else _STREAMED
     for _, rows in pool.evaluate(experiment, _chunks(observations, size)):
@@ -162,8 +162,8 @@ def stream_fits(
                 yield row["row"], DataError(row["reason"])
 
 
-def run_fits(
-    options: FitRunOptions,
+def run_many(
+    options: ManyOptions,
     folder: RunFolder,
     *,
     workers: int | None,
@@ -171,12 +171,18 @@ def run_fits(
     on_progress: OnProgress = lambda progress: None,
 ) -> Tally:
     """Do the run that the options describe, or what is left of it; see `fit_many`."""
-    plan = plan_fits(options, folder)
-    if workers is None:
-        workers = 0 if len(plan.tasks) < _FEW else -1
-    execute(plan, folder, workers=workers_of(workers, dask), on_progress=on_progress)
+    plan = plan_run(options, folder)
+    pool = pool_of(len(plan.tasks), workers, dask, threads=options.threads)
+    execute(plan, folder, workers=pool, on_progress=on_progress)
     write_csv(folder)
     return _tally(folder)
+
+
+def pool_of(count: int, workers: int | None, dask: str | None, *, threads: int = 1) -> Workers:
+    """The workers of a run of so many tasks; by default processes, for few tasks none."""
+    if workers is None:
+        workers = 0 if count < _FEW else -1
+    return workers_of(workers, dask, threads=threads)
 
 
 def options_of(given: dict[str, Any]) -> FitRunOptions:

@@ -1,28 +1,44 @@
-"""Options of a run over many observations."""
+"""Options of runs over many observations, and what a run asks of them."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from cadalign.errors import DataError
 from cadalign.estimation.observation_fit import ObservationFit
+from cadalign.estimation.result import Result
+from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.io.images import photo_size
 from cadalign.io.input_kinds import DetectorOptions
-from cadalign.io.observation import ObservationChanges
+from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observed_image import ObservedImage
+from cadalign.shapes.model import ShapeModel
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """Result of an observation, what it is the alignment of, and cells that the table adds."""
+
+    observation: Observation
+    result: Result
+    cells: Row = field(default_factory=dict)
+    record: Row = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FitRunOptions(ExperimentOptions):
-    """A run that aligns many observations.
+class ManyOptions(ExperimentOptions):
+    """A run over many observations, whatever is estimated of each.
 
     Parameters
     ----------
     inputs : tuple of Path
         Observation files, folders and patterns of such, JSON lines, files of detectors.
-    estimate : ObservationFit
     changes : ObservationChanges
         What takes the place of the observations' own.
     detector : DetectorOptions
@@ -30,11 +46,12 @@ class FitRunOptions(ExperimentOptions):
         Number of observations whose photos the page shows, the first ones.
     """
 
-    experiment: ClassVar[str] = "fit"
-    command: ClassVar[str] = "fit"
+    columns: ClassVar[Columns] = ()
+    """Columns of the table beside those of every run."""
+    record_columns: ClassVar[Columns] = ()
+    """Columns of the records beside those of every run."""
 
     inputs: tuple[Path, ...]
-    estimate: ObservationFit = field(default_factory=ObservationFit)
     changes: ObservationChanges = field(default_factory=ObservationChanges)
     detector: DetectorOptions = field(default_factory=DetectorOptions)
     pictures: int = 0
@@ -43,14 +60,104 @@ class FitRunOptions(ExperimentOptions):
         super().__post_init__()
         self.check_least(pictures=0)
 
+    @property
+    def learned(self) -> Path | None:
+        """The learned shape that keypoints of detectors may be named after."""
+        raise NotImplementedError
+
+    def warm_up(self, seen: Observation) -> Result:
+        """Compile the kernels by the estimate of a model's points."""
+        raise NotImplementedError
+
+    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
+        """Read the parsed form of an observation, which messages call ``where``."""
+        raise NotImplementedError
+
+    def estimate_of(self, seen: Observation, where: str) -> Estimated:
+        """Estimate the object of an observation; raises CadalignError if it cannot be."""
+        raise NotImplementedError
+
+    def contents(self) -> dict[str, Any]:
+        """Entries of a run's configuration that change with the contents of the options' files."""
+        raise NotImplementedError
+
     def as_config(self) -> dict[str, Any]:
         """The options in a run's configuration, without those that are at their defaults."""
-        given = asdict(self)
-        usual = asdict(FitRunOptions(inputs=()))
-        parts = {name: given.pop(name) for name in ("estimate", "changes", "detector")}
-        for name, part in parts.items():
-            given |= {key: value for key, value in part.items() if value != usual[name][key]}
+        given: dict[str, Any] = {}
+        for each in fields(self):
+            value = getattr(self, each.name)
+            given |= _changed(value) if is_dataclass(value) else {each.name: value}
         return {name: _plain(value) for name, value in given.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitRunOptions(ManyOptions):
+    """A run that aligns many observations, as ``estimate`` says; see `ManyOptions`."""
+
+    experiment: ClassVar[str] = "fit"
+    command: ClassVar[str] = "fit"
+
+    estimate: ObservationFit = field(default_factory=ObservationFit)
+
+    @property
+    def learned(self) -> Path | None:
+        """See `ManyOptions.learned`."""
+        return self.estimate.shape
+
+    def warm_up(self, seen: Observation) -> Result:
+        """See `ManyOptions.warm_up`."""
+        return replace(self.estimate, shape=None).fit(seen, "warm-up")[0]
+
+    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
+        """See `ManyOptions.read`."""
+        return self.estimate.read(data, where, folder=folder, changes=self.changes)
+
+    def estimate_of(self, seen: Observation, where: str) -> Estimated:
+        """See `ManyOptions.estimate_of`."""
+        result, _ = self.estimate.fit(seen, where)
+        doubts = [text for view in seen.views for text in _photo_doubt(view)]
+        if doubts:
+            stated = Stated.of(result.statistics)
+            statistics = replace(stated, warnings=(*doubts, *stated.warnings))
+            result = replace(result, statistics=statistics)
+        return Estimated(seen, result)
+
+    def contents(self) -> dict[str, Any]:
+        """See `ManyOptions.contents`."""
+        shape = self.estimate.shape
+        return {"shapes": None if shape is None else ShapeModel.open(shape).category}
+
+
+def _photo_doubt(view: ObservedImage) -> tuple[str, ...]:
+    """Warning about a photo, if it is there, of another size than its camera's images."""
+    if view.image is None or not view.image.is_file():
+        return ()
+    try:
+        width, height = photo_size(view.image)
+    except DataError:  # which whoever draws it will name
+        return ()
+    if (width, height) == (view.camera.width, view.camera.height):
+        return ()
+    return (
+        f"{view.image.name} is {width} x {height} px, the camera {view.camera.width} x "
+        f"{view.camera.height}: give camera and keypoints of its resolution "
+        "(`Camera.resized`, `Camera.cropped`)",
+    )
+
+
+def _changed(part: Any) -> dict[str, Any]:
+    """The fields of some of the options that are not at their defaults."""
+    values = asdict(part)
+    return {
+        each.name: values[each.name]
+        for each in fields(part)
+        if values[each.name] != _plain_default(each)
+    }
+
+
+def _plain_default(each: Any) -> Any:
+    default: Any = each.default if each.default_factory is MISSING else each.default_factory()
+    return asdict(default) if is_dataclass(default) and not isinstance(default, type) else default
 
 
 def _plain(value: Any) -> Any:

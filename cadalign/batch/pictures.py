@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import cv2
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets.models.categories import name_of_synset
 from cadalign.errors import CadalignError, DataError, RenderError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.instances.pictures import write_preview, write_webp
@@ -26,17 +28,32 @@ from cadalign.io.observation import Observation
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.drawing.result_overlay import mesh_of
 
+NAMING = ("row", "source", "image", "object", "model", "match_category", "match_id")
+"""Columns that `page_names` looks at; only a retrieval has the last ones."""
 _MOST = 1024  # pixels of a picture's longer side
 _THUMB = (320, 240)
 _MARGIN = 0.2  # of a thumb, around the object
 
 
 def page_names(row: Row) -> Row:
-    """Names of an observation on the page, unique by its number in the run."""
+    """Names of an observation on the page, unique by its number in the run, and of its model."""
     known = row["image"] or row["source"]
     parts = (Path(known).name, row["object"], f"row {row['row']}")
-    category = Path(row["model"]).stem.removesuffix(".keypoints") or "no model"
-    return {"category": category, "model_id": ", ".join(filter(None, parts)), "view": 0}
+    category, model = row.get("match_category"), row.get("match_id")
+    if not category or not model:
+        category, model = _names_of(Path(row["model"]))
+    name = ", ".join(filter(None, parts))
+    return {"category": category, "model_id": name, "view": 0, "model_name": model}
+
+
+def _names_of(model: Path) -> tuple[str, str]:
+    """Category and name of a model's or a shape's file: in ShapeNet's layout the folders tell."""
+    for part, below in pairwise(model.parts):
+        category = name_of_synset(part)
+        if category != part:
+            return category, Path(below).stem
+    name = model.stem.removesuffix(".keypoints") or "no model"
+    return name, name
 
 
 def draw_fit(folder: RunFolder, row: Row, seen: Observation, result: Result) -> tuple[str, ...]:

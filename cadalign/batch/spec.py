@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -11,18 +11,19 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
-from cadalign.batch.experiment import plan_fits
+from cadalign.batch.experiment import plan_run
 from cadalign.batch.options import FitRunOptions
-from cadalign.batch.pictures import page_names
+from cadalign.batch.pictures import NAMING, page_names
 from cadalign.batch.table import COLUMNS as TABLE_COLUMNS
-from cadalign.batch.table import LISTS, RECORD_COLUMNS
+from cadalign.batch.table import RECORD_COLUMNS, without_lists
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, cumulative
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
+    ALL,
     Summary,
     by_category_and_method,
     known,
@@ -33,6 +34,7 @@ from cadalign.evaluation.summary import (
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
+Statistics = Mapping[str, Callable[[Cells], float]]
 METHOD = "alignment"
 """Name of the estimate on the page, the same in all runs, such that they can be compared."""
 ROTATION_STD = Metric("rotation_std_deg", "rotation uncertainty", "deg", head="R std. dev.")
@@ -48,6 +50,7 @@ _HEADLINE = (
     *_GALLERY,
     metrics.QUERY_MILLISECONDS,
 )
+_MOST_MODELS = 20  # in the table, the most frequent ones
 _PLACES = np.array([0.1, 0.2, 0.5, 1, 2, 3, 5, 7.5, 10, 15, 20, 30, 50])
 
 
@@ -80,10 +83,10 @@ class FitRun(Run):
 
 def _as_instances(table: pa.Table) -> pa.Table:
     """The table of results with the names of instances, and the numbers of the gallery."""
-    shown = table.drop_columns(LISTS)
-    naming = shown.select(["row", "source", "image", "object", "model"]).to_pylist()
-    names = [page_names(row) for row in naming]
-    for name in ("category", "model_id", "view"):
+    shown = without_lists(table)
+    naming = [name for name in NAMING if name in shown.column_names]
+    names = [page_names(row) for row in shown.select(naming).to_pylist()]
+    for name in ("category", "model_id", "view", "model_name"):
         shown = shown.append_column(name, pa.array([each[name] for each in names]))
     inliers, keypoints = (_floats(shown, name) for name in ("inliers", "keypoints"))
     shown = shown.append_column(MATCHED.key, pa.array(inliers / np.maximum(keypoints, 1)))
@@ -164,9 +167,34 @@ _STATISTICS = {
 }
 
 
-def summarize(run: Run) -> list[Summary]:
-    """Medians for every model, and for all together."""
-    return by_category_and_method(run, _STATISTICS)
+def summarize_by(further: Statistics) -> Callable[[Run], list[Summary]]:
+    """Medians for every category, for its models, and for all, with further statistics."""
+    statistics = {**_STATISTICS, **further}
+
+    def summarize(run: Run) -> list[Summary]:
+        found, models = by_category_and_method(run, statistics), _by_model(run)
+        if models is not None:
+            lines = by_category_and_method(models, statistics)
+            found += [line for line in lines if line.group != ALL]
+        return found
+
+    return summarize
+
+
+def _by_model(run: Run) -> Run | None:
+    """The run with its most frequent models for categories; None where each category has one."""
+    names = run.column("category"), run.column("model_name")
+    labels = np.array([f"{each}, {model}" for each, model in zip(*names, strict=True)])
+    models, counts = np.unique(labels, return_counts=True)
+    if len(models) == len(set(names[0].tolist())):
+        return None
+    most = models[np.argsort(-counts, kind="stable")[:_MOST_MODELS]]
+    rows = np.flatnonzero(np.isin(labels, most))
+    results = run.results.take(rows)
+    place = results.schema.get_field_index("category")
+    results = results.set_column(place, "category", pa.array(labels[rows], pa.string()))
+    timings = run.timings.take(rows) if len(run.timings) else run.timings
+    return replace(run, results=results, timings=timings)
 
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
@@ -194,13 +222,13 @@ class FitSpec(Spec):
 
 SPEC = FitSpec(
     options=FitRunOptions,
-    plan=plan_fits,
+    plan=plan_run,
     results=TABLE_COLUMNS,
     columns=_HEADLINE,
-    summarize=summarize,
+    summarize=summarize_by({}),
     plots=plots,
-    group=lambda run: replace(metrics.CATEGORY, label="model", head="model"),
     title=lambda runs: "alignments",
+    joins=True,
     describe=_describe,
     metrics=_GALLERY,
     about="Red is the estimate: its box, and the model warped to the estimated shape.",

@@ -46,13 +46,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
 
 from cadalign.arrays import FloatArray
 from cadalign.estimation.result import Result
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups, schema_of
+from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.files import write_whole
 from cadalign.io.observation import Observation
@@ -63,8 +65,6 @@ _LISTS: Columns = (
     *(("coefficients", list[float]), ("covariance", list[float])),
     *(("residuals", list[float]), ("is_inlier", list[bool])),
 )
-LISTS = [name for name, _ in _LISTS]
-"""Columns that hold several numbers in a cell."""
 COLUMNS: Columns = (
     *(("row", int), ("source", str), ("image", str), ("object", str), ("model", str)),
     *(("status", str), ("reason", str), ("method", str)),
@@ -150,12 +150,12 @@ def shape_coefficients(result: Result, shape: ShapeModel) -> FloatArray:
 
 def write_csv(folder: RunFolder) -> None:
     """Write ``results.csv`` of a finished run, holding few rows at a time."""
-    schema = schema_of(tuple(each for each in COLUMNS if each not in _LISTS))
+    schema = without_lists(pq.read_schema(folder.results).empty_table()).schema
 
     def write(unfinished: Any) -> None:
         with pa_csv.CSVWriter(unfinished, schema) as writer:
             for table in read_groups(folder.results, fix=DONE_ANEW):
-                writer.write_table(table.drop_columns(LISTS))
+                writer.write_table(without_lists(table))
 
     write_whole(folder.path / "results.csv", write)
 
@@ -175,4 +175,9 @@ def _by_axis(name: str, values: Any) -> Row:
 def read_rows(folder: RunFolder) -> list[Row]:
     """The rows of a finished run, without the columns that are lists."""
     groups = read_groups(folder.results, fix=DONE_ANEW)
-    return [row for table in groups for row in table.drop_columns(LISTS).to_pylist()]
+    return [row for table in groups for row in without_lists(table).to_pylist()]
+
+
+def without_lists(table: pa.Table) -> pa.Table:
+    """A table without the columns that hold several values in a cell."""
+    return table.select([each.name for each in table.schema if not pa.types.is_list(each.type)])

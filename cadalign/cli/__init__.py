@@ -39,18 +39,12 @@ def plain_help() -> ConstructorRegistry:
     that of a value, ``PATH`` rather than ``{None}|PATH``.
     """
     registry = ConstructorRegistry()
-    asked: list[StructTypeInfo] = []
-    asked_unions: list[PrimitiveTypeInfo] = []
+    own_primitive = _own_rules(ConstructorRegistry.get_primitive_spec)
+    own_struct = _own_rules(ConstructorRegistry.get_struct_spec)
 
     @registry.primitive_rule
     def optional(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        if asked_unions or NoneType not in get_args(info.type):
-            return None
-        asked_unions.append(info)
-        try:
-            spec = ConstructorRegistry.get_primitive_spec(info)
-        finally:
-            asked_unions.pop()
+        spec = own_primitive(info) if NoneType in get_args(info.type) else None
         if not isinstance(spec, PrimitiveConstructorSpec):
             return None
         metavar = spec.metavar.removeprefix("{None}|").replace("{None,", "{")
@@ -60,18 +54,28 @@ def plain_help() -> ConstructorRegistry:
 
     @registry.struct_rule
     def plain(info: StructTypeInfo) -> StructConstructorSpec | None:
-        if asked:  # tyro's own rules, by the call below
-            return None
-        asked.append(info)
-        try:
-            spec = ConstructorRegistry.get_struct_spec(info)
-        finally:
-            asked.pop()
+        spec = own_struct(info)
         if not isinstance(spec, StructConstructorSpec):
             return None
         return replace(spec, fields=tuple(map(_plain, spec.fields)))
 
     return registry
+
+
+def _own_rules(get_spec: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Ask tyro's own rules: while they are asked, the rule that asks gets None."""
+    asked: list[Any] = []
+
+    def get(info: Any) -> Any:
+        if asked:
+            return None
+        asked.append(info)
+        try:
+            return get_spec(info)
+        finally:
+            asked.pop()
+
+    return get
 
 
 def _plain(field: StructFieldSpec) -> StructFieldSpec:

@@ -14,12 +14,7 @@ import tyro
 from cadalign.cli.options import JsonOption, named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
-from cadalign.evaluation.options import (
-    ExperimentOptions,
-    FunctionOptions,
-    PluginOption,
-    RunOptions,
-)
+from cadalign.evaluation.options import ExperimentOptions, FunctionOptions, PluginOption, RunOptions
 from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +30,11 @@ class CameraOptions:
     (OpenCV) or the corner of the image (COLMAP); by default center for a matrix, and corner for
     COLMAP's form."""
 
+    focal: float | None = None
+    """Focal length [px], where no file has it, or in its place."""
+    fov: float | None = None
+    """Horizontal field of view [degrees], in the place of the focal length."""
+
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera of --camera; ``size`` is the photo's, for a file of a matrix alone."""
         return self.of_camera.read_camera(size)
@@ -38,7 +44,17 @@ class CameraOptions:
         """The camera as what takes the place of an observation's."""
         if self.camera is None and self.pixel_origin is not None:
             raise InputError("given without --camera", where="--pixel-origin", fix="give both")
-        return ObservationChanges(self.camera, self.pixel_origin)
+        focal: Any = self.focal
+        if isinstance(focal, str):  # a word of the commands that estimate
+            if self.fov is not None:
+                what = f"given beside --focal {focal}"
+                raise InputError(what, where="--fov", fix="give one of the two options")
+            focal = None
+        for name, value in (("focal", focal), ("fov", self.fov)):
+            if value is not None and not 0 < value < (180 if name == "fov" else math.inf):
+                bound = "between 0 and 180 degrees" if name == "fov" else "positive"
+                raise InputError(f"{value:g} is not {bound}", where=f"--{name}")
+        return ObservationChanges(self.camera, self.pixel_origin, focal=focal, fov=self.fov)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,17 +33,17 @@ class Export:
     they open in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh,
     .lines.ply the box and cameras for Open3D, .csv and scene_gt.json poses for BOP with the
     stretched mesh beside them, transforms.json and COLMAP's text files the cameras.
-    A run of many fits becomes GLBs (a folder of one each, or one file), COCO's keypoints with
-    poses, BOP's results, cameras for COLMAP or nerfstudio, or a data set in the form of BOP, KITTI,
-    Pix3D, Scan2CAD or Objectron.
+    A run of many fits becomes the observation and fit.json of each, overlays, GLBs (a folder of one
+    each, or one file), COCO's keypoints with poses, BOP's results, cameras for COLMAP or
+    nerfstudio, or a data set in the form of BOP, KITTI, Pix3D, Scan2CAD or Objectron.
     """
 
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
     """Result of `cadalign fit` or `cadalign annotate`; or the folder of a run of many fits."""
     to: Path
     """File to write, or folder of a format of several files. Of a run, a format's name is a folder
-    of that name: glb, coco, bop-results, colmap, nerfstudio, bop, kitti, pix3d, scan2cad,
-    objectron."""
+    of that name: json, overlay, glb, coco, bop-results, colmap, nerfstudio, bop, kitti, pix3d,
+    scan2cad, objectron."""
     format: str | None = None
     """Format, by default what the name's ending tells: glb, usd, obj, ply, lines, bop-results, bop,
     scan2cad, nerfstudio, colmap, open3d-camera, coco."""
@@ -56,6 +56,8 @@ class Export:
     world: Path | None = None
     """Text file of the first camera's pose in the world, 4 x 4, as ScanNet's pose files; for
     --frame world."""
+    rows: tuple[int, ...] = ()
+    """Of a run, the numbers of the observations to write, by default all."""
     options: Annotated[
         _Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_Options.__doc__)
     ] = _Options()
@@ -84,7 +86,9 @@ class Export:
         from cadalign.batch.exports import export_run
 
         with named_as_flags(self, self.options):
-            found = export_run(self.fit, self.to, format=self.format, metres=self.metres)
+            found = export_run(
+                self.fit, self.to, format=self.format, metres=self.metres, rows=self.rows
+            )
         console = new_console()
         for error in found.left_out[:_MOST_LISTED]:
             console.print(f"left out: {error}", markup=False)

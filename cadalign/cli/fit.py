@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import KW_ONLY, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,9 +12,9 @@ import tyro
 
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
 from cadalign.cli.options import (
+    ManyCommand,
     ObservationCommand,
     OptionError,
-    UsageError,
     flag_of,
     make_folder,
     named_as_flags,
@@ -22,11 +22,11 @@ from cadalign.cli.options import (
     waiting,
 )
 from cadalign.errors import InputError
-from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.observation_fit import ObservationFit, refuse_photo
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import read_json, written_path
-from cadalign.io.input_kinds import DetectorOptions, is_of_many
+from cadalign.io.input_kinds import is_of_many
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
@@ -43,7 +43,7 @@ class _FitOptions(FitOptions):
 
     sigma: tyro.conf.Suppress[Sigma | None] = FitOptions.sigma
     focal: tyro.conf.Suppress[str] = FitOptions.focal
-    focal_prior: tyro.conf.Suppress[FocalPrior | None] = FitOptions.focal_prior
+    focal_prior: tyro.conf.Suppress[PriorOption] = FitOptions.focal_prior
 
     def __post_init__(self) -> None:
         with named_as_flags(self, kind=OptionError):
@@ -71,12 +71,17 @@ class EstimateOptions(ObservationFit, ObservationCommand):
         _RansacOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RansacOptions.__doc__)
     ] = _RansacOptions()
 
+    focal: Literal["known", "estimate"] | float | None = None  # type: ignore[assignment]
+    """Focal length [px], in the place of the file's, or: known (the file's) or estimate; by default
+    known, if every view has one. Views of equal cameras share an estimated one."""
     named = staticmethod(flag_of)
 
     @property
     def estimate(self) -> ObservationFit:
         """The options of the estimate alone, without those of the command."""
         given = {field.name: getattr(self, field.name) for field in fields(ObservationFit)}
+        if not isinstance(self.focal, str):  # a number is the camera's, see `CameraOptions`
+            given["focal"] = None
         given["fitting"] = FitOptions(**vars(self.fitting))
         given["ransac"] = RansacOptions(**vars(self.ransac))
         return ObservationFit(**given)
@@ -214,41 +219,25 @@ def draw(
     return drawn, tuple(overlays)
 
 
-@dataclass(frozen=True)
-class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
+@dataclass(frozen=True, kw_only=True)
+class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
     """Align a model to what an observation file holds, and draw the result.
 
     Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
     known lengths. Prints the alignment and, where there is more than keypoints of one image, the
-    deviations without each piece of evidence. Writes fit.json and overlay.png, overlay_1.png and so
-    on for further views. Many observations are a run, which goes on where it was killed: it writes
-    results.parquet and results.csv with a row for each, and report.html. Exit codes of a run: 0 all
-    are aligned, 3 some failed, 1 all failed or refused, 2 a wrong command line.
+    standard deviations without each piece of evidence. Writes fit.json and overlay.png,
+    overlay_1.png and so on for further views; of a file with several objects of one photo, which
+    share its camera, scene.json and a folder for each. Many observations are a run, which goes on
+    where it was killed: it writes results.parquet and results.csv with a row for each, and
+    report.html. Exit codes of a run: 0 all are aligned, 3 some failed, 1 all failed or refused, 2 a
+    wrong command line.
     """
 
-    observations: Annotated[
-        tuple[Path, ...],
-        tyro.conf.Positional,
-        tyro.conf.arg(metavar="OBSERVATION ...", help_behavior_hint="(required)"),
-    ]
-    """A JSON file with camera and keypoints, optionally image, model and further evidence. Or many:
-    several such files, folders, patterns in quotes, JSON lines (.jsonl), or a detector's file of
-    keypoints (COCO's JSON, or CSV) with --camera and --model or --shape."""
-    _: KW_ONLY
     out: Path | None = None
     """Folder to write to; by default <observation>_fit beside the file or folder."""
-    picture: bool = True
-    """Draw box and keypoints over the photo, as overlay.png; of many observations, write a page."""
-    workers: int | None = None
-    """Processes for many observations; -1 for one for each core, 0 for none. By default -1, for few
-    observations 0."""
-    dask: str | None = None
-    """Address of a Dask scheduler, whose workers are used instead."""
-    pictures: int = 100
-    """Of many observations, the number of those whose photos the page shows, the first ones."""
     overlay: Path | None = None
     """Draw the aligned model over the photo, too, and write it to this picture; further views to
-    FILE_1 and so on. The observation names the model."""
+    FILE_1 and so on. The observation names the model. Of many observations, a folder."""
     overlay_mode: Literal["shaded", "translucent", "lines", "box"] = "shaded"
     """Style of drawing: in its own colours, as a red veil, its outline and creases, or its box."""
     overlay_opacity: float = 0.6
@@ -256,17 +245,16 @@ class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
 
     def run(self) -> int:
         """Run the fit, or the fits; returns the exit code."""
-        if not self.observations:
-            fix = "give a JSON file with camera and keypoints, or a folder of such files"
-            raise UsageError("no observation is given", where="OBSERVATION", fix=fix)
-        path = self.observations[0]
+        path = self.first()
         refuse_photo(path)
         is_read = len(self.observations) == 1 and path.suffix.lower() == ".json" and path.is_file()
         data = read_json(path) if is_read else None
         if len(self.observations) > 1 or is_of_many(path, data):
-            from cadalign.cli.fit_many import fit_many
+            return self._fit_many()
+        if isinstance(data, dict) and "objects" in data:
+            from cadalign.cli.fit_scene import fit_scene
 
-            return fit_many(self)
+            return fit_scene(self, path, data)
         fitted = self._fit_file(path, data)
         out = self.out or path.with_name(f"{path.stem}_fit")
         paths = fitted.write(out, overlay=self.overlay)
@@ -278,6 +266,24 @@ class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
             listed = ", ".join(str(path) for path in paths)
             say(f"{'Picture' if len(paths) == 1 else 'Pictures'}: {listed}")
         return 0
+
+    def _fit_many(self) -> int:
+        """Align all observations; returns the exit code."""
+        from cadalign.batch.options import FitRunOptions
+        from cadalign.cli.many import inputs_of, run_command, run_folder, write_overlays
+        from cadalign.cli.runs import NOTHING_WORKED
+
+        style = None
+        if self.overlay is not None:
+            style = overlay_style(
+                self.overlay, mode=self.overlay_mode, opacity=self.overlay_opacity, has_model=True
+            )
+        with named_as_flags(self, self.fitting, self.ransac):
+            options = FitRunOptions(estimate=self.estimate, **inputs_of(self, self.changes))
+            code = run_command(self, options, done="aligned")
+        if self.overlay is not None and code != NOTHING_WORKED:
+            write_overlays(run_folder(self, options), self.overlay, style)
+        return code
 
     @property
     def changes(self) -> ObservationChanges:
@@ -300,6 +306,18 @@ class Fit(EstimateOptions, DetectorOptions, CameraOptions, EvidenceOptions):
                 )
             status = waiting("fitting")
             result, views = self.fit(observation, str(path), note=say, status=status)
+        return self.fitted(path, observation, result, views, style=style)
+
+    def fitted(
+        self,
+        path: Path,
+        observation: Observation,
+        result: Result,
+        views: tuple[View, ...] | None,
+        *,
+        style: OverlayStyle | None = None,
+    ) -> FittedFile:
+        """The result of the observation in a file, its table and pictures; see `draw`."""
         found = FittedFile(result, result.to_dict(), "")
         if views is not None:
             from cadalign.cli.contributions import list_contributions, tabulate_contributions

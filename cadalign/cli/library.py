@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LibraryBuild:
-    """Build a library of a data set's annotated models, as one file."""
+    """Build a library of a data set's annotated models, as one file.
+
+    The build is a run, which goes on where it was killed. Its folder stays beside the library where
+    models are left out, or meshes cannot be read: results.parquet has a row for each.
+    """
 
     root: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="ROOT")]
     """Folder in KeypointNet's layout."""
@@ -30,17 +35,26 @@ class LibraryBuild:
     shapenet: Path | None = None
     """Folder of ShapeNetCore, for the meshes, if they are not below the root."""
 
+    workers: int | None = None
+    """Processes; -1 for one for each core, 0 for none. By default -1, for few models 0."""
+    dask: str | None = None
+    """Address of a Dask scheduler, whose workers are used instead."""
+
     def run(self) -> int:
         """Build the library; returns the exit code."""
+        from cadalign.batch.libraries import build_library
+        from cadalign.cli.runs import run_progress
         from cadalign.datasets import KeypointNet
-        from cadalign.retrieval import Library
 
         console = new_console()
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
         dataset = dataset.subset(categories=self.categories, split=self.split)
-        with console.status("reading annotations and meshes"):
-            library = Library.from_dataset(dataset)
         make_folder(self.out.absolute().parent)
+        folder = self.out.with_name(f"{self.out.stem}_build")
+        with run_progress("reading models") as on_progress:
+            library, troubles = build_library(
+                dataset, folder, workers=self.workers, dask=self.dask, on_progress=on_progress
+            )
         library.save(self.out)
         megabytes = self.out.stat().st_size / 1e6
         console.print(
@@ -49,6 +63,13 @@ class LibraryBuild:
         left_out = len(dataset.problems)
         if left_out:
             console.print(f"Left out: {left_out} models with malformed annotations", markup=False)
+        without = sum(bool(row["warning"]) for row in troubles)
+        if without:
+            console.print(f"Without their meshes, which cannot be read: {without}", markup=False)
+        if troubles:
+            console.print(f"Rows: {folder / 'results.parquet'}", markup=False)
+        else:
+            shutil.rmtree(folder)
         return 0
 
 

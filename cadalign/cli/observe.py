@@ -26,7 +26,7 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.images import photo_size, write_image
-from cadalign.io.observation import Observation
+from cadalign.io.observation import Observation, with_lens
 
 # Arguments of the library's functions, and their names on the command line.
 _FLAGS = {"image": "--image", "number": "--object", "sigma_from_scores": "--sigma"}
@@ -37,9 +37,10 @@ class Observe(CameraOptions, EvidenceOptions):
     """Pair the keypoints of a detector in a photo with a model's.
 
     Writes an observation for `cadalign fit`, or with --every one of each object of every photo.
-    Keypoints are paired by name, otherwise by semantic id, otherwise by order. Without --camera the
-    focal length is unknown. The mask that stands beside COCO keypoints is written as PNG beside the
-    observation where the camera and the model's mesh are known, which a fit to it needs.
+    Keypoints are paired by name, otherwise by semantic id, otherwise by order. Without --camera,
+    --focal or --fov the focal length is unknown. The mask that stands beside COCO keypoints is
+    written as PNG beside the observation where the camera and the model's mesh are known, which a
+    fit to it needs.
     """
 
     keypoints: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="KEYPOINTS")]
@@ -145,7 +146,8 @@ class Observe(CameraOptions, EvidenceOptions):
                     where=name,
                     fix="give keypoints, photo and camera of one image",
                 )
-        return camera or Camera.without_focal(*size)
+        changes = self.of_camera
+        return with_lens(camera or Camera.without_focal(*size), changes.focal, fov=changes.fov)
 
 
 def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: ModelKeypoints) -> int:

@@ -8,17 +8,18 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.io.files import printable
+from cadalign.io.input_kinds import DetectorOptions
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
     from rich.console import Console
 
-    from cadalign.estimation.options import Sigma
-    from cadalign.io.observation import Observation
 
 _PIPE_WIDTH = 120
 
@@ -94,11 +95,35 @@ class ObservationCommand(JsonOption):
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
 
-    def sigma_of(self, observation: Observation) -> Sigma:
-        """Standard deviation of the keypoints: the given one, the file's, or 1."""
-        if self.sigma is not None:
-            return self.sigma
-        return 1.0 if observation.sigma is None else observation.sigma
+
+@dataclass(frozen=True, kw_only=True)
+class ManyCommand(ObservationCommand, DetectorOptions):
+    """Options of the commands on one observation, or on many."""
+
+    observations: Annotated[
+        tuple[Path, ...],
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="OBSERVATION ...", help_behavior_hint="(required)"),
+    ]
+    """A JSON file with camera and keypoints, optionally image, model and further evidence. Or many:
+    several such files, folders, patterns in quotes, JSON lines (.jsonl), or a detector's file of
+    keypoints (COCO's JSON, or CSV) with --camera and --model or --shape."""
+    picture: bool = True
+    """Draw box and keypoints over the photo, as overlay.png; of many observations, write a page."""
+    workers: int | None = None
+    """Processes for many observations; -1 for one for each core, 0 for none. By default -1, for few
+    observations 0."""
+    dask: str | None = None
+    """Address of a Dask scheduler, whose workers are used instead."""
+    pictures: int = 100
+    """Of many observations, the number of those whose photos the page shows, the first ones."""
+
+    def first(self) -> Path:
+        """The first observation; raises UsageError if none is given."""
+        if not self.observations:
+            fix = "give a JSON file with camera and keypoints, or a folder of such files"
+            raise UsageError("no observation is given", where="OBSERVATION", fix=fix)
+        return self.observations[0]
 
 
 def say(text: str) -> None:

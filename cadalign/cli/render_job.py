@@ -22,8 +22,8 @@ from cadalign.render.drawing.movie import MOVIES, contact_sheet
 from cadalign.render.drawing.pictures import keypoint_picture
 from cadalign.render.drawing.stills import VIEWS, Angles, draw_still, pose_in_view, turntable
 from cadalign.render.frame import LIGHT_GREY, Renderer, check_image_size
+from cadalign.render.probe import make_renderer
 from cadalign.render.scene import Scene
-from cadalign.render.select import make_renderer
 from cadalign.render.views.visibility import visible_keypoints
 
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}

@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.options import (
-    ObservationCommand,
-    OptionError,
-    make_folder,
-    named_as_flags,
-    new_console,
-)
+from cadalign.cli.evidence import CameraOptions
+from cadalign.cli.options import ManyCommand, OptionError, make_folder, named_as_flags, new_console
 from cadalign.cli.runs import print_json, print_table
 from cadalign.errors import InputError
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import Sigma
+from cadalign.io.documents import read_json
 from cadalign.io.images import read_image
-from cadalign.retrieval import Match
+from cadalign.io.input_kinds import is_of_many
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.shapes.model import ShapeModel
+from cadalign.retrieval.query import ObservationRetrieval
+
+if TYPE_CHECKING:
+    from cadalign.retrieval.match import Match
 
 
 @dataclass(frozen=True)
@@ -41,80 +39,76 @@ class _RetrievalOptions(RetrievalOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Retrieve(ObservationCommand):
+class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     """Find the models of a library that explain an image's keypoints best.
 
     Each model is posed and stretched. The observation is a file as for `cadalign fit`; its
     keypoints need a semantic_id and no xyz. With --out, writes matches.json, an overlay of each
-    match, and index.html, which shows them side by side.
+    match, its observation and fit, and index.html, which shows them side by side.
+    Many observations are a run, as of `cadalign fit`: it writes results.parquet and results.csv
+    with a row for each, and report.html.
     """
 
-    observation: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OBSERVATION")]
-    """JSON file with camera and keypoints, optionally image."""
-    library: Path
-    """File that `cadalign library build` wrote."""
-    shape: tuple[Path, ...] = ()
-    """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
-    shape estimated from the keypoints, for objects that are not in the library. An unknown focal
-    length is estimated with it, with the photo's EXIF data as a prior."""
     out: Path | None = None
     """Folder for matches.json, the matches' overlays and index.html; by default none is
-    written."""
+    written. Of many observations the run's, by default beside them."""
     mask: Path | None = None
     """Image of the object's pixels in white: ranks the matches again by their silhouettes."""
-    silhouette: bool = False
-    """The same with the photo's opacity, or with what is segmented around the keypoints."""
-    workers: int = -1
-    """Number of threads; -1 for one per core."""
+    workers: int | None = None
+    """Threads for one observation, -1 (the default) for one per core. Processes for many, 0 for
+    none; by default -1, for few observations 0."""
+    picture: bool = True
+    """Of many observations, write a page."""
     ranking: Annotated[
         _RetrievalOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RetrievalOptions.__doc__)
     ] = _RetrievalOptions()
 
     def run(self) -> int:
-        """Run the retrieval; returns the exit code."""
-        from cadalign.retrieval import Library
-        from cadalign.retrieval.page import none_text, write_retrieval
-        from cadalign.retrieval.query import read_mask, read_opacity, read_query
+        """Run the retrieval, or the retrievals; returns the exit code."""
+        path = self.first()
+        is_file = path.suffix.lower() == ".json" and path.is_file()
+        is_many = is_of_many(path, read_json(path) if is_file else None)
+        with named_as_flags(self, self.ranking):
+            if len(self.observations) > 1 or is_many:
+                return self._retrieve_many()
+            return self._retrieve(path)
 
-        query = read_query(self.observation)
-        assert query.semantic_ids is not None
-        library = Library.open(self.library)
-        shape = _open_shapes(self.shape)
+    def _retrieve_many(self) -> int:
+        """Retrieve the models of all observations; returns the exit code."""
+        from cadalign.batch.retrievals import RetrieveRunOptions
+        from cadalign.cli.many import inputs_of, run_command
+
+        if self.mask is not None:
+            fix = "give --silhouette, which takes each photo's opacity or cuts the object out"
+            raise InputError("is for one observation", where="--mask", fix=fix)
+        given = {each.name: getattr(self, each.name) for each in fields(ObservationRetrieval)}
+        given["ranking"] = RetrievalOptions(**vars(self.ranking))
+        options = RetrieveRunOptions(
+            estimate=ObservationRetrieval(**given), **inputs_of(self, self.of_camera)
+        )
+        return run_command(self, options, done="retrieved")
+
+    def _retrieve(self, path: Path) -> int:
+        """Retrieve the models of one observation; returns the exit code."""
+        from cadalign.retrieval.page import none_text, write_retrieval
+        from cadalign.retrieval.query import read_mask, read_query
+
+        query = self.of_camera.applied_to(read_query(path), str(path))
+        library, _ = self.opened()
         camera = query.camera
-        prior = None
-        if not camera.focal_known:
-            if shape is None:
-                raise InputError(
-                    "the focal length is unknown, without which no model's pose is searched",
-                    where=f"{self.observation}: camera",
-                    fix="rank by --shape, which estimates it, or give a calibrated camera",
-                )
-            if query.image is not None:
-                prior = FocalPrior.from_exif(query.image)
         mask = None if self.mask is None else read_mask(self.mask, camera)
-        image = read_opacity(query.image, camera) if self.silhouette else None
         # The table needs no photo, which may have been moved.
         photo = None
         if self.out is not None and query.image is not None:
             photo = read_image(query.image, camera)
         console = new_console()
         status = console.status("retrieving (the first time after an installation takes a minute)")
-        with status, named_as_flags(self, self.ranking):
-            matches = library.retrieve(
-                query.points_2d,
-                query.semantic_ids,
-                camera,
-                **vars(replace(self.ranking, sigma=self.sigma_of(query))),
-                shape=shape,
-                focal_prior=prior,
-                mask=mask,
-                image=image,
-                workers=self.workers,
-            )
+        with status:
+            workers = -1 if self.workers is None else self.workers
+            matches = self.retrieve(query, str(path), mask=mask, workers=workers)
         found = matches[0].camera if matches else None
         if not camera.focal_known and found is not None:
-            camera = found
-            console.print(f"Focal length: estimated as {camera.fx:.4g} px", markup=False)
+            console.print(f"Focal length: estimated as {found.fx:.4g} px", markup=False)
         if self.json:
             print_json([match.to_dict() for match in matches])
         else:
@@ -127,26 +121,14 @@ class Retrieve(ObservationCommand):
             page = write_retrieval(
                 self.out,
                 matches,
-                camera,
-                title=f"Models for {self.observation.name}",
+                found or camera,
+                query=query,
+                title=f"Models for {path.name}",
                 library=f"{self.library.name} ({len(library):,} models)",
                 image=photo,
             )
             console.print(f"Page: {page}", markup=False)
         return 0
-
-
-def _open_shapes(paths: Sequence[Path]) -> ShapeModel | dict[str, ShapeModel] | None:
-    """The shape models of files: one, or several by category; None of no file."""
-    models = [ShapeModel.open(path) for path in paths]
-    if len(models) < 2:
-        return models[0] if models else None
-    by_category = {model.category: model for model in models}
-    if len(by_category) < len(models):
-        names = [model.category for model in models]
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"two files of the category {twice!r}", where="--shape")
-    return by_category
 
 
 def _print_table(matches: Sequence[Match]) -> None:

@@ -119,6 +119,7 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
         TimeRemainingColumn(),
         console=new_console(),
         transient=True,
+        disable=not sys.stderr.isatty(),  # else it ends in an empty line
     ) as progress:
         bar = progress.add_task(label, total=None)
         yield lambda state: progress.update(bar, total=state.total, completed=state.done)

@@ -23,21 +23,18 @@ from msgspec import Meta
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.datasets.sfm.correspondences import CameraView
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import (
-    PIXEL_CENTRE,
-    alignment_from_opengl,
-    opengl_from_model,
-)
+from cadalign.geometry.conventions import PIXEL_CENTRE, alignment_from_opengl, opengl_from_model
 from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json, within
 from cadalign.io.files import write_json
 
 _OPEN3D_VIEW = "PinholeCameraParameters"
 _OPEN3D_TRAJECTORY = "PinholeCameraTrajectory"
 _VERSION = {"version_major": 1, "version_minor": 0}
-_NERF_DISTORTION = ("k1", "k2", "p1", "p2")
+_NERF_DISTORTION = {"OPENCV": ("k1", "k2", "p1", "p2"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
+_NERF_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", *_NERF_DISTORTION)
 _Angle = Annotated[float, Meta(gt=0, lt=np.pi)]
 
 
@@ -76,6 +73,8 @@ class _NerfFrame(ForeignDocument):
     k4: Finite | None = None
     p1: Finite | None = None
     p2: Finite | None = None
+    camera_model: str | None = None
+    is_fisheye: bool = False
     file_path: Any = ""
 
 
@@ -99,7 +98,8 @@ def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> N
 def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
     """Write ``transforms.json``; what all cameras share stands at the top.
 
-    Refused are lenses of more coefficients than k1, k2, p1, p2, and poses with a scale.
+    Refused are lenses of more coefficients than k1, k2, p1, p2, of a fisheye k1 to k4, fov lenses,
+    and poses with a scale.
     """
     _require_views(views)
     cameras = [_nerf_camera(view.camera, number) for number, view in enumerate(views)]
@@ -133,18 +133,21 @@ def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
 
 
 def _nerf_camera(camera: Camera, number: int) -> dict[str, Any]:
-    if any(camera.distortion[4:]):
-        what = "transforms.json has no place for more than k1, k2, p1, p2"
+    if any(camera.distortion[4:]) or camera.lens == "fov":
+        what = "transforms.json has no place for more than k1, k2, p1, p2, or a fisheye's k1 to k4"
         raise InputError(what, where=f"views[{number}]")
     coefficients = camera.distortion[:4] or (0.0,) * 4
+    model = "OPENCV_FISHEYE" if camera.lens == "fisheye" else "OPENCV"
     return {
+        "camera_model": model,
         "w": camera.width,
         "h": camera.height,
         "fl_x": camera.fx,
         "fl_y": camera.fy,
         "cx": camera.cx + PIXEL_CENTRE,
         "cy": camera.cy + PIXEL_CENTRE,
-        **dict(zip(_NERF_DISTORTION, coefficients, strict=True)),
+        **dict.fromkeys(("k1", "k2", "k3", "k4", "p1", "p2"), 0.0),
+        **dict(zip(_NERF_DISTORTION[model], coefficients, strict=True)),
     }
 
 
@@ -208,17 +211,24 @@ def _nerf_views(data: dict[str, Any]) -> list[CameraView]:
 
 
 def _camera_from_nerf(frame: _NerfFrame) -> Camera:
-    for name, value in (("k3", frame.k3), ("k4", frame.k4)):
-        if value:
-            what = f"{name} is a fisheye's coefficient"
-            raise InputError(what, where=name, fix="undistort first")
+    if frame.camera_model not in (None, *_NERF_MODELS):
+        what, fix = f"{quote(frame.camera_model)} is not a camera model that is known", "undistort"
+        raise InputError(what, where="camera_model", fix=f"{fix}, or give {_NERF_MODELS[-1]}")
+    is_fisheye = frame.is_fisheye or frame.camera_model == "OPENCV_FISHEYE"
+    model = "OPENCV_FISHEYE" if is_fisheye else "OPENCV"
+    for name in {"k3", "k4", "p1", "p2"} - set(_NERF_DISTORTION[model]):
+        if getattr(frame, name):
+            what = f"{name} is not a coefficient of the model {model}"
+            raise InputError(what, where=name, fix="state the camera_model, or undistort")
     width, height = frame.w, frame.h
     if width is None or height is None:
         raise InputError("w and h, the image's size, are missing")
     fx, fy = frame.fl_x, frame.fl_y
+    if is_fisheye and fx is None:
+        raise InputError("fl_x, a fisheye's focal length, is missing")
     if fx is None and frame.camera_angle_x is not None:
         fx = width / 2 / float(np.tan(frame.camera_angle_x / 2))
-    if fy is None and frame.camera_angle_y is not None:
+    if fy is None and frame.camera_angle_y is not None and not is_fisheye:
         fy = height / 2 / float(np.tan(frame.camera_angle_y / 2))
     if fx is None:
         raise InputError("neither fl_x nor camera_angle_x is there")
@@ -229,7 +239,8 @@ def _camera_from_nerf(frame: _NerfFrame) -> Camera:
         fy=fx if fy is None else fy,
         cx=(width / 2 if frame.cx is None else frame.cx) - PIXEL_CENTRE,
         cy=(height / 2 if frame.cy is None else frame.cy) - PIXEL_CENTRE,
-        distortion=(frame.k1 or 0.0, frame.k2 or 0.0, frame.p1 or 0.0, frame.p2 or 0.0),
+        distortion=tuple(getattr(frame, name) or 0.0 for name in _NERF_DISTORTION[model]),
+        lens="fisheye" if is_fisheye else "perspective",
     )
 
 

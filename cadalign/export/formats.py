@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.datasets.detections.coco import write_coco_keypoints
 from cadalign.datasets.photos import bop, bop_files
-from cadalign.datasets.photos.poses import PoseEstimate
+from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.datasets.photos.scan2cad import scan_entry
 from cadalign.datasets.sfm.colmap import write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView

@@ -9,7 +9,7 @@ photo with a margin at one side. A distorted photo is resampled to a pinhole cam
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -97,8 +97,8 @@ def _pinhole_of(camera: Camera) -> Camera:
     low = np.maximum(np.floor(pixels.min(axis=0) + _BORDER), -slack)
     high = np.minimum(np.ceil(pixels.max(axis=0) + _BORDER), [width, height] + slack)
     columns, rows = (int(n) for n in np.maximum(high - low, 1))
-    centre = camera.cx - float(low[0]), camera.cy - float(low[1])
-    return replace(camera, width=columns, height=rows, cx=centre[0], cy=centre[1], distortion=())
+    cx, cy = camera.cx - float(low[0]), camera.cy - float(low[1])
+    return Camera(columns, rows, camera.fx, camera.fy, cx, cy)
 
 
 def _undistorted(image: ByteImage, camera: Camera, pinhole: Camera) -> ByteImage:

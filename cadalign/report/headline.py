@@ -14,6 +14,7 @@ from cadalign.evaluation.photos.protocols import TRUTH
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.summary import ALL, Summary, group_name
+from cadalign.report.runs import by_spec
 
 _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
@@ -83,23 +84,30 @@ class Headline:
 
 def headline_of(runs: Sequence[Run]) -> Headline:
     """The headline table of runs of one kind."""
-    spec, group = spec_of(runs[0]), spec_of(runs[0]).group(runs[0])
-    lines = [_all_first(spec.lines(spec.summarize(run))) for run in runs]
-    columns = spec.shown_columns([line for found in lines for line in found], runs)
+    lines = [_all_first(spec_of(run).lines(spec_of(run).summarize(run))) for run in runs]
+    columns, notes, stated = dict[str, Metric](), list[str](), list[Summary]()
+    for spec, places in by_spec(runs):
+        own = [runs[k] for k in places]
+        of_spec = [line for k in places for line in lines[k]]
+        columns |= {each.key: each for each in spec.shown_columns(of_spec, own)}
+        reference = spec.reference(own, {line.group for line in of_spec})
+        stated += reference.lines
+        notes += [spec.note, reference.note]
+    shown = tuple(columns.values())
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
-        rows += _with_best([HeadlineRow.of(index, line, columns) for line in lines[index]], columns)
+        rows += _with_best([HeadlineRow.of(index, line, shown) for line in lines[index]], shown)
+        group = spec_of(run).group(run)
         failures += _reasons(index, run, group, FAILED)
         skipped += _reasons(index, run, group, SKIPPED)
-    stated = spec.reference(runs, {row.category for row in rows})
     return Headline(
-        group=group.heading,
-        columns=tuple(columns),
+        group=spec_of(runs[0]).group(runs[0]).heading,
+        columns=shown,
         rows=rows,
         failures=failures,
         skipped=skipped,
-        paper=[HeadlineRow.of(0, line, columns) for line in stated.lines],
-        note=f"{spec.note} {stated.note}".strip(),
+        paper=[HeadlineRow.of(0, line, shown) for line in stated],
+        note=" ".join(filter(None, dict.fromkeys(notes))),
     )
 
 

@@ -13,6 +13,7 @@ import pyarrow.compute as pc
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import LEFT_OUT, OK, SKIPPED
 from cadalign.evaluation.plots import compact
+from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
 
 InstanceName = tuple[str, str, int]
@@ -51,18 +52,19 @@ def instance_table(
     rows: dict[str, list[Any]] = {name: [] for name in ("instance", "method", "status", "reason")}
     rows |= {metric.key: [] for metric in metrics}
     places: dict[tuple[int, InstanceName], int] = {}
-    ids: dict[InstanceName, int] = {}
+    ids: dict[InstanceName | tuple[str, int], int] = {}
     number = {name: place for place, name in enumerate(methods)}
     for run_index, run in enumerate(runs):
         cells = _cells(run, metrics)
         names = list(zip(cells["category"], cells["model_id"], cells["view"], strict=True))
+        joins = spec_of(run).joins
         for row, name in enumerate(names):
             key = (run_index, name)
             if key not in places:
                 places[key] = len(places)
                 _append(
                     instances,
-                    id=ids.setdefault(name, len(ids)),
+                    id=ids.setdefault(name[1:] if joins else name, len(ids)),
                     run=run_index,
                     category=texts.place(name[0]),
                     model=texts.place(name[1]),

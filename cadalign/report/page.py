@@ -51,14 +51,13 @@ from __future__ import annotations
 import colorsys
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from cadalign.evaluation.methods.method import LIMIT
-from cadalign.evaluation.plots import look_of
-from cadalign.evaluation.registry import spec_of
+from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import dense_json, write_text, writing
 from cadalign.report.headline import Headline, headline_of
@@ -66,6 +65,7 @@ from cadalign.report.instances import InstanceTable, instance_table
 from cadalign.report.media import INLINE_LIMIT, AssetStore, inline_bytes
 from cadalign.report.runs import (
     all_methods,
+    by_spec,
     read_runs,
     settings_of,
     shown_metrics,
@@ -101,7 +101,8 @@ def write_report(
     Parameters
     ----------
     runs : sequence of path-like
-        Folders of runs, finished or not; several of the same kind are compared.
+        Folders of runs, finished or not; several of the same kind are compared, and runs over many
+        observations stand beside each other and beside one with truth.
     path : path-like
         The page to write.
     assets : bool
@@ -158,7 +159,6 @@ def payload_of(
     ``table`` is None for runs without instances; ``media`` is from
     `cadalign.report.media.AssetStore`.
     """
-    spec = spec_of(runs[0])
     return {
         "format": _FORMAT,
         "title": title,
@@ -178,9 +178,21 @@ def payload_of(
         "metrics": [metric.page() for metric in shown_metrics(runs)],
         "headline": headline.to_dict(),
         "tables": None if table is None else table.to_dict(),
-        "plots": [plot.to_dict() for plot in spec.plots(runs)],
+        "plots": [plot.to_dict() for plot in _plots(runs)],
         **media,
     }
+
+
+def _plots(runs: Sequence[Run]) -> list[Plot]:
+    """The plots of all runs; those of several kinds share the plot of the same metric."""
+    found: dict[str, Plot] = {}
+    for spec, places in by_spec(runs):
+        for plot in spec.plots([runs[k] for k in places]):
+            traces = [replace(trace, run=places[trace.run]) for trace in plot.traces]
+            known = found.get(plot.id)
+            before = [] if known is None else known.traces
+            found[plot.id] = replace(known or plot, traces=[*before, *traces])
+    return list(found.values())
 
 
 def method_dict(name: str) -> dict[str, Any]:

@@ -6,9 +6,9 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from cadalign.batch.spec import SPEC
+from cadalign.batch import retrievals, spec
 from cadalign.errors import InputError
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
@@ -17,7 +17,11 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import refuse_nul
 
-register(SPEC)  # runs over many observations are shown as those of experiments are
+if TYPE_CHECKING:
+    from cadalign.evaluation.spec import Spec
+
+for many in (spec, retrievals):  # runs over many observations are shown as experiments are
+    register(many.SPEC)
 
 _LABELS = {
     "root": "dataset",
@@ -55,23 +59,41 @@ def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
             raise InputError("the run is given twice", where=str(path))
         seen.add(path.resolve())
     runs = [_read(path, name) for path, name in zip(paths, _names(paths), strict=True)]
-    kinds = [spec_of(run).kind(run) for run in runs]
-    for run, kind in zip(runs, kinds, strict=True):
-        if kind != kinds[0]:
+    _require_comparable(runs)
+    return runs
+
+
+def _require_comparable(runs: Sequence[Run]) -> None:
+    """Refuse runs of several kinds, but those that may stand beside others on instances."""
+    others = [run for run in runs if not spec_of(run).joins]
+    joining = [run for run in runs if spec_of(run).joins]
+    for run in others:
+        kind = spec_of(run).kind(run)
+        apart = [each for each in others[:1] if spec_of(each).kind(each) != kind]
+        if not spec_of(run).metrics:
+            apart += joining
+        for other in apart:
             raise InputError(
-                f"{run.name} is a run of {kind}, {runs[0].name} one of {kinds[0]}",
+                f"{run.name} is a run of {kind}, {other.name} one of {spec_of(other).kind(other)}",
                 where="runs",
                 fix="write a report for each kind",
             )
-    return runs
+
+
+def by_spec(runs: Sequence[Run]) -> list[tuple[Spec, list[int]]]:
+    """The specifications of runs, each with the places of its runs among them."""
+    places: dict[str, list[int]] = {}
+    for place, run in enumerate(runs):
+        places.setdefault(spec_of(run).name, []).append(place)
+    return [(spec_of(runs[own[0]]), own) for own in places.values()]
 
 
 def shown_metrics(runs: Sequence[Run]) -> list[Metric]:
     """Metrics of the instances that some run has; none for runs without instances."""
     known = {name for run in runs for name in run.results.column_names}
-    metrics = spec_of(runs[0]).metrics
+    metrics = {metric.key: metric for spec, _ in by_spec(runs) for metric in spec.metrics}
     further = {metric.key: metric for run in runs for metric in run.metrics} if metrics else {}
-    return [metric for metric in (*metrics, *further.values()) if metric.key in known]
+    return [metric for metric in (metrics | further).values() if metric.key in known]
 
 
 def all_methods(runs: Sequence[Run]) -> list[str]:
@@ -98,7 +120,8 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def title_of(runs: Sequence[Run]) -> str:
     """A report's title."""
-    title = spec_of(runs[0]).title_of(runs)
+    titles = [spec.title_of([runs[k] for k in places]) for spec, places in by_spec(runs)]
+    title = " and ".join(dict.fromkeys(titles))
     if len(runs) > 1:
         return f"{len(runs)} runs compared: {title}"
     return title[0].upper() + title[1:]
@@ -126,19 +149,19 @@ def settings_of(run: Run) -> list[tuple[str, str]]:
 
 
 def _sentences(runs: Sequence[Run]) -> Iterator[str]:
-    spec = spec_of(runs[0])
     for run in runs:
         before = f"{run.name}: " if len(runs) > 1 else ""
         version = run.config.get("versions", {}).get("cadalign", "of an unknown version")
-        text = f"{_methods(run)} {spec.describe(run)}, with cadalign {version} on {run.day}."
+        text = (
+            f"{_methods(run)} {spec_of(run).describe(run)}, with cadalign {version} on {run.day}."
+        )
         yield f"{before}{text}"
         if not run.is_finished:
             yield (
                 f"The run is unfinished, {run.done:,} of {run.total:,} tasks are done: the numbers "
                 "are those of the finished ones."
             )
-    if spec.about:
-        yield spec.about
+    yield from filter(None, dict.fromkeys(spec.about for spec, _ in by_spec(runs)))
 
 
 def _methods(run: Run) -> str:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.posterior import bent
@@ -42,6 +43,7 @@ def observe(
     """Check an image's keypoints and prepare them for the kernels."""
     if not isinstance(camera, Camera):
         raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
+    require_perspective(camera, "retrieval")
     pixels = as_points(points_2d, name="points_2d", dimension=2)
     ids = check_semantic_ids(semantic_ids, len(pixels), where="semantic_ids")
     order = np.argsort(ids)

@@ -19,7 +19,7 @@ from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_b
 from cadalign.retrieval.candidates import gather_candidates, observe
 from cadalign.retrieval.library_file import fingerprint, read_library, write_library
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable
+from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable, read_annotated
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import make_matches, rank
 from cadalign.shapes.model import ShapeModel
@@ -100,11 +100,10 @@ class Library:
         """
         models = []
         for model in dataset.subset(categories=categories):
-            try:
-                models.append(LibraryModel.of_annotated(model))
-            except DataError as error:
-                logger.warning("bounds are the keypoints': %s", error)
-                models.append(LibraryModel.of_annotated(model, with_mesh=False))
+            found, warning = read_annotated(model)
+            if warning:
+                logger.warning("bounds are the keypoints': %s", warning)
+            models.append(found)
             on_model()
         if not models:
             raise DataError("the data set has no such models", where=str(dataset.root))
@@ -193,10 +192,11 @@ class Library:
         camera : Camera
             The calibrated camera. Lens distortion is honoured. With ``shape`` it may lack a focal
             length, which is then estimated: ``match.camera`` has it.
-        shape : ShapeModel or mapping of category to ShapeModel, optional
-            Rank by the shape that these estimate from the image, for objects that no model of the
-            library is, not even stretched: only models of these categories, a single shape model
-            being that of ``category``, if given. See `cadalign.retrieval.by_shape`.
+        shape : ShapeModel or mapping of str to ShapeModel, optional
+            Rank by the shape, or each category's, that these estimate from the image, for objects
+            that no model of the library is, not even stretched: only models of these categories, a
+            single shape model being that of ``category``, if given. See
+            `cadalign.retrieval.by_shape`.
         focal_prior : FocalPrior, optional
             Prior on an unknown focal length, with ``shape``.
         mask : (h, w) bool, optional
@@ -206,8 +206,8 @@ class Library:
         image : (h, w, 3) or (h, w, 4) uint8, optional
             The image instead of a mask: its opacity, or a segmentation around the keypoints, is
             the mask.
-        exclude : collection of (category, model id)
-            Models to leave out.
+        exclude : collection of (str, str)
+            Category and id of models to leave out.
         workers : int
             Number of threads; -1 for one per core.
         **options

@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import os
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import InputError
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import ViewResult
+from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.plots import plot_box, plot_keypoints, plot_photo
+from cadalign.io.meshes.load import load_mesh
+from cadalign.io.observation import Observation
 from cadalign.notebook.html import card, draw_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+METHOD = "retrieve"
+"""Method of a match's result."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +124,76 @@ class Match:
             return card("Match", rows)
 
         def draw(axes: Axes) -> None:
-            plot_photo(camera, axes=axes)
-            plot_box(axes, camera, self.box)
-            every = np.ones(self.shared, dtype=bool)
-            plot_keypoints(axes, self.points_2d, self.residuals, every)
+            self.result.plot(axes=axes)
 
         picture = draw_picture(draw, aspect=camera.height / camera.width)
         return card("Match", rows, picture=picture)
+
+    @property
+    def result(self) -> Result:
+        """The match in the form of every estimate: its pose, residuals, box, and JSON form.
+
+        It states no uncertainty; `cadalign.fit` of the keypoints does.
+
+        Raises
+        ------
+        InputError
+            If the match has no camera.
+        """
+        if self.camera is None:
+            raise InputError("the match has no camera", where="camera", fix="retrieve it again")
+        ids, none = tuple(self.semantic_ids.tolist()), Stated(None)
+        inliers = np.ones(self.shared, dtype=bool)
+        seen = (self.camera, self.alignment, ids, self.points_2d, self.residuals, inliers, none)
+        return Result(
+            (ViewResult(*seen),), ids, self.points_3d, METHOD, none, own_bounds=self.bounds
+        )
+
+    def observation(self, seen: Observation) -> Observation:
+        """The keypoints of an observation that the model has, paired with the model's."""
+        assert seen.semantic_ids is not None
+        kept = np.flatnonzero(np.isin(seen.semantic_ids, self.semantic_ids))
+        ids = seen.semantic_ids[kept]
+        own: dict[str, Any] = {
+            name: None if values is None else values[kept]
+            for name in ("sigma", "confidences", "depths")
+            for values in (getattr(seen, name),)
+        }
+        return replace(
+            seen,
+            points_3d=self.points_3d[np.searchsorted(self.semantic_ids, ids)],
+            points_2d=seen.points_2d[kept],
+            semantic_ids=ids,
+            names=seen.names and tuple(seen.names[row] for row in kept.tolist()),
+            camera=self.camera or seen.camera,
+            model=self.mesh_path,
+            others=(),
+            **own,
+        )
+
+    def plot(
+        self,
+        image: npt.ArrayLike | str | os.PathLike[str] | None = None,
+        *,
+        axes: Axes | None = None,
+    ) -> Axes:
+        """Draw photo, model, box and keypoints; see `cadalign.Result.plot`."""
+        return self.result.plot(image, self._mesh(), axes=axes)
+
+    def export(
+        self, path: str | os.PathLike[str], *, format: str | None = None, **of_the_object: Any
+    ) -> Path:
+        """Write the posed and stretched model for another tool; see `cadalign.Result.export`.
+
+        Examples
+        --------
+        >>> library.retrieve(points_2d, ids, camera)[0].export("chair.glb")  # doctest: +SKIP
+        """
+        known = {"mesh": self._mesh(), "name": self.model_id} | of_the_object
+        return self.result.export(path, format=format, **known)
+
+    def _mesh(self) -> Any:
+        return None if self.mesh_path is None else load_mesh(self.mesh_path)
 
     def to_dict(self) -> dict[str, Any]:
         """Write the match as plain lists and numbers, for JSON."""

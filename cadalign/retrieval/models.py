@@ -136,16 +136,24 @@ class ModelTable:
     @classmethod
     def of(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> ModelTable:
         """Make a table; raises InputError if two models have the same category and id."""
-        in_order = sorted(map(_library_model, models), key=lambda model: model.key)
+        return cls.of_rows(row_of(_library_model(model)) for model in models)
+
+    @classmethod
+    def of_rows(cls, rows: Iterable[dict[str, Any]]) -> ModelTable:
+        """Make a table of what `row_of` makes of each model; raises as `of`."""
+
+        def key_of(row: dict[str, Any]) -> ModelKey:
+            return row["category"], row["model_id"]
+
+        in_order = sorted(rows, key=key_of)
         for first, second in pairwise(in_order):
-            if first.key == second.key:
+            if key_of(first) == key_of(second):
                 raise InputError(
-                    f"the model {first.model_id!r} of {first.category!r} occurs twice",
+                    f"the model {first['model_id']!r} of {first['category']!r} occurs twice",
                     where="library",
                     fix="give every model of a category its own id",
                 )
-        rows = [_row(model) for model in in_order]
-        return cls(pa.Table.from_pylist(rows, schema=SCHEMA))
+        return cls(pa.Table.from_pylist(in_order, schema=SCHEMA))
 
     def __len__(self) -> int:
         return len(self.table)
@@ -240,7 +248,15 @@ def _library_model(model: object) -> LibraryModel:
     raise InputError(what, where="models", fix="give the models of `cadalign.datasets`")
 
 
-def _row(model: LibraryModel) -> dict[str, Any]:
+def read_annotated(model: AnnotatedModel) -> tuple[LibraryModel, str]:
+    """A data set's model, and why its bounds are the keypoints' where the mesh cannot be read."""
+    try:
+        return LibraryModel.of_annotated(model), ""
+    except DataError as error:
+        return LibraryModel.of_annotated(model, with_mesh=False), str(error)
+
+
+def row_of(model: LibraryModel) -> dict[str, Any]:
     """Convert a model to a row of the table, its keypoints in the order of their ids."""
     order = np.argsort(model.semantic_ids)
     place = np.argsort(order)

@@ -11,6 +11,7 @@ import numpy as np
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import write_json, write_text, writing
 from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import LIGHT_GREY
@@ -27,16 +28,25 @@ def write_retrieval(
     title: str,
     library: str,
     image: ByteImage | None,
+    query: Observation | None = None,
 ) -> Path:
     """Write ``matches.json``, ``overlay_01.png`` and so on, and ``index.html``; returns the page.
 
-    The library is described by text. Without a photo the overlays are drawn on grey.
+    The library is described by text. Without a photo the overlays are drawn on grey. Of a query,
+    ``match_01.json`` and so on are the observation of each match's model, and
+    ``match_01_fit/fit.json`` its result, which `cadalign export` takes.
     """
     if image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
     _remove_overlays(folder)
     for rank, match in enumerate(matches, start=1):
         write_image(folder / overlay_name(rank), draw_match(image, camera, match))
+        if query is not None:
+            observation, fit = folder / f"match_{rank:02d}.json", folder / f"match_{rank:02d}_fit"
+            match.observation(query).save(observation)
+            with writing(fit):
+                fit.mkdir(exist_ok=True)
+            match.result.save(fit / "fit.json")
     write_json(folder / "matches.json", [match.to_dict() for match in matches])
     html = fill(
         "retrieval.html",

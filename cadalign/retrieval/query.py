@@ -1,18 +1,129 @@
-"""Reading of queries: observations whose keypoints need no model points, masks and opacity."""
+"""Queries: observations whose models are retrieved, the options of that, masks and opacity."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.arrays import BoolArray
+from cadalign.arrays import BoolArray, IntArray
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.images import open_photo, read_image
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.color import ByteImage
+from cadalign.retrieval.options import RetrievalOptions
+from cadalign.shapes.model import ShapeModel
+
+if TYPE_CHECKING:
+    from cadalign.render.drawing.color import ByteImage
+    from cadalign.retrieval.library import Library
+    from cadalign.retrieval.match import Match
+
+
+@dataclass(frozen=True, kw_only=True)
+class ObservationRetrieval:
+    """Settings of the retrieval of an observation's model."""
+
+    library: Path
+    """File that `cadalign library build` wrote."""
+    shape: tuple[Path, ...] = ()
+    """Files that `cadalign shape learn` wrote, one for each category: ranks their models by the
+    shape estimated from the keypoints, for objects that are not in the library. An unknown focal
+    length is estimated with it, with the photo's EXIF data as a prior."""
+    silhouette: bool = False
+    """Rank the matches again by the object's pixels: those of the photo's opacity, or what is
+    segmented around the keypoints."""
+    sigma: float | None = None
+    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
+
+    def opened(self) -> tuple[Library, ShapeModel | dict[str, ShapeModel] | None]:
+        """The library and the shapes, which runs use again and again.
+
+        Raises
+        ------
+        DataError
+            If a file cannot be read.
+        InputError
+            If two shapes are of the same category.
+        """
+        shapes = tuple((path, _time_of(path)) for path in self.shape)
+        return _opened_library(self.library, _time_of(self.library)), _opened_shapes(shapes)
+
+    def retrieve(
+        self, seen: Observation, where: str, *, mask: BoolArray | None = None, workers: int = -1
+    ) -> list[Match]:
+        """Rank the library's models by an observation, which messages call ``where``.
+
+        ``mask`` and ``workers`` are as for `Library.retrieve`.
+
+        Raises
+        ------
+        CadalignError
+            As for `Library.retrieve`; or if the keypoints have no semantic ids, or the photo cannot
+            be read.
+        """
+        library, shape = self.opened()
+        camera, ids = seen.camera, _semantic_ids(seen, where)
+        if shape is None and not camera.focal_known:
+            raise InputError(
+                "the focal length is unknown, without which no model's pose is searched",
+                where=f"{where}: camera",
+                fix="rank by --shape, which estimates it, or give a calibrated camera",
+            )
+        prior = None
+        if not camera.focal_known and seen.image is not None:
+            prior = FocalPrior.from_exif(seen.image)
+        stated = 1.0 if seen.sigma is None else seen.sigma
+        sigma = stated if self.sigma is None else self.sigma
+        return library.retrieve(
+            seen.points_2d,
+            ids,
+            camera,
+            **vars(replace(self.ranking, sigma=sigma)),
+            shape=shape,
+            focal_prior=prior,
+            mask=mask,
+            image=read_opacity(seen.image, camera) if self.silhouette else None,
+            workers=workers,
+        )
+
+
+def _time_of(path: Path) -> int:
+    """Time at which a file was written, so that it is read anew then; 0 where there is none."""
+    try:
+        return path.stat().st_mtime_ns
+    except (OSError, ValueError):
+        return 0
+
+
+@lru_cache(maxsize=4)
+def _opened_library(path: Path, _written: int) -> Library:
+    from cadalign.retrieval.library import Library  # only here: help of a command needs none
+
+    return Library.open(path)
+
+
+@lru_cache(maxsize=4)
+def _opened_shapes(
+    files: Sequence[tuple[Path, int]],
+) -> ShapeModel | dict[str, ShapeModel] | None:
+    """The shape models of files: one, or several by category; None of no file."""
+    models = [ShapeModel.open(path) for path, _ in files]
+    if len(models) < 2:
+        return models[0] if models else None
+    by_category = {model.category: model for model in models}
+    if len(by_category) < len(models):
+        names = [model.category for model in models]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"two files of the category {twice!r}", where="--shape")
+    return by_category
 
 
 def read_query(path: Path) -> Observation:
@@ -22,13 +133,16 @@ def read_query(path: Path) -> Observation:
     may lack ``xyz``, which is zero in the returned observation and not used.
     """
     query = Observation.load(path, needs_xyz=False)
-    with in_file(path):
-        if query.semantic_ids is None:
-            raise DataError(
-                "the keypoints have no semantic_id",
-                fix="give each the id of the library's models for it",
-            )
+    _semantic_ids(query, str(path))
     return query
+
+
+def _semantic_ids(query: Observation, where: str) -> IntArray:
+    if query.semantic_ids is None:
+        fix = "give each the id of the library's models for it"
+        with in_file(where):
+            raise DataError("the keypoints have no semantic_id", fix=fix)
+    return query.semantic_ids
 
 
 def read_mask(path: Path, camera: Camera) -> BoolArray:

@@ -135,3 +135,35 @@ def test_a_fit_remembers_its_observation(run: Path, tmp_path: Path) -> None:
     assert data["observation"] == "../somewhere/seen.json"
     assert main(["export", str(out / "fit.json"), "--to", str(tmp_path / "box.glb")]) == 0
     assert (tmp_path / "box.glb").is_file()
+
+
+def test_documents_are_those_of_single_fits(run: Path, tmp_path: Path) -> None:
+    out = ["--to", str(tmp_path / "docs"), "--format", "json", "--rows", "0", "2"]
+    assert main(["export", str(run), *out]) == 0
+    names = ["000000.json", "000000_fit", "000002.json", "000002_fit"]
+    assert sorted(path.name for path in (tmp_path / "docs").iterdir()) == names
+    fit = tmp_path / "docs" / "000002_fit" / "fit.json"
+    expected = Results.open(run)[2]
+    assert isinstance(expected, Result)
+    np.testing.assert_array_equal(Result.load(fit).alignment.packed, expected.alignment.packed)
+    assert main(["export", str(fit), "--to", str(tmp_path / "box.glb")]) == 0
+    assert main(["fit", str(tmp_path / "docs" / "000002.json"), "--no-picture"]) == 0
+    again = Result.load(fit)
+    np.testing.assert_allclose(again.alignment.scale, expected.alignment.scale)
+
+
+def test_overlays_of_many_are_those_of_single_fits(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "docs"
+    export_run(run, folder, format="json", rows=[0])
+    style = ["--overlay-mode", "lines"]
+    one = ["fit", str(folder / "000000.json"), "--no-picture", *style]
+    assert main([*one, "--overlay", str(tmp_path / "one.png")]) == 0
+    many = ["fit", str(folder / "000000.json"), str(folder / "000000.json"), "--no-picture", *style]
+    assert main([*many, "--overlay", str(tmp_path / "all"), "--out", str(tmp_path / "run")]) == 0
+    names = ["000000.png", "000001.png"]
+    assert sorted(path.name for path in (tmp_path / "all").iterdir()) == names
+    expected = np.asarray(Image.open(tmp_path / "one.png"))
+    for name in names:
+        np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "all" / name)), expected)
+    found = export_run(run, tmp_path / "drawn", format="overlay")
+    assert (found.objects, found.left_out) == (3, ())

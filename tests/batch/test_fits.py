@@ -19,7 +19,7 @@ import pytest
 
 import cadalign
 from cadalign import Alignment, CadalignError, Camera, Observation, Result, Results
-from cadalign.batch.fits import options_of, run_fits
+from cadalign.batch.fits import options_of, run_many
 from cadalign.batch.options import FitRunOptions
 from cadalign.batch.table import COLUMNS
 from cadalign.errors import DataError, InputError
@@ -122,7 +122,7 @@ def test_workers_and_processes_leave_the_bytes_as_they_are(tmp_path: Path) -> No
     source = lines(tmp_path / "o.jsonl", 150)
     for name, workers in (("none", 0), ("two", 2)):
         cadalign.fit_many(source, out=tmp_path / name, workers=workers, method="aepnp")
-    for table in ("results.parquet", "exhibits.parquet", "results.csv"):
+    for table in ("results.parquet", "records.parquet", "results.csv"):
         assert (tmp_path / "none" / table).read_bytes() == (tmp_path / "two" / table).read_bytes()
 
 
@@ -152,7 +152,7 @@ def test_killed_five_times_it_gives_the_same_bytes(tmp_path: Path) -> None:
     seen: list[Progress] = []
     cadalign.fit_many(source, out=hit.path, workers=0, on_progress=seen.append)
     assert seen[0].done >= 5 * 4
-    for name in ("results.parquet", "exhibits.parquet", "results.csv", "run.json"):
+    for name in ("results.parquet", "records.parquet", "results.csv", "run.json"):
         assert (hit.path / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
 
 
@@ -175,7 +175,7 @@ def test_a_dask_worker_killed_in_between_loses_nothing(tmp_path: Path) -> None:
         address = cluster.scheduler_address
         cadalign.fit_many(source, out=tmp_path / "hit", dask=address, on_progress=kill_one)
     assert killed
-    for name in ("results.parquet", "exhibits.parquet"):
+    for name in ("results.parquet", "records.parquet"):
         assert (tmp_path / "hit" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
 
 
@@ -292,7 +292,7 @@ def test_failures_are_counted_by_reason(tmp_path: Path) -> None:
     with source.open("a") as file:
         file.write("{}\n{}\n[]\n")
     options = FitRunOptions(inputs=(source,))
-    tally = run_fits(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
+    tally = run_many(options, RunFolder(tmp_path / "run"), workers=0, dask=None)
     assert (tally.total, tally.failed) == (6, 3)
     assert [count for _, count in tally.reasons] == [2, 1]
     assert "line" not in tally.reasons[0][0]

@@ -210,7 +210,7 @@ def test_prior_of_the_photos_is_used_where_they_agree(
     path = without_focal(write(tmp_path, *images))
     assert main(["fit", str(path), "--no-picture"]) == 0
     said = capsys.readouterr().err
-    assert ("Focal length from the photo's EXIF data" in said) == used
+    assert ("+- 5 %, the photo's EXIF data" in said) == used
     assert ("The photos' EXIF data differ" in said) != used
     assert main(["fit", str(path), "--no-picture", "--no-exif"]) == 0
     assert "EXIF" not in capsys.readouterr().err

@@ -212,7 +212,7 @@ def test_prior_on_a_focal_length_is_that_of_the_file_and_flags_say_otherwise(
     printed = capsys.readouterr()
     found = align(numbered, view, loss="huber", focal="estimate", focal_prior=prior)
     assert printed.out == f"{found}\n"
-    assert "Focal length from the file's prior: 905 px +-1 %" in printed.err
+    assert "Focal length is estimated, its prior: 905 px +- 1 %" in printed.err
     assert main(["fit", str(path), "--focal", "known"]) == 0
     assert capsys.readouterr().out == f"{align(numbered, view, loss='huber')}\n"
     path = without_focal(path)
@@ -309,7 +309,7 @@ def test_keypoint_that_occurs_twice(
     numbered.save(tmp_path / "box.shape")
     path = write(tmp_path, semantic_ids=np.array([0, 1, 2, 3, 1, 5]))
     assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
-        f"{path}: keypoints.semantic_id: 1 occurs twice; give each once"
+        f"{path}: keypoints[4].semantic_id: 1 occurs twice, first in keypoints[1]"
     )
 
 

@@ -121,16 +121,6 @@ def test_the_overlay_of_every_view_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_overlays_of_several_files_are_left_to_the_page(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    paths = [write_observation(tmp_path, name) for name in ("a.json", "b.json")]
-    line = refusal_line(capsys, "fit", *paths, "--overlay", "model.png")
-    assert line.startswith(
-        "--overlay: is for one observation; leave it out: the page of a run draws"
-    )
-
-
 @pytest.mark.parametrize(
     ("flags", "without_model", "message"),
     [

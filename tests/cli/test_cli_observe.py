@@ -89,7 +89,7 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     result = fitted(folder, "found.observation")
     captured = capsys.readouterr()
     focal = 34 / np.hypot(36, 24) * 800
-    assert f"Focal length from the photo's EXIF data: {focal:.4g} px +-5 %" in captured.err
+    assert f"its prior: {focal:.4g} px +- 5 %, the photo's EXIF data" in captured.err
     assert "  focal length " in captured.out
     prior = FocalPrior.from_exif(folder / "photo.jpg")
     expected = fit(
@@ -99,7 +99,10 @@ def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     assert result.camera.fx == pytest.approx(620, rel=0.03)
     assert result.focal_prior == prior
     without = fitted(folder, "found.observation", "--no-exif")
-    assert without.focal_prior is None
+    usual = FocalPrior.of_usual_lenses(640, 480)
+    assert without.focal_prior == usual
+    assert f"its prior: {usual}" in capsys.readouterr().err
+    assert fitted(folder, "found.observation", "--focal-prior", "none").focal_prior is None
     assert without.std is not None
     assert result.std is not None
     assert without.std.focal > result.std.focal
@@ -115,7 +118,7 @@ def test_exif_that_lies_is_ignored_with_a_warning(
     observe(folder, "--image", str(folder / "photo.jpg"))
     with caplog.at_level(logging.WARNING, logger="cadalign"):
         result = fitted(folder, "found.observation")
-    assert result.focal_prior is None
+    assert result.focal_prior == FocalPrior.of_usual_lenses(640, 480)
     assert result.camera.fx == pytest.approx(620, rel=0.1)
     (record,) = caplog.records
     assert record.getMessage() == (
@@ -131,6 +134,31 @@ def test_known_focal_length_can_be_estimated_all_the_same(folder: Path) -> None:
     assert estimated.camera.fx == pytest.approx(620, rel=0.1)
     assert estimated.covariance is not None
     assert estimated.covariance.shape == (10, 10)
+
+
+def test_focal_length_or_field_of_view_is_given_in_the_command(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    observe(folder, "--image", str(folder / "photo.jpg"))
+    assert fitted(folder, "found.observation", "--focal", "620").camera == TRUE
+    fov = float(np.degrees(2 * np.arctan(320 / 620)))
+    result = fitted(folder, "found.observation", "--fov", str(fov))
+    assert result.focal == "known"
+    assert result.camera.fx == pytest.approx(620)
+    prior = fitted(folder, "found.observation", "--focal-prior", "600", "--focal-prior-sigma", ".1")
+    assert prior.focal_prior == FocalPrior(600.0, 0.1)
+    observe(folder, "--image", str(folder / "photo.jpg"), "--focal", "620")
+    assert Observation.load(folder / "found.observation.json").camera == TRUE
+    capsys.readouterr()
+    for options, message in (
+        (["--focal", "620", "--fov", "50"], "--fov: given beside the focal length"),
+        (["--focal", "estimate", "--fov", "50"], "--fov: given beside --focal estimate"),
+        (["--fov", "190"], "--fov: 190 is not between 0 and 180 degrees"),
+        (["--focal", "-3"], "--focal: -3 is not positive"),
+        (["--focal-prior", "500"], "--focal-prior: given for a known focal length"),
+    ):
+        assert main(["fit", str(folder / "found.observation.json"), *options]) == 1
+        assert message in capsys.readouterr().err
 
 
 def test_robust_fit_draws_by_the_scores(folder: Path) -> None:

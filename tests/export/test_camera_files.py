@@ -184,7 +184,14 @@ def _nerf(tmp_path, matrix=None, **fields):
         (None, {"fl_x": "wide"}, "'wide' is not a finite number"),
         (None, {"w": None}, "w and h"),
         (None, {"w": 0}, "is not a size"),
-        (None, {"k4": 0.1}, "fisheye"),
+        (None, {"k4": 0.1}, "k4 is not a coefficient of the model OPENCV"),
+        (None, {"p1": 0.1, "is_fisheye": True}, "p1 is not a coefficient of the model OPENCV_FISH"),
+        (None, {"camera_model": "EQUIRECTANGULAR"}, "'EQUIRECTANGULAR' is not a camera model"),
+        (
+            None,
+            {"camera_model": "OPENCV_FISHEYE", "fl_x": None, "camera_angle_x": 1},
+            "fl_x, a fisheye's focal length",
+        ),
     ],
 )
 def test_impossible_nerf_cameras_are_refused(tmp_path, matrix, fields, message):

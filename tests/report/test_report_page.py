@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from support.pages import Opened, scroll_through
+from support.pages import Opened, cut_off, scroll_through
 from support.reports import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
 
 from cadalign.evaluation.api import run as do_run
@@ -256,6 +257,28 @@ def test_tables_begin_with_all_and_are_whole_at_1440_pixels(opened: Opened, tmp_
     expect(groups).to_have_count(3)
     for scroller in page.locator(".scroller").all():
         assert scroller.evaluate("(e) => e.scrollWidth - e.clientWidth") <= 0
+
+
+@pytest.mark.parametrize("width", [1000, 1280])
+def test_no_column_is_cut_off(opened: Opened, tmp_path: Path, width: int) -> None:
+    recipe = Recipe(runs=2, categories=("bottle", "chair"))
+    payload = payload_of(recipe)
+    columns = payload["headline"]["columns"]
+    many = [{**columns[k % 5], "key": f"{k}", "label": f"metric number {k}"} for k in range(24)]
+    rows = [{**row, "cells": {f"{k}": 12.345 for k in range(20)}} for row in payload_rows(payload)]
+    rows[0]["cells"] = {f"{k}": 1.0 for k in range(24)}
+    headline = {**payload["headline"], "columns": columns + many, "rows": rows}
+    address = write_page(tmp_path / "report.html", recipe, headline=headline)
+    page = opened(address, viewport={"width": width, "height": 900})
+    expect(page.locator("table.headline").nth(1)).to_be_visible()
+    assert cut_off(page) == []
+    heads = page.locator("table.headline thead th").all_inner_texts()
+    assert all(any(f"metric number {k}" in head for head in heads) for k in range(24))
+
+
+def payload_rows(payload: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows of a payload's headline, numbers of their own left out."""
+    return [{**row, "best": [], "cells": {}} for row in payload["headline"]["rows"]]
 
 
 def test_a_phone_shows_all_of_it(opened: Opened, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
-from cadalign.evaluation.methods.fitted import fit_options
+from cadalign.evaluation.methods.method import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
@@ -282,17 +282,26 @@ def test_meshes_are_light_and_in_the_coordinates_of_the_dataset(
 
 def test_overlays_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
-    for name in ("overlays", "pictures", "thumbs", "sketches"):
+    for name in ("overlays", "pictures", "thumbs", "previews"):
         shutil.rmtree(copy / name)
     found = report(tmp_path, copy)
     assert found["pictures"] == found["thumbs"] == found["meshes"] == {}
     assert set(found["tables"]["instances"]["thumb"]) == {-1}
     assert all(e["picture"] is None and e["mesh"] is None for e in found["exhibits"].values())
     assert len(found["exhibits"]) == 8
-    (copy / "exhibits.parquet").unlink()  # as in a run of an older version
+    (copy / "records.parquet").unlink()  # as in a run of an older version
     found = report(tmp_path, copy)
     assert set(found["tables"]["instances"]["exhibit"]) == {-1}
     assert len(found["headline"]["rows"]) == 5 * len(METHODS)
+
+
+def test_folders_of_earlier_versions_show_the_same(drawn: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
+    (copy / "records.parquet").rename(copy / "exhibits.parquet")
+    (copy / "previews").rename(copy / "sketches")
+    found, expected = report(tmp_path, copy), report(tmp_path, drawn)
+    for part in ("exhibits", "meshes", "pictures"):
+        assert found[part] == expected[part] != {}
 
 
 def test_pictures_of_different_instances_have_different_names() -> None:

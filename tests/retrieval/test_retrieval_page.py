@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, expect
 from support.files import write_json
 from support.refusals import refusal_line
 
-from cadalign import Library, Match, Mesh
+from cadalign import Library, Match, Mesh, Result
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
@@ -380,8 +380,15 @@ def test_a_page_shows_the_matches_side_by_side(
     assert main(["retrieve", *case.arguments, "--top", "4", "--out", str(out)]) == 0
     assert f"Page: {out / 'index.html'}" in capsys.readouterr().err
     written = [f"overlay_{place:02d}.png" for place in range(1, 5)]
-    assert sorted(p.name for p in out.iterdir()) == ["index.html", "matches.json", *written]
+    fits = [f"match_{place:02d}{end}" for place in range(1, 5) for end in (".json", "_fit")]
+    names = ["index.html", *fits, "matches.json", *written]
+    assert sorted(path.name for path in out.iterdir()) == names
     matches = case.retrieve(top=4)
+    fit = out / "match_02_fit" / "fit.json"
+    assert main(["export", str(fit), "--to", str(out / "second.glb")]) == 0
+    np.testing.assert_allclose(
+        Result.load(fit).alignment.packed, matches[1].alignment.packed, rtol=1e-12
+    )
     assert json.loads((out / "matches.json").read_text()) == [m.to_dict() for m in matches]
     first = cv2.imread(str(out / written[0]))[..., ::-1]
     np.testing.assert_array_equal(first, draw_match(case.photo, CAMERA, matches[0]))
@@ -474,7 +481,7 @@ def test_malformed_queries_are_refused(
         return text.removeprefix(f"{path}: ")
 
     camera = CAMERA.to_dict()
-    assert refused([]) == "[] is not an object"
+    assert refused([]) == "there are no keypoints"
     assert refused({"camera": camera}) == "keypoints: missing"
     keypoint = {"uv": [1.0, 2.0], "semantic_id": 0}
     assert "keypoints[0].uv" in refused({"camera": camera, "keypoints": [{"semantic_id": 0}]})

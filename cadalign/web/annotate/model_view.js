@@ -10,7 +10,9 @@ import { ASIDE, disposeResult, makeResult } from "./result_view.js";
 const CLICK_REACH = 4;
 const MARKER_REACH = 14;
 const HIDDEN_BY = 0.02; // diagonals that a marker may lie behind the surface
-const FRONT = new Vector3(0.8, 0.6, -1.4); // ShapeNet's models face -z
+const FRONT = [0.8, 0.6, -1.4]; // ShapeNet's models face -z
+// Directions at models of which y points up, at those of another up axis, which face -y.
+const STANDING = { x: (x, y, z) => [y, z, x], y: (x, y, z) => [x, y, z], z: (x, y, z) => [-x, z, y] };
 
 export class ModelView {
   /**
@@ -23,9 +25,9 @@ export class ModelView {
     this.stage = new Stage(host, {
       label:
         "The model. Arrow keys turn it, plus and minus zoom, Enter places a point at the middle of the view.",
+      zoomToCursor: true,
     });
     this.stage.canvas.setAttribute("role", "application");
-    this.stage.controls.zoomToCursor = true;
     this.markers = new Markers(this.stage);
     this.loupe = new Loupe(host);
     this.stage.beforeDraw = () => this.markers.face();
@@ -34,6 +36,7 @@ export class ModelView {
       if (loupe) renderLoupe(this.stage, this.markers.group, loupe);
     };
     this.state = null;
+    this.upAxis = "y";
     this.models = new Map();
     this.raycaster = new Raycaster();
     const { canvas } = this.stage;
@@ -80,8 +83,9 @@ export class ModelView {
 
   /** See the whole model, from its usual front, or the whole result. */
   frame() {
+    this.stage.orbit(this.result ? new Vector3(0, 1, 0) : this.standing(0, 1, 0));
     if (this.result) this.stage.frame(this.result, ASIDE);
-    else if (this.mesh) this.stage.frame(this.mesh, FRONT);
+    else this.frameFrom(FRONT);
   }
 
   /** Look at the model from where the photo was taken. */
@@ -90,9 +94,14 @@ export class ModelView {
     if (eye && !this.result && this.mesh) this.stage.frame(this.mesh, new Vector3(...eye));
   }
 
-  /** Look at the model along one of its axes. */
+  /** Look at the model from a direction, given for one of which y points up. */
   frameFrom(direction) {
-    if (this.mesh && !this.result) this.stage.frame(this.mesh, new Vector3(...direction));
+    if (this.mesh && !this.result) this.stage.frame(this.mesh, this.standing(...direction));
+  }
+
+  /** A direction at the model, given for one of which y points up. */
+  standing(x, y, z) {
+    return new Vector3(...STANDING[this.upAxis](x, y, z));
   }
 
   zoom(factor) {
@@ -104,6 +113,10 @@ export class ModelView {
 
   show(state, selected) {
     this.state = state;
+    if (this.upAxis !== state.image.up_axis) {
+      this.upAxis = state.image.up_axis;
+      this.frame();
+    }
     const shown = [];
     for (const point of state.keypoints) {
       if (!point.used) shown.push({ kind: "free", label: "", xyz: point.xyz, keypoint: point.keypoint, name: point.name });

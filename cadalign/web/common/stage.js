@@ -13,15 +13,17 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 /**
- * A scene drawn only when something has changed. Its axes are those of the model: y up.
+ * A scene drawn only when something has changed. Its axes are those of the model: y up, or another.
  *
  * @param {HTMLElement} host - the element to fill; it needs a size of its own
  * @param {object} options
  * @param {string} options.label - what a screen reader says of the canvas
+ * @param {boolean} options.zoomToCursor - zoom at the pointer, not at the middle
  */
 export class Stage {
-  constructor(host, { label }) {
+  constructor(host, { label, zoomToCursor = false }) {
     this.host = host;
+    this.zoomToCursor = zoomToCursor;
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(40, 1, 0.01, 100);
     this.renderer = new WebGLRenderer({ antialias: true, alpha: true, preserveDrawingBuffer: true });
@@ -38,12 +40,21 @@ export class Stage {
     this.camera.add(sun);
     this.scene.add(this.camera);
 
-    this.controls = new OrbitControls(this.camera, this.canvas);
-    this.controls.addEventListener("change", () => this.invalidate());
+    this.orbit();
     this.canvas.addEventListener("keydown", (event) => this.steer(event));
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(host);
     this.resize();
+  }
+
+  /** Orbit about the direction that points up on the screen; controls keep the one they began with. */
+  orbit(up = this.camera.up) {
+    if (this.controls && this.camera.up.equals(up)) return;
+    this.controls?.dispose();
+    this.camera.up.copy(up);
+    this.controls = new OrbitControls(this.camera, this.canvas);
+    this.controls.zoomToCursor = this.zoomToCursor;
+    this.controls.addEventListener("change", () => this.invalidate());
   }
 
   /** Place the camera so that an object fills the view, seen along a direction. */

@@ -1,0 +1,90 @@
+"""`cadalign library build` as a run: resumed, shared among processes, failures as rows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+import cadalign.batch.libraries as module
+from cadalign import Library
+from cadalign.batch.libraries import ModelRows, build_library
+from cadalign.cli import main
+from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.evaluation.runs.run import Progress
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_sample_dataset(tmp_path / "sample", per_category=4, categories=["chair", "bottle"])
+
+
+class Stop(Exception):
+    """Stands for the signal that ends a run."""
+
+
+def test_a_build_that_was_interrupted_goes_on(root: Path, tmp_path: Path) -> None:
+    folder, dataset = tmp_path / "build", KeypointNet(root)
+    seen: list[Progress] = []
+
+    def stop(progress: Progress) -> None:
+        seen.append(progress)
+        if progress.done == 5:
+            raise Stop
+
+    with pytest.raises(Stop):
+        build_library(dataset, folder, on_progress=stop)
+    seen.clear()
+    library, troubles = build_library(dataset, folder, on_progress=seen.append)
+    assert (seen[0].done, troubles) == (5, [])
+    library.save(tmp_path / "resumed")
+    Library.from_dataset(dataset).save(tmp_path / "whole")
+    assert (tmp_path / "resumed").read_bytes() == (tmp_path / "whole").read_bytes()
+
+
+@pytest.mark.slow
+def test_processes_leave_the_bytes_as_they_are(root: Path, tmp_path: Path) -> None:
+    for workers in ("0", "2"):
+        out = ["--out", str(tmp_path / f"lib{workers}"), "--workers", workers]
+        assert main(["library", "build", str(root), *out]) == 0
+    assert (tmp_path / "lib0").read_bytes() == (tmp_path / "lib2").read_bytes()
+    assert not (tmp_path / "lib0_build").exists()
+
+
+def test_models_that_cannot_be_read_are_rows(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = root / "annotations" / "chair.json"
+    entries = json.loads(path.read_text())
+    del entries[0]["keypoints"]
+    path.write_text(json.dumps([*entries, entries[1]]))
+    mesh = KeypointNet(root)["bottle"][0].mesh_path
+    assert mesh is not None
+    mesh.write_text("nonsense")
+    for _ in range(2):  # a finished build is done anew
+        assert main(["library", "build", str(root), "--out", str(tmp_path / "lib")]) == 0
+    said = capsys.readouterr().err
+    assert "Left out: 2 models with malformed annotations" in said
+    assert "Without their meshes, which cannot be read: 1" in said
+    rows = pq.read_table(tmp_path / "lib_build" / "results.parquet").to_pylist()
+    assert len(rows) == 9
+    reasons = [row["reason"] for row in rows if row["status"] == "failed"]
+    assert ["missing" in reasons[0], "the model occurs twice" in reasons[1]] == [True, True]
+    assert sum(bool(row["warning"]) for row in rows) == 1
+    assert len(Library.open(tmp_path / "lib")) == 7
+
+
+def test_a_folder_of_another_run_is_refused(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "lib_build").mkdir()
+    (tmp_path / "lib_build" / "run.json").write_text('{"experiment": "fit"}')
+    assert main(["library", "build", str(root), "--out", str(tmp_path / "lib")]) == 1
+    assert 'experiment is "fit" there and "library" now' in capsys.readouterr().err
+
+
+def test_the_columns_are_documented() -> None:
+    assert module.__doc__ is not None
+    assert [name for name, _ in ModelRows.columns if name not in module.__doc__] == []

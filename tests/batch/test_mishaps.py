@@ -1,0 +1,211 @@
+"""What goes wrong around a run: disks that fill, folders that cannot be written, wrong records.
+
+Each is a row, or one clear line, and nothing that was done is lost.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from PIL import Image
+
+import cadalign
+from cadalign import Camera, Observation
+from cadalign.batch.options import FitRunOptions
+from cadalign.cli import main
+from cadalign.datasets import ModelKeypoint, ModelKeypoints
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.io.images import write_image
+
+CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
+POINTS = np.random.default_rng(1).uniform(-1, 1, (8, 3))
+PIXELS = CAMERA.project(POINTS + [0.1, 0.2, 6.0])
+CODE = "import sys; from cadalign.cli import main; sys.exit(main())"
+
+
+def lines(path: Path, count: int, **fields: Any) -> Path:
+    """JSON lines of noisy observations, with fields in place of their own."""
+    rng, texts = np.random.default_rng(0), []
+    for _ in range(count):
+        seen = Observation(POINTS, PIXELS + rng.normal(0, 1, PIXELS.shape), CAMERA)
+        data = seen.to_dict(states_origins=True) | fields
+        given = {name: value for name, value in data.items() if value is not None}
+        texts.append(json.dumps(given) + "\n")
+    path.write_text("".join(texts))
+    return path
+
+
+def rows_of(run: Path) -> list[dict[str, Any]]:
+    return pq.read_table(run / "results.parquet").to_pylist()
+
+
+def test_a_full_disk_is_one_line_and_the_run_goes_on(
+    tmp_path: Path,
+) -> None:
+    source = lines(tmp_path / "o.jsonl", 640)
+    run = RunFolder(tmp_path / "run")
+    arguments = ["fit", str(source), "--no-picture", "--out", str(run.path), "--workers", "0"]
+
+    def limit() -> None:  # the system refuses what exceeds it, as a full disk does
+        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+
+    ended = subprocess.run(
+        [sys.executable, "-c", CODE, *arguments, "--method", "aepnp"],
+        preexec_fn=limit,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 1
+    (line,) = ended.stderr.splitlines()
+    assert "cannot be written (File too large); make room" in line
+    done = len(list(run.parts.glob("???????.parquet")))
+    assert done == 64
+    seen: list[Progress] = []
+    cadalign.fit_many(source, out=run.path, workers=0, method="aepnp", on_progress=seen.append)
+    assert seen[0].done == 640
+    assert {row["status"] for row in rows_of(run.path)} == {"ok"}
+
+
+@pytest.mark.skipif(os.geteuid() == 0 and shutil.which("mount") is None, reason="needs mount")
+def test_a_file_system_without_room_is_one_line(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)],
+        capture_output=True,
+        check=False,
+    )
+    if mounted.returncode:
+        pytest.skip("file systems cannot be mounted here")
+    try:
+        command = ["fit", str(lines(tmp_path / "o.jsonl", 640)), "--no-picture", "--workers=0"]
+        ended = subprocess.run(
+            [sys.executable, "-c", CODE, *command, f"--out={disk / 'run'}", "--method=aepnp"],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert ended.returncode == 1
+        (line,) = ended.stderr.splitlines()
+        assert "cannot be written (No space left on device); make room" in line
+        parts = RunFolder(disk / "run").parts
+        assert [path for path in parts.iterdir() if path.name.startswith(".unfinished")] == []
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.parametrize("command", ["fit", "retrieve"])
+def test_a_folder_that_cannot_be_written_is_one_line(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = lines(tmp_path / "o.jsonl", 3)
+    (tmp_path / "file").write_text("")
+    library = ["--library", str(tmp_path / "lib")] if command == "retrieve" else []
+    if library:
+        bounds = np.array([POINTS.min(axis=0), POINTS.max(axis=0)])
+        model = cadalign.retrieval.LibraryModel("box", "1", POINTS, np.arange(8), bounds)
+        cadalign.Library.from_models([model]).save(tmp_path / "lib")
+    out = tmp_path / "file" / "run"
+    assert main([command, str(source), *library, "--out", str(out)]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == (
+        f"cadalign: {out}: cannot be written (Not a directory); make room or choose another "
+        "folder; what was written before is kept"
+    )
+
+
+def test_a_photo_that_cannot_be_read_is_a_warning_of_its_row(tmp_path: Path) -> None:
+    (tmp_path / "broken.png").write_bytes(b"no photo")
+    source = lines(tmp_path / "o.jsonl", 2, image="broken.png")
+    assert main(["fit", str(source), "--out", str(tmp_path / "run")]) == 0
+    for row in rows_of(tmp_path / "run"):
+        assert "the photo is not shown: " in row["warnings"]
+        assert "broken.png" in row["warnings"]
+
+
+def test_a_mask_that_cannot_be_read_fails_its_row_alone(tmp_path: Path) -> None:
+    (tmp_path / "broken.png").write_bytes(b"no mask")
+    source = lines(tmp_path / "o.jsonl", 1, mask="broken.png")
+    source.write_text(source.read_text() + lines(tmp_path / "p.jsonl", 1).read_text())
+    assert main(["fit", str(source), "--no-picture", "--out", str(tmp_path / "run")]) == 3
+    bad, good = rows_of(tmp_path / "run")
+    assert (bad["status"], good["status"]) == ("failed", "ok")
+    assert "broken.png" in bad["reason"]
+
+
+def test_a_record_without_camera_fails_its_row_alone(tmp_path: Path) -> None:
+    source = lines(tmp_path / "o.jsonl", 1, camera=None)
+    source.write_text(source.read_text() + lines(tmp_path / "p.jsonl", 1).read_text())
+    assert main(["fit", str(source), "--no-picture", "--out", str(tmp_path / "run")]) == 3
+    bad, good = rows_of(tmp_path / "run")
+    assert bad["reason"].endswith("o.jsonl, line 1: camera: missing")
+    assert good["status"] == "ok"
+
+
+def test_a_wrong_model_name_is_a_warning_of_its_row_and_refused_for_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.new("RGB", (640, 480)).save(tmp_path / "a.png")
+    source = lines(tmp_path / "o.jsonl", 1, image="a.png", model="gone.obj")
+    assert main(["fit", str(source), "--out", str(tmp_path / "run")]) == 0
+    (row,) = rows_of(tmp_path / "run")
+    assert "the model is shown as a box: " in row["warnings"]
+    assert "gone.obj" in row["warnings"]
+    found = {"images": [], "annotations": [], "categories": []}
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    (tmp_path / "found.csv").write_text("image,name,x,y\na.png,one,1,2\n")
+    capsys.readouterr()
+    wrong = ["--model", str(tmp_path / "wrong.keypoints.json"), "--out", str(tmp_path / "x")]
+    assert main(["fit", str(tmp_path / "found.csv"), *wrong]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == f"cadalign: {tmp_path / 'wrong.keypoints.json'}: no such file"
+    assert not (tmp_path / "x").exists()
+
+
+def test_duplicate_object_ids_are_rows_of_their_own(tmp_path: Path) -> None:
+    flat = np.column_stack([PIXELS, np.ones(8)]).ravel().tolist()
+    entry = {"id": 7, "image_id": 1, "category_id": 1, "keypoints": flat, "num_keypoints": 8}
+    names = [f"k{n}" for n in range(8)]
+    data = {
+        "images": [{"id": 1, "file_name": "a.png", "width": 640, "height": 480}],
+        "annotations": [entry, entry],
+        "categories": [{"id": 1, "name": "thing", "keypoints": names}],
+    }
+    (tmp_path / "found.json").write_text(json.dumps(data))
+    np.savetxt(tmp_path / "K.txt", CAMERA.matrix)
+    rows = zip(names, POINTS.tolist(), strict=True)
+    model = ModelKeypoints(tuple(ModelKeypoint(name, tuple(xyz)) for name, xyz in rows))
+    model.save(tmp_path / "m.keypoints.json")
+    command = ["fit", str(tmp_path / "found.json"), "--camera", str(tmp_path / "K.txt")]
+    command += ["--model", str(tmp_path / "m.keypoints.json"), "--out", str(tmp_path / "run")]
+    assert main(command) == 0
+    first, second = rows_of(tmp_path / "run")
+    assert (first["row"], second["row"]) == (0, 1)
+    assert first["source"] != second["source"]
+    assert first["tz"] == second["tz"]
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "found.json: annotations[0], row 0" in page
+    assert "found.json: annotations[1], row 1" in page
+
+
+def test_photo_of_another_size_than_its_camera_is_warned_of(tmp_path: Path) -> None:
+    problem = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
+    photo = tmp_path / "photo.png"
+    write_image(photo, np.zeros((960, 1280, 3), dtype=np.uint8))
+    seen = Observation(problem.points_3d, problem.points_2d, problem.camera, image=photo)
+    options = FitRunOptions(inputs=(tmp_path,))
+    (warning,) = options.estimate_of(seen, "seen.json").result.warnings
+    assert warning.startswith("photo.png is 1280 x 960 px, the camera 640 x 480: give camera")

@@ -1,0 +1,223 @@
+"""`cadalign retrieve` of many observations: a run whose table holds the best matches."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import cadalign
+from cadalign import Camera, Library, Observation, Result, Results
+from cadalign.batch.retrievals import RetrieveRunOptions
+from cadalign.cli import main
+from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.render import look_at
+
+CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A library of three chairs and three bottles, and JSON lines of stretched ones."""
+
+    folder: Path
+    library: Library
+    keys: list[tuple[str, str]]
+
+    @property
+    def queries(self) -> Path:
+        return self.folder / "queries.jsonl"
+
+    @property
+    def arguments(self) -> list[str]:
+        return [str(self.queries), "--library", str(self.folder / "lib.cadalign")]
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    folder = tmp_path_factory.mktemp("queries")
+    root = write_sample_dataset(folder / "sample", per_category=3, categories=["chair", "bottle"])
+    library = Library.from_dataset(KeypointNet(root))
+    library.save(folder / "lib.cadalign")
+    rng, texts, keys = np.random.default_rng(0), [], []
+    for model in (list(library) * 4)[:20]:
+        stretch = (1.0, *np.exp(rng.uniform(-0.2, 0.2, 2)).tolist())
+        pose = look_at(azimuth=rng.uniform(0, 360), elevation=20.0, distance=2.6, scale=stretch)
+        seen = CAMERA.project(pose.apply(model.xyz)) + rng.normal(0, 0.5, (len(model.xyz), 2))
+        query = Observation(np.zeros_like(model.xyz), seen, CAMERA, None, model.semantic_ids)
+        texts.append(json.dumps(query.to_dict(states_origins=True)))
+        keys.append(model.key)
+    (folder / "queries.jsonl").write_text("\n".join(texts) + "\n")
+    return Case(folder, library, keys)
+
+
+def rows_of(run: Path) -> list[dict[str, Any]]:
+    return pq.read_table(run / "results.parquet").to_pylist()
+
+
+def test_the_table_holds_the_best_match_of_each(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert main(["retrieve", *case.arguments, "--top", "4", "--out", str(run)]) == 0
+    said = capsys.readouterr().err
+    assert f"20 of 20 retrieved, 0 failed: {run / 'results.csv'}" in said
+    rows = rows_of(run)
+    found = [(row["match_category"], row["match_id"]) for row in rows]
+    assert sum(a == b for a, b in zip(found, case.keys, strict=True)) >= 18
+    with (run / "results.csv").open() as file:
+        texts = list(csv.DictReader(file))
+    assert [row["match_id"] for row in texts] == [model_id for _, model_id in found]
+    assert "top_ids" not in texts[0]
+    results = Results.open(run)
+    records = pq.read_table(run / "records.parquet").to_pylist()
+    for number, (line, row, record) in enumerate(
+        zip(case.queries.read_text().splitlines(), rows, records, strict=True)
+    ):
+        seen = json.loads(line)["keypoints"]
+        expected = case.library.retrieve(
+            [each["uv"] for each in seen], [each["semantic_id"] for each in seen], CAMERA, top=4
+        )
+        assert row["top_ids"] == [match.model_id for match in expected]
+        assert row["top_scores"] == [match.score for match in expected]
+        assert json.loads(record["matches"]) == [match.to_dict() for match in expected]
+        single = results[number]
+        assert isinstance(single, Result)
+        np.testing.assert_allclose(
+            single.alignment.packed, expected[0].alignment.packed, rtol=1e-12
+        )
+    page = (run / "report.html").read_text()
+    assert "Retrieved models" in page
+    assert "none of these" in page
+
+
+def test_matches_of_a_run_are_exported_as_fits_are(case: Case, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    out = ["--out", str(run), "--no-picture"]
+    assert main(["retrieve", *case.arguments, *out]) == 0
+    assert main(["export", str(run), "--to", str(tmp_path / "all.glb")]) == 0
+    assert main(["export", str(run), "--to", str(tmp_path / "k"), "--format", "coco"]) == 0
+    written = json.loads((tmp_path / "k" / "keypoints.json").read_text())
+    assert len(written["annotations"]) == 20
+
+
+def test_a_query_that_fails_is_a_row(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = case.queries.read_text().splitlines()[0]
+    data = json.loads(good)
+    bare = [{"uv": each["uv"]} for each in data["keypoints"]]
+    strange = [{**each, "semantic_id": 900 + k} for k, each in enumerate(data["keypoints"])]
+    lines = [
+        good,
+        json.dumps({**data, "keypoints": bare}),
+        json.dumps({**data, "keypoints": strange}),
+        json.dumps({**data, "camera": {"width": 640, "height": 480}}),
+        "{",
+    ]
+    path = tmp_path / "q.jsonl"
+    path.write_text("\n".join(lines) + "\n")
+    run = tmp_path / "run"
+    assert main(["retrieve", str(path), *case.arguments[1:], "--out", str(run)]) == 3
+    rows = rows_of(run)
+    assert [row["status"] for row in rows] == ["ok", *["failed"] * 4]
+    for row, text in zip(
+        rows[1:],
+        ("no semantic_id", "semantic id 900", "the focal length is unknown", "not valid JSON"),
+        strict=True,
+    ):
+        assert text in row["reason"]
+    assert "1 of 5 retrieved, 4 failed" in capsys.readouterr().err
+
+
+def test_what_is_for_one_is_refused_for_many(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["retrieve", *case.arguments, "--mask", "m.png"]) == 1
+    assert "--mask: is for one observation" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_killed_and_shared_among_workers_it_gives_the_same_bytes(
+    case: Case, tmp_path: Path
+) -> None:
+    queries = tmp_path / "q.jsonl"
+    queries.write_text(10 * case.queries.read_text())
+    arguments = ["retrieve", str(queries), *case.arguments[1:], "--no-picture"]
+    code = "import sys; from cadalign.cli import main; sys.exit(main())"
+    calm, hit, two = (RunFolder(tmp_path / name) for name in ("calm", "hit", "two"))
+    for folder, workers in ((calm, "0"), (two, "2")):
+        assert main([*arguments, "--out", str(folder.path), "--workers", workers]) == 0
+    again = [*arguments, "--out", str(hit.path), "--workers"]
+    process = subprocess.Popen([sys.executable, "-c", code, *again, "1"])
+    end = time.monotonic() + 120
+    while len(list(hit.parts.glob("???????.parquet"))) < 3 and time.monotonic() < end:
+        assert process.poll() is None, "it ended before it was killed"
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not hit.is_finished
+    assert main([*again, "0"]) == 0
+    for name in ("results.parquet", "records.parquet", "results.csv", "run.json"):
+        expected = (calm.path / name).read_bytes()
+        assert (hit.path / name).read_bytes() == expected, name
+        assert (two.path / name).read_bytes() == expected, name
+
+
+def test_another_library_is_another_run(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "lib"
+    run = ["--library", str(path), "--out", str(tmp_path / "run"), "--no-picture"]
+    case.library.save(path)
+    assert main(["retrieve", str(case.queries), *run]) == 0
+    Library.from_models(list(case.library)[:5]).save(path)
+    assert main(["retrieve", str(case.queries), *run]) == 1
+    assert "another configuration: library_contents is" in capsys.readouterr().err
+
+
+def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:
+    model = case.library["chair", "sample_chair_001"]
+    pose = look_at(azimuth=40.0, elevation=20.0, distance=2.6, scale=(1.0, 1.2, 0.9))
+    ids = model.semantic_ids[::-1]
+    seen = Observation(
+        np.zeros_like(model.xyz),
+        CAMERA.project(pose.apply(model.xyz))[::-1],
+        CAMERA,
+        semantic_ids=ids,
+        names=tuple(f"k{each}" for each in ids),
+    )
+    match = case.library.retrieve(seen.points_2d, ids, CAMERA)[0]
+    result = match.result
+    assert (result.method, result.rms) == ("retrieve", pytest.approx(match.rms))
+    np.testing.assert_array_equal(result.box.corners, match.box.corners)
+    again = Result.from_json(result.to_json())
+    np.testing.assert_array_equal(again.alignment.packed, match.alignment.packed)
+    paired = match.observation(seen)
+    assert paired.model == match.mesh_path
+    assert paired.names == seen.names
+    fitted = cadalign.fit(paired.points_3d, paired.points_2d, CAMERA)
+    np.testing.assert_allclose(fitted.alignment.scale, pose.scale, atol=1e-3)
+    written = match.export(tmp_path / "chair.glb")
+    assert written.stat().st_size > 1000
+    assert match.plot().get_ylim() == (479.5, -0.5)
+
+
+def test_the_columns_are_documented() -> None:
+    import cadalign.batch.retrievals as module
+
+    assert module.__doc__ is not None
+    columns = (*RetrieveRunOptions.columns, *RetrieveRunOptions.record_columns)
+    assert [name for name, _ in columns if name not in module.__doc__] == []

@@ -1,0 +1,99 @@
+"""Pages of runs over many observations: beside each other, beside runs with truth, by model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, expect
+from support.pages import Opened, cut_off, embedded_payload, watched
+
+import cadalign
+from cadalign import Alignment, Camera, Observation
+from cadalign.batch.spec import SPEC, FitRun
+from cadalign.datasets import write_sample_dataset
+from cadalign.errors import InputError
+from cadalign.evaluation.api import run as do_run
+from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.report import headline_text, write_report
+
+CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
+POINTS = np.random.default_rng(1).uniform(-1, 1, (8, 3))
+SHAPENET = Path("/shapenet/03001627")
+
+
+def observations(*, models: bool = False) -> Iterator[Observation]:
+    rng = np.random.default_rng(0)
+    for number in range(6):
+        pose = Alignment(np.eye(3), [0.1 * number, 0.2, 6.0], [1, 1.2, 0.9])
+        seen = CAMERA.project(pose.apply(POINTS)) + rng.normal(0, 1, (8, 2))
+        model = SHAPENET / f"m{number % 2}" / "models" / "model_normalized.obj"
+        yield Observation(
+            POINTS, seen, CAMERA, model=model if models else None, image=Path(f"{number}.png")
+        )
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Runs of the same observations, with models and without, and one with truth."""
+    folder = tmp_path_factory.mktemp("runs")
+    cadalign.fit_many(observations(), out=folder / "plain")
+    cadalign.fit_many(observations(models=True), out=folder / "cauchy", loss="cauchy")
+    root = write_sample_dataset(folder / "sample", per_category=1, categories=["chair"])
+    options = KeypointNetOptions(root=root, views_per_model=2, render="none")
+    do_run(options, RunFolder(folder / "truth"), workers=0, dask=None)
+    return {name: folder / name for name in ("plain", "cauchy", "truth")}
+
+
+@pytest.fixture
+def opened(browser: Browser) -> Iterator[Opened]:
+    with watched(browser) as open_page:
+        yield open_page
+
+
+def test_runs_are_joined_by_observation_whatever_the_model(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    page = write_report([runs["plain"], runs["cauchy"]], tmp_path / "r.html").path
+    instances = embedded_payload(page)["tables"]["instances"]
+    assert instances["id"] == [*range(6), *range(6)]
+    assert len(set(instances["category"])) == 2
+
+
+def test_a_category_and_its_models_have_lines_of_their_own(runs: dict[str, Path]) -> None:
+    lines = SPEC.summarize(FitRun.open(runs["cauchy"]))
+    assert [(line.group, line["instances"]) for line in lines] == [
+        ("chair", 6),
+        ("chair, m0", 3),
+        ("chair, m1", 3),
+    ]
+    groups = [line.group for line in SPEC.summarize(FitRun.open(runs["plain"]))]
+    assert groups == ["no model"]
+
+
+def test_a_run_stands_beside_one_with_truth(
+    runs: dict[str, Path], tmp_path: Path, opened: Opened
+) -> None:
+    chosen = [runs["truth"], runs["cauchy"]]
+    path = write_report(chosen, tmp_path / "r.html").path
+    payload = embedded_payload(path)
+    keys = [metric["key"] for metric in payload["metrics"]]
+    assert {"rotation_std_deg", "rotation_error_deg"} <= set(keys)
+    assert {row["run"] for row in payload["headline"]["rows"]} == {0, 1}
+    rms = next(plot for plot in payload["plots"] if plot["id"] == "within_rms_px")
+    assert {trace["run"] for trace in rms["traces"]} == {1}
+    assert "truth" in headline_text(chosen, format="md")
+    page = opened(path.as_uri(), viewport={"width": 1280, "height": 900})
+    expect(page.locator("table.headline").first).to_be_visible()
+    assert cut_off(page) == []
+
+
+def test_runs_without_instances_are_for_a_page_of_their_own(
+    runs: dict[str, Path], tmp_path: Path
+) -> None:
+    cadalign.simulate(sweep="points", runs=1, values=(10,), out=tmp_path / "sim", workers=0)
+    with pytest.raises(InputError, match=r"sim is a run of .*, plain one of fit; write a report"):
+        write_report([runs["plain"], tmp_path / "sim"], tmp_path / "r.html")

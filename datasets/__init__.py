@@ -86,7 +86,3 @@ __all__ = [
 ]
 
 __getattr__ = lazy_names(__name__)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)

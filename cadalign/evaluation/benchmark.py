@@ -50,32 +50,16 @@ class Tasks(Sequence[T]):
 
 @dataclass(frozen=True)
 class Case:
-    """An instance with the cells that name its rows, or why there is none.
+    """An instance with the cells that name its rows, or why there is none."""
 
-    Parameters
-    ----------
-    names : dict
-        All but the method.
-    facts : dict
-        Cells that do not depend on the estimate.
-    instance : optional
-    error : Exception, optional
-        Why there is no instance.
-    status : str
-        Of the rows where there is no instance; by default the error's, see `status_of`.
-    without : tuple of str
-        Methods that are not run on it.
-    seconds : float, optional
-        Spent on it where there is no instance.
-    """
-
-    names: Row
-    facts: Row = field(default_factory=dict)
+    names: Row  # all but the method
+    facts: Row = field(default_factory=dict)  # cells that do not depend on the estimate
     instance: Any = None
-    error: Exception | None = None
+    error: Exception | None = None  # why there is no instance
     status: str = ""
-    without: tuple[str, ...] = ()
-    seconds: float | None = None
+    """The rows' status where there is no instance; by default the error's, see `status_of`."""
+    without: tuple[str, ...] = ()  # methods that are not run on it
+    seconds: float | None = None  # spent on it where there is no instance
 
 
 class Setting:
@@ -144,25 +128,14 @@ class Setting:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Runs methods on the instances of a setting; an experiment of the engine.
-
-    Parameters
-    ----------
-    setting : Setting
-    methods : tuple of Method
-    batched : frozenset of str
-        Methods that are given all instances of a chunk at once, and share the time among them.
-    repeats : int
-        Calls of a method on one instance, of which the quickest is timed.
-    metrics : tuple of RegisteredMetric
-        Further columns of the result table.
-    """
+    """Runs methods on the instances of a setting; an experiment of the engine."""
 
     setting: Setting
     methods: tuple[Method, ...]
     batched: frozenset[str] = frozenset()
-    repeats: int = 1
-    metrics: tuple[RegisteredMetric, ...] = ()
+    """Methods that are given all instances of a chunk at once, and share the time among them."""
+    repeats: int = 1  # calls of a method on one instance, of which the quickest is timed
+    metrics: tuple[RegisteredMetric, ...] = ()  # further columns of the result table
 
     @classmethod
     def chosen(

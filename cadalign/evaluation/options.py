@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 import tyro
 
-from cadalign.errors import InputError
+from cadalign.errors import InputError, unknown
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +25,10 @@ class ExperimentOptions:
     """Name of the experiment, as in the run's configuration."""
     command: ClassVar[str] = "evaluate"
     """Command that runs it."""
+    not_stored: ClassVar[tuple[str, ...]] = ("metrics", "format")
+    """Options that the run's configuration describes otherwise."""
+    if_given: ClassVar[tuple[str, ...]] = ("shapenet", "shape")
+    """Options that the run's configuration has only if they are not None."""
 
     seed: int = 0
     """Seed of everything random."""
@@ -48,8 +52,13 @@ class ExperimentOptions:
         return 1
 
     def as_config(self) -> dict[str, Any]:
-        """The options and the experiment's name in a run's configuration, paths made absolute."""
-        config = {name: _absolute(value) for name, value in asdict(self).items()}
+        """The options and the experiment's name in a run's configuration, paths made absolute.
+
+        Some stand there only if they are given; others are left to the rest of it.
+        """
+        options = asdict(self).items()
+        stored = {name: _absolute(each) for name, each in options if name not in self.not_stored}
+        config = {k: v for k, v in stored.items() if v is not None or k not in self.if_given}
         return {**config, "experiment": self.experiment}
 
     def with_methods(self, names: tuple[str, ...]) -> Self:
@@ -68,9 +77,7 @@ class ExperimentOptions:
         for name, known in choices.items():
             value = getattr(self, name)
             if value not in known:
-                raise InputError(
-                    f"unknown value {value!r}", where=name, fix=f"known are {', '.join(known)}"
-                )
+                raise unknown("value", value, known, where=name)
 
     def replace_values(self, **values: Any) -> None:
         """Set options of a new instance to their checked values."""
@@ -91,19 +98,10 @@ class FunctionOptions(ExperimentOptions):
     metrics: tuple[str, ...] = ()
     """Metrics of one's own, beside the experiment's: names that a plugin registers."""
 
-    def as_config(self) -> dict[str, Any]:
-        """The options in a run's configuration, which has metrics where there are any."""
-        config = super().as_config()
-        del config["metrics"]
-        return config
-
     def with_methods(self, names: tuple[str, ...]) -> Self:
         """The options with further methods, those of plugins.
 
-        Raises
-        ------
-        InputError
-            If the other methods are not given.
+        Raises InputError if the other methods are not given.
         """
         methods: tuple[str, ...] = getattr(self, "methods", ())
         if not methods:
@@ -137,13 +135,6 @@ class ModelOptions(ExperimentOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_least(max_models=1)
-
-    def as_config(self) -> dict[str, Any]:
-        """The options in a run's configuration: ``shapenet`` only where it is given."""
-        config = super().as_config()
-        if config["shapenet"] is None:
-            del config["shapenet"]
-        return config
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.methods.fitted import fit_methods
-from cadalign.evaluation.methods.method import LIMIT
+from cadalign.evaluation.methods.method import LIMIT, fit_methods
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import HIGH, Metric
 from cadalign.evaluation.outcome import OK
@@ -352,14 +351,8 @@ _SHARE = replace(metrics.COVERED, key="share", label="objects", better=HIGH)
 def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
     """Shares of the objects with at most an error, or at least an overlap, by method.
 
-    Parameters
-    ----------
-    runs : sequence of Run
-    metric : Metric
-        Column of the result tables; failures count as never within.
-    places : (k,) float
-        The errors, in the column's unit.
-    title : str
+    ``metric`` is a column of the result tables, of which failures count as never within; ``places``
+    (k,) are the errors, in the column's unit.
     """
     traces = []
     for index, run in enumerate(runs):
@@ -385,7 +378,7 @@ def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title
 
 
 def cumulative_curves(
-    runs: Sequence[Run], curves: Sequence[tuple[Metric, FloatArray]], *, of: str
+    runs: Sequence[Run], *, curves: Sequence[tuple[Metric, FloatArray]], of: str
 ) -> list[Plot]:
     """Curves of the metrics that some run has, each at its places; see `cumulative`."""
     return [

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import pickle
 import sysconfig
@@ -13,6 +12,7 @@ from types import ModuleType
 from typing import Any
 
 from cadalign.errors import InputError, quote
+from cadalign.evaluation.runs.work import fingerprint
 
 
 class Portable:
@@ -107,10 +107,7 @@ def _innermost(function: Any) -> Any:
 def names_of(values: Any, register: Callable[[str, Any], object], *, where: str) -> tuple[str, ...]:
     """Names of methods or metrics, of which functions are registered by their own names.
 
-    Raises
-    ------
-    InputError
-        If a function has no name of its own, or two have the same.
+    Raises InputError if a function has no name of its own, or two have the same.
     """
     names: list[str] = []
     functions: dict[str, Any] = {}
@@ -143,4 +140,4 @@ def code_hash(function: Callable[..., Any]) -> str:
         text = inspect.getsource(code)
     except (OSError, TypeError):
         text = repr(getattr(getattr(function, "__code__", None), "co_code", name_of(function)))
-    return hashlib.sha256(text.encode("utf-8", "replace")).hexdigest()[:16]
+    return fingerprint(text)

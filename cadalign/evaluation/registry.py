@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.evaluation.options import ExperimentOptions
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ def spec_named(name: str) -> Spec:
         if spec.name == name:
             return spec
         known.append(spec.name)
-    what, fix = f"unknown experiment {quote(name)}", f"known are {', '.join(known)}"
-    raise InputError(what, where="experiment", fix=fix)
+    raise unknown("experiment", name, known)
 
 
 def spec_of(run: Run) -> Spec:

@@ -6,7 +6,6 @@ library of its models; `shapes_of` are given to runs on photos, or found in the 
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -21,6 +20,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.work import fingerprint
 from cadalign.io.files import read_bytes, writing
 from cadalign.shapes.model import ShapeModel
 
@@ -42,12 +42,8 @@ class ShapeFiles:
     def find(cls, path: Path, categories: Iterable[str]) -> ShapeFiles:
         """Find the shapes of categories in a file or a folder.
 
-        Raises
-        ------
-        DataError
-            If there is no file, one cannot be read, or two are of one category.
-        InputError
-            If none is of these categories, or a shape's keypoints have names.
+        Raises DataError if there is no file, one cannot be read, or two are of one category; and
+        InputError if none is of these categories, or a shape's keypoints have names.
         """
         files = sorted(path.glob(f"*{_SUFFIX}")) if path.is_dir() else [path]
         if not files:
@@ -80,7 +76,7 @@ class ShapeFiles:
 
     def fingerprint(self) -> str:
         """Hash of the files: a run must not go on with others."""
-        return _hash(
+        return fingerprint(
             *(part for name, path in self.paths for part in (f"{name}\0", read_bytes(path)))
         )
 
@@ -114,7 +110,7 @@ class LearnedFiles:
             if shape.box_margins is not None:
                 parts += [shape.box_margins.margins, shape.box_margins.tolerances]
             parts += _numbers(shape)
-        return _hash(*parts)
+        return fingerprint(*parts)
 
 
 def learn(
@@ -125,10 +121,7 @@ def learn(
     Boxes are those of the keypoints. Files are named after a hash of their models, so that those
     of other models are neither used nor overwritten.
 
-    Raises
-    ------
-    InputError
-        If there is no such split, or a category has too few models in it.
+    Raises InputError if there is no such split, or a category has too few models in it.
     """
     # Only here: runs that are given their shapes do without retrieval.
     from cadalign.retrieval.library import Library
@@ -160,7 +153,9 @@ def learn(
 
 def _hash_of_models(models: Sequence[AnnotatedModel]) -> str:
     keypoints = ((each.model_id, each.keypoints) for each in models)
-    return _hash(*(part for name, k in keypoints for part in (f"{name}\0", k.xyz, k.semantic_ids)))
+    return fingerprint(
+        *(part for name, k in keypoints for part in (f"{name}\0", k.xyz, k.semantic_ids))
+    )
 
 
 def _is_readable(file: Path) -> bool:
@@ -187,12 +182,7 @@ def _open_library(path: str) -> Library:
 def shapes_of(files: Sequence[Path], folder: Path) -> tuple[ShapeModel, ...]:
     """The shape models of some files, and of the folder for a category that they lack.
 
-    Raises
-    ------
-    InputError
-        If two files are of the same category.
-    DataError
-        If one cannot be read.
+    Raises InputError if two files are of the same category; and DataError if one cannot be read.
     """
     given = [ShapeModel.open(path) for path in files]
     counts = Counter(each.category for each in given)
@@ -213,7 +203,7 @@ def shapes_fingerprint(shapes: Sequence[ShapeModel]) -> str:
     parts: list[Any] = []
     for shape in shapes:
         parts += [f"{shape.category}\0{shape.inflation!r}\0{shape.unit}\0", *_numbers(shape)]
-    return _hash(*parts)
+    return fingerprint(*parts)
 
 
 def _numbers(shape: ShapeModel) -> list[Any]:
@@ -222,12 +212,3 @@ def _numbers(shape: ShapeModel) -> list[Any]:
         np.append([part.weight, *part.mean.ravel(), *part.modes.ravel()], part.residual_sigma)
         for part in shape.components
     ]
-
-
-def _hash(*parts: Any) -> str:
-    """Hash of texts, bytes and arrays."""
-    digest = hashlib.sha256()
-    for part in parts:
-        data = part.tobytes() if isinstance(part, np.ndarray) else part
-        digest.update(data.encode() if isinstance(data, str) else data)
-    return digest.hexdigest()[:16]

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.plots import Plot, draw_plots
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from cadalign.evaluation.options import ExperimentOptions
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
     from cadalign.evaluation.runs.tables import Columns
-    from cadalign.evaluation.runs.work import Plan
 
     Summaries = Sequence[Summary]
 
@@ -45,70 +44,44 @@ def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
 
 @dataclass(frozen=True)
 class Spec:
-    """Specification of an experiment.
-
-    Parameters
-    ----------
-    options : type
-        A frozen dataclass derived from `ExperimentOptions`, which names the experiment; at once
-        keywords of the API, flags of the command line and configuration of the run.
-    plan : callable
-        Makes the plan of a run from its options and its folder, in which it may put files.
-    columns : tuple of Metric
-        Columns of the headline table; those are left out that no line has a value of.
-    summarize : callable
-        Makes summaries of a run, finished or not; see `cadalign.evaluation.summary`.
-    results : Columns
-        Columns that the result table of a run must have to be summarized.
-    lines : callable
-        Makes lines of the headline table from summaries; by default a line of each.
-    table : callable, optional
-        Makes the table for the console of a run and its summaries; by default the headline table.
-    group : callable
-        The column that a run's tasks are grouped by.
-    plots : callable
-        Makes the plots of a page of runs to be compared.
-    write_more : callable
-        Writes more files of a run and its summaries.
-    conclude : callable
-        Counts rows and failures of a run.
-    metrics : tuple of Metric
-        Columns of the result table that a page's gallery shows, for experiments on instances.
-    kind : callable
-        Runs of one kind, whose name this gives, can be compared.
-    title : callable
-        Names runs of one kind in a few words.
-    topic : str
-        What is evaluated, in place of a title: ``topic on dataset``.
-    describe : callable
-        Says what the methods were run on.
-    about : str
-        Explains the pictures.
-    note : str
-        Explains the numbers of the headline table.
-    reference : callable
-        Published numbers for the groups of some runs.
-    """
+    """Specification of an experiment."""
 
     options: type[ExperimentOptions]
+    """A frozen dataclass derived from `ExperimentOptions`, which names the experiment; at once
+    keywords of the API, flags of the command line and configuration of the run."""
     plan: Callable[[Any, RunFolder], Plan[Any]]
+    """Makes the plan of a run from its options and its folder, in which it may put files."""
     columns: tuple[Metric, ...]
+    """Columns of the headline table; those are left out that no line has a value of."""
     summarize: Callable[[Run], Summaries]
+    """Makes summaries of a run, finished or not; see `cadalign.evaluation.summary`."""
     results: Columns = RESULT_COLUMNS
+    """Columns that the result table of a run must have to be summarized."""
     lines: Callable[[Summaries], Summaries] = list
+    """Makes lines of the headline table from summaries; by default a line of each."""
     table: Callable[[Run, Summaries], ConsoleTable] | None = None
+    """Makes the table for the console of a run and its summaries; by default the headline table."""
     group: Callable[[Run], Metric] = lambda run: CATEGORY
+    """The column that a run's tasks are grouped by."""
     plots: Callable[[Sequence[Run]], list[Plot]] = lambda runs: []
+    """Makes the plots of a page of runs to be compared."""
     write_more: Callable[[Run, Summaries], object] = lambda run, summaries: None
+    """Writes more files of a run and its summaries."""
     conclude: Callable[[Run, Summaries], Conclusion] = _count_failures
+    """Counts rows and failures of a run."""
     metrics: tuple[Metric, ...] = ()
+    """Columns of the result table that a page's gallery shows, for experiments on instances."""
     kind: Callable[[Run], str] = lambda run: run.experiment
-    title: Callable[[Sequence[Run]], str] | None = None
-    topic: str = ""
+    joins: bool = False
+    """Runs of one kind, whose name this gives, can be compared."""
+    title: Callable[[Sequence[Run]], str] | None = None  # names runs of one kind in a few words
+    topic: str = ""  # what is evaluated, in place of a title: ``topic on dataset``
     describe: Callable[[Run], str] = lambda run: f"on {run.total:,} tasks of {run.experiment}"
-    about: str = ""
-    note: str = ""
+    """Says what the methods were run on."""
+    about: str = ""  # explains the pictures
+    note: str = ""  # explains the numbers of the headline table
     reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: Reference((), "")
+    """Published numbers for the groups of some runs."""
 
     @property
     def name(self) -> str:

@@ -1,24 +1,6 @@
 """COCO: keypoints in images, read from its JSON and what detectors make of it, and written.
 
-Four forms are read:
-
-COCO annotations
-    ``{"images": [...], "annotations": [{"image_id", "category_id", "keypoints"}, ...],
-    "categories": [{"id", "keypoints": [names]}]}``, ``keypoints`` a list x, y, v, x, y, v, ...
-COCO results (MMPose's and Detectron2's result files, ultralytics' ``save_json``)
-    ``[{"image_id", "category_id", "keypoints": [x, y, score, ...], "score"}, ...]``
-MMPose predictions (``inferencer(..., pred_out_dir=...)``)
-    ``[{"keypoints": [[x, y], ...], "keypoint_scores": [...]}, ...]``, alone or as ``instances`` in
-    the ``instance_info`` of an object whose ``meta_info`` names the keypoints
-ultralytics' ``results.to_json()``
-    ``[{"confidence", "keypoints": {"x": [...], "y": [...], "visible": [...]}}, ...]``
-
-The third number of a keypoint is its visibility flag where all of an object's are 0, 1 or 2 and one
-is 2: 0 for not labelled, 1 for hidden, 2 for visible. Otherwise it is the detector's score. As in
-COCO, integer coordinates are pixel centres.
-
-A ``segmentation`` beside the keypoints is kept as it is, for
-`cadalign.datasets.detections.coco_masks`.
+The forms that are read are described in docs/formats/detections.md.
 """
 
 from __future__ import annotations
@@ -42,7 +24,7 @@ from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.documents import Finite, ForeignDocument, Text, convert, in_file, read_json
 from cadalign.io.files import write_json
 
-_FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign.datasets.detections.coco"
+_FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keypoints of detectors"
 _OUTSIDE, _INFERRED, _OBSERVED = 0, 1, 2  # visibility flags
 _Id = int | str
 _Size = Annotated[float, Meta(ge=1, le=2**31)]
@@ -238,29 +220,17 @@ def _scores(third: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class CocoObject:
-    """One object's keypoints, as an annotation of COCO.
+    """One object's keypoints, as an annotation of COCO."""
 
-    Parameters
-    ----------
-    image, category : int
-        Rows of its image and its category in the document.
-    points_2d : (k, 2) float
-        Pixels of all keypoints of the category.
-    flags : (k,) int
-        2 for keypoints that are observed, 1 for inferred ones; 0 for others, whose pixels don't
-        count.
-    rectangle : (4,) float
-        Left, top, right and bottom.
-    pose : Alignment, optional
-        From the model's axes to the camera's, with the model's scale [m].
-    """
-
-    image: int
-    category: int
-    points_2d: FloatArray
+    image: int  # row of its image in the document
+    category: int  # row of its category
+    points_2d: FloatArray  # (k, 2), pixels of all keypoints of the category
     flags: IntArray
-    rectangle: FloatArray
+    """(k,), 2 for keypoints that are observed, 1 for inferred ones; 0 for others, whose pixels
+    don't count."""
+    rectangle: FloatArray  # (4,), left, top, right and bottom
     pose: Alignment | None = None
+    """From the model's axes to the camera's, with the model's scale [m]."""
 
     def annotation(self, number: int) -> dict[str, Any]:
         """The annotation of a number."""
@@ -296,13 +266,7 @@ def coco_document(
 ) -> dict[str, Any]:
     """Keypoints as COCO's JSON.
 
-    Parameters
-    ----------
-    images : iterable of (str, int, int)
-        File name, width and height.
-    categories : iterable of (str, sequence of str)
-        Name, and names of the keypoints.
-    objects : iterable of CocoObject
+    Images are file names with width and height, categories names with the names of their keypoints.
     """
     return {
         "images": [
@@ -326,10 +290,7 @@ def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
     field of its own: ``quat_wxyz`` and ``translation`` [m] from the model's axes to the camera's,
     and ``scale`` along the model's axes [m per model unit].
 
-    Raises
-    ------
-    InputError
-        If the camera, a pose or a model is not known.
+    Raises InputError if the camera, a pose or a model is not known.
     """
     placed = [
         (row, PlacedObject(photo, found))

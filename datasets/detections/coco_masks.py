@@ -32,23 +32,10 @@ class _Runs(ForeignDocument):
 
 
 def decode_segmentation(segmentation: Any, *, width: int, height: int) -> BoolArray:
-    """Decode the ``segmentation`` of a COCO annotation or result.
+    """Decode the ``segmentation`` of a COCO annotation or result, (height, width) bool.
 
-    Parameters
-    ----------
-    segmentation : list or dict
-        As it is in the JSON.
-    width, height : int
-        Size of the image [px].
-
-    Returns
-    -------
-    (height, width) bool
-
-    Raises
-    ------
-    DataError
-        If it is neither, or of another image size, or the mask is empty.
+    It is a list or a dictionary, as in the JSON. Raises DataError if it is neither, or of another
+    image size, or the mask is empty.
 
     Examples
     --------

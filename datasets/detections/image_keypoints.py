@@ -13,6 +13,7 @@ from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import check_pixels
 from cadalign.io.observation import Observation
 
 VISIBILITY_SCORES = (0.0, 0.5, 1.0)
@@ -21,47 +22,32 @@ VISIBILITY_SCORES = (0.0, 0.5, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class ImageKeypoints:
-    """The keypoints of one object in one image.
-
-    Parameters
-    ----------
-    points_2d : (k, 2) float
-        Pixels; integers are pixel centres.
-    scores : (k,) float, optional
-        How sure the detector is of each, 0 for a keypoint that was not found. Visibility flags are
-        scores of 0 (not labelled), 0.5 (hidden) and 1 (visible).
-    names : tuple of k str, optional
-        What each keypoint is called.
-    semantic_ids : tuple of k int, optional
-        What each keypoint means.
-    sigma : (k,) float, optional
-        Standard deviation of each [px].
-    image : str, optional
-        Name or id of the image.
-    size : (int, int), optional
-        The image's width and height [px].
-    images : int
-        How many images the file lists, with keypoints or without.
-    score : float, optional
-        How sure the detector is of the whole object.
-    segmentation : list or dict, optional
-        The object's mask as COCO writes it, unchecked; see
-        `cadalign.datasets.detections.coco_masks.decode_segmentation`.
-    source : str
-        The file and the place in it, for messages.
-    """
+    """The keypoints of one object in one image."""
 
     points_2d: FloatArray
+    """(k, 2), pixels; integers are pixel centres."""
     scores: FloatArray | None = None
+    """(k,), how sure the detector is of each, 0 for a keypoint that was not found. Visibility flags
+    are scores of 0 (not labelled), 0.5 (hidden) and 1 (visible)."""
     names: tuple[str, ...] | None = None
+    """(k,), what each keypoint is called."""
     semantic_ids: tuple[int, ...] | None = None
+    """(k,), what each keypoint means."""
     sigma: FloatArray | None = None
+    """(k,), standard deviation of each [px]."""
     image: str | None = None
+    """Name or id of the image."""
     size: tuple[int, int] | None = None
+    """The image's width and height [px]."""
     images: int = 1
+    """How many images the file lists, with keypoints or without."""
     score: float | None = None
+    """How sure the detector is of the whole object."""
     source: str = "keypoints"
+    """The file and the place in it, for messages."""
     segmentation: Any = field(default=None, kw_only=True)
+    """The object's mask as COCO writes it, unchecked; see
+    `cadalign.datasets.detections.coco_masks.decode_segmentation`."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name=f"{self.source}: keypoints", dimension=2)
@@ -179,6 +165,7 @@ def join_keypoints(
     InputError
         If ``sigma_from_scores`` is not positive.
     """
+    check_pixels(found.points_2d, camera.width, camera.height, where=found.source)
     kept = list(range(len(found)))
     if found.scores is not None:
         kept = np.flatnonzero((found.scores > 0) & (found.scores >= min_score)).tolist()

@@ -1,29 +1,4 @@
-"""Files of keypoints in images: COCO's JSON and its relatives, or plain CSV.
-
-The first line of a CSV file names the columns, in any order:
-
-``u``, ``v``
-    The pixel; integers are pixel centres. ``x`` and ``y`` mean the same. Empty for a keypoint that
-    was not found.
-``name``
-    What the keypoint is called.
-``semantic_id``
-    What the keypoint means, a whole number; used where there is no name.
-``score``
-    How sure the detector is.
-``visibility``
-    COCO's flag: 0 not labelled, 1 hidden, 2 visible. Instead of a score.
-``sigma``
-    Standard deviation [px].
-``image``
-    The image's file name; the rows of each image make one object.
-
-Only ``u`` and ``v`` must be there. Example::
-
-    image,name,u,v,score
-    photo.jpg,"seat, front left",351.2,204.9,0.93
-    photo.jpg,"back, top left",377.0,96.4,0.71
-"""
+"""Files of keypoints in images: JSON in COCO's forms, or CSV; see docs/formats/detections.md."""
 
 from __future__ import annotations
 
@@ -60,8 +35,7 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
     Parameters
     ----------
     path : str or path-like
-        A .csv file, see the module's documentation, or JSON, see
-        `cadalign.datasets.detections.coco`.
+        A .csv or JSON file as described in docs/formats/detections.md.
 
     Returns
     -------

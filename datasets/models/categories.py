@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 
-from cadalign.errors import InputError
+from cadalign.errors import unknown
 
 SYNSETS: dict[str, str] = {
     "airplane": "02691156", "bag": "02773838", "basket": "02801938", "bathtub": "02808440",
@@ -45,10 +44,4 @@ def require_category(name: str, known: Iterable[str], *, where: str) -> str:
     for candidate in (name, name_of_synset(name)):
         if candidate in names:
             return candidate
-    nearest = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    hint = f", did you mean {nearest[0]!r}?" if nearest else ""
-    raise InputError(
-        f"unknown category {name!r}{hint}",
-        where=where,
-        fix=f"known are {', '.join(names)}" if names else "there are none here",
-    )
+    raise unknown("category", name, names, where=where)

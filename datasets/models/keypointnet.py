@@ -26,7 +26,7 @@ from cadalign.datasets.models.keypoints import (
     read_entries,
 )
 from cadalign.datasets.models.shapenet import MeshLocator
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.files import read_text
@@ -45,30 +45,20 @@ _MATCH_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class AnnotatedModel:
-    """One model of KeypointNet.
-
-    Parameters
-    ----------
-    category : str
-        The category's name, such as "chair".
-    class_id : str
-        Its synset id, such as "03001627".
-    model_id : str
-        The model's id.
-    keypoints : Keypoints
-        The annotated points.
-    symmetries : Symmetries
-        Which of them trade places under reflections and rotations.
-    mesh_path : Path or None
-        The mesh file, None where there is none.
-    """
+    """One model of KeypointNet."""
 
     category: str
+    """The category's name, such as "chair"."""
     class_id: str
+    """Its synset id, such as "03001627"."""
     model_id: str
+    """The model's id."""
     keypoints: Keypoints
+    """The annotated points."""
     symmetries: Symmetries
+    """Which of them trade places under reflections and rotations."""
     mesh_path: Path | None
+    """The mesh file, None where there is none."""
 
     @property
     def key(self) -> ModelKey:
@@ -200,12 +190,7 @@ class KeypointNet:
             If a line of its file is not ``<synset>-<model id>``.
         """
         if name not in self.splits:
-            known = ", ".join(self.splits)
-            raise InputError(
-                f"unknown split {name!r}",
-                where=str(self.root / "splits"),
-                fix=f"known are {known}" if known else "there are none here",
-            )
+            raise unknown("split", name, self.splits, where=str(self.root / "splits"))
         return _read_split(self.root / "splits" / f"{name}.txt")
 
     def subset(

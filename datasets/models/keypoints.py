@@ -5,7 +5,6 @@ Files are read model by model, so that one bad model spoils no other.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -24,6 +23,7 @@ from cadalign.io.documents import (
     Point3,
     convert,
     read_json,
+    require_unique,
 )
 from cadalign.io.files import damaged
 
@@ -35,30 +35,21 @@ _NO_POINT = -1
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """The annotated points of a model, in the order of the annotation file.
-
-    Parameters
-    ----------
-    xyz : (k, 3) float
-        Positions [model units].
-    semantic_ids : (k,) int
-        Which keypoint of its category each one is; no id occurs twice.
-    face_index : (k,) int
-        The face that each one lies on, numbered as in the mesh file.
-    barycentric : (k, 3) float
-        Where on that face: weights of its corners in file order, of sum 1.
-    point_index : (k,) int
-        Its nearest point in KeypointNet's point cloud, -1 where the annotation names none.
-    colors : (k, 3) float
-        Red, green and blue of the surface there, 0 to 1; grey where the annotation names none.
-    """
+    """The annotated points of a model, in the order of the annotation file."""
 
     xyz: FloatArray
+    """(k, 3), positions [model units]."""
     semantic_ids: IntArray
+    """(k,), which keypoint of its category each one is; no id occurs twice."""
     face_index: IntArray
+    """(k,), the face that each one lies on, numbered as in the mesh file."""
     barycentric: FloatArray
+    """(k, 3), where on that face: weights of its corners in file order, of sum 1."""
     point_index: IntArray
+    """(k,), its nearest point in KeypointNet's point cloud, -1 where the annotation names none."""
     colors: FloatArray
+    """(k, 3), red, green and blue of the surface there, 0 to 1; grey where the annotation names
+    none."""
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -79,38 +70,25 @@ class Keypoints:
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """A circle that keypoints of equal rank lie on, such as a bottle's rim.
-
-    Parameters
-    ----------
-    center : (3,) float
-        [model units]
-    radius : float
-        [model units]
-    normal : (3,) float
-        The axis, of length 1.
-    """
+    """A circle that keypoints of equal rank lie on, such as a bottle's rim."""
 
     center: FloatArray
+    """(3,), [model units]."""
     radius: float
+    """[model units]."""
     normal: FloatArray
+    """(3,), the axis, of length 1."""
 
 
 @dataclass(frozen=True)
 class RotationalSymmetry:
-    """Keypoints that a rotation of the object takes to one another.
-
-    Parameters
-    ----------
-    keypoints : tuple of int
-        Their rows in `Keypoints` (not their semantic ids).
-    circle : Circle, optional
-        Where the object looks the same under any rotation about the circle's axis; None where
-        only some rotations take it to itself, as the five feet of an office chair.
-    """
+    """Keypoints that a rotation of the object takes to one another."""
 
     keypoints: tuple[int, ...]
+    """Their rows in `Keypoints` (not their semantic ids)."""
     circle: Circle | None = None
+    """Where the object looks the same under any rotation about the circle's axis; None where only
+    some rotations take it to itself, as the five feet of an office chair."""
 
     @property
     def is_circle(self) -> bool:
@@ -125,18 +103,12 @@ class RotationalSymmetry:
 
 @dataclass(frozen=True)
 class Symmetries:
-    """The symmetries of a model as far as its keypoints show them.
-
-    Parameters
-    ----------
-    reflections : tuple of pairs of int
-        Keypoints that mirror each other, as rows in `Keypoints` (not semantic ids).
-    rotations : tuple of RotationalSymmetry
-        Keypoints that a rotation takes to one another.
-    """
+    """The symmetries of a model as far as its keypoints show them."""
 
     reflections: tuple[tuple[int, int], ...] = ()
+    """Keypoints that mirror each other, as rows in `Keypoints` (not semantic ids)."""
     rotations: tuple[RotationalSymmetry, ...] = ()
+    """Keypoints that a rotation takes to one another."""
 
     @property
     def axes(self) -> FloatArray:
@@ -224,16 +196,6 @@ class _Entry(ForeignDocument):
                         f"{beyond[0]} is not the row of one of the {len(self.keypoints)} keypoints",
                         where=f"symmetries.{kind}[{position}].kp_indexes",
                     )
-
-
-def require_unique(keypoints: Sequence[Any], field: str) -> None:
-    """Refuse a field's value, other than None, that two of the keypoints have."""
-    first: dict[Any, int] = {}
-    for row, keypoint in enumerate(keypoints):
-        value = getattr(keypoint, field)
-        if value is not None and first.setdefault(value, row) != row:
-            what = f"{value!r} occurs twice, first in keypoints[{first[value]}]"
-            raise InputError(what, where=f"keypoints[{row}].{field}")
 
 
 class Annotation(NamedTuple):

@@ -1,25 +1,6 @@
 """A model's keypoints with their names, as a file beside the model: `chair.keypoints.json`.
 
-The file holds one object::
-
-    {
-      "format": "cadalign model keypoints",
-      "version": 1,
-      "model": "chair.obj",
-      "keypoints": [
-        {"name": "seat, front left", "xyz": [0.17, 0.02, 0.21], "semantic_id": 3,
-         "face_index": 118, "barycentric": [0.2, 0.3, 0.5]},
-        {"name": "back, top left", "xyz": [0.16, 0.44, -0.19]},
-        {"name": "arm rest, left", "face_index": 52, "barycentric": [0.1, 0.1, 0.8]}
-      ]
-    }
-
-``name`` is what detectors and people call the keypoint; no name occurs twice. Where it lies is said
-by ``xyz`` in model units, or by ``face_index`` (counted as in the mesh file, from 0) and
-``barycentric`` (weights of the face's corners in file order), or by both; ``xyz`` counts then.
-``semantic_id``, optional, is the keypoint's number within its category; none occurs twice.
-``model``, optional, is the mesh file's path, relative to this file; keypoints without ``xyz`` need
-it.
+The file is described in docs/formats/model_keypoints.md.
 """
 
 from __future__ import annotations
@@ -34,7 +15,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.keypointnet import AnnotatedModel
-from cadalign.datasets.models.keypoints import Keypoints, entry_id, parse_entry, require_unique
+from cadalign.datasets.models.keypoints import Keypoints, entry_id, parse_entry
 from cadalign.errors import CadalignError, DataError, InputError, quote
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import (
@@ -48,6 +29,7 @@ from cadalign.io.documents import (
     in_file,
     path_from,
     read_json,
+    require_unique,
     written_path,
 )
 from cadalign.io.files import write_json
@@ -92,38 +74,23 @@ class _File(Document):
 
 @dataclass(frozen=True)
 class ModelKeypoint:
-    """One named point on a model.
-
-    Parameters
-    ----------
-    name : str
-        What the point is called.
-    xyz : tuple of 3 float
-        Where it lies [model units].
-    semantic_id : int, optional
-        Its number within the model's category.
-    face_index : int, optional
-        The face that it lies on, counted as in the mesh file.
-    barycentric : tuple of 3 float, optional
-        Where on that face: weights of its corners in file order, of sum 1.
-    """
+    """One named point on a model."""
 
     name: str
+    """What the point is called."""
     xyz: tuple[float, float, float]
+    """(3,), where it lies [model units]."""
     semantic_id: int | None = None
+    """Its number within the model's category."""
     face_index: int | None = None
+    """The face that it lies on, counted as in the mesh file."""
     barycentric: tuple[float, float, float] | None = None
+    """(3,), where on that face: weights of its corners in file order, of sum 1."""
 
 
 @dataclass(frozen=True)
 class ModelKeypoints:
     """The named keypoints of a model.
-
-    Parameters
-    ----------
-    keypoints : tuple of ModelKeypoint
-    model : Path, optional
-        The mesh file.
 
     Raises
     ------
@@ -143,6 +110,7 @@ class ModelKeypoints:
 
     keypoints: tuple[ModelKeypoint, ...]
     model: Path | None = None
+    """The mesh file."""
 
     def __post_init__(self) -> None:
         try:
@@ -210,8 +178,8 @@ class ModelKeypoints:
         Parameters
         ----------
         path : str or path-like
-            A file as described in `cadalign.datasets.models.model_keypoints`, or KeypointNet's
-            annotations of a category.
+            A file as described in docs/formats/model_keypoints.md, or KeypointNet's annotations of
+            a category.
         mesh : Mesh, optional
             The surface that keypoints without ``xyz`` lie on; the file's ``model`` is read
             otherwise, if it is needed.
@@ -254,10 +222,7 @@ class ModelKeypoints:
     @classmethod
     def _from_data(cls, data: Any, folder: Path, mesh: Mesh | None) -> ModelKeypoints:
         other_version = "it was written by another version of cadalign"
-        for name, wanted, fix in (
-            ("format", FORMAT, _WANTED),
-            ("version", VERSION, other_version),
-        ):
+        for name, wanted, fix in (("format", FORMAT, _WANTED), ("version", VERSION, other_version)):
             if isinstance(data, dict) and data.get(name) != wanted:
                 raise DataError(f"{quote(data.get(name))} is not {wanted!r}", where=name, fix=fix)
         read: _File = convert(data, _File)

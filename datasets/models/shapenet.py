@@ -25,24 +25,16 @@ _SHAPENET_FOLDERS = ("models", "ShapeNetCore.v2")
 
 @dataclass(frozen=True)
 class ShapeNetModel:
-    """One model of ShapeNetCore.
-
-    Parameters
-    ----------
-    category : str
-        The category's name, such as "chair".
-    class_id : str
-        Its synset id, such as "03001627".
-    model_id : str
-        The model's id.
-    mesh_path : Path
-        Its OBJ file.
-    """
+    """One model of ShapeNetCore."""
 
     category: str
+    """The category's name, such as "chair"."""
     class_id: str
+    """Its synset id, such as "03001627"."""
     model_id: str
+    """The model's id."""
     mesh_path: Path
+    """Its OBJ file."""
 
     def load_mesh(self) -> Mesh:
         """Read its mesh; see `cadalign.datasets.load_mesh`."""

@@ -29,7 +29,16 @@ from cadalign.datasets.photos.bop_files import (
     write_models_info,
     write_scene_gt,
 )
-from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, parse, read_each, read_table
+from cadalign.datasets.photos.dataset import (
+    Estimates,
+    PhotoDataset,
+    PhotoFormat,
+    PoseEstimate,
+    PoseFile,
+    parse,
+    read_each,
+    read_table,
+)
 from cadalign.datasets.photos.photo import (
     CadModel,
     DepthImage,
@@ -39,7 +48,6 @@ from cadalign.datasets.photos.photo import (
     first_existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted
-from cadalign.datasets.photos.poses import Estimates, PoseEstimate, PoseFile
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -363,14 +371,11 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> _Written:
 def write_scene(folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, Camera]) -> None:
     """Write ``scene_gt.json`` and ``scene_camera.json`` of photos named by their numbers.
 
-    Raises
-    ------
-    InputError
-        If a camera has lens distortion, or a pose a stretch, which the format lacks.
+    Raises InputError if a camera has lens distortion, or a pose a stretch, which the format lacks.
     """
     table = {}
     for number, (image, camera) in enumerate(cameras.items()):
-        if any(camera.distortion):
+        if camera.distortion:
             fix = "undistort the photo and fit again, or export the result CSV alone"
             what = "BOP's camera files have no place for lens distortion"
             raise InputError(what, where=f"views[{number}].camera", fix=fix)

@@ -19,8 +19,8 @@ import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets.photos.dataset import Estimates, PoseEstimate
 from cadalign.datasets.photos.photo import CadModel, ModelFiles, existing
-from cadalign.datasets.photos.poses import Estimates, PoseEstimate
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
@@ -75,16 +75,8 @@ def object_name(number: int) -> str:
 def write_bop_results(path: Path, poses: Iterable[PoseEstimate]) -> None:
     """Write poses as the CSV file of results that the BOP challenge takes.
 
-    Parameters
-    ----------
-    path : Path
-    poses : iterable of PoseEstimate
-        Their ids are numbers; models may be called ``obj_000001``. Translations are millimetres.
-
-    Raises
-    ------
-    InputError
-        If an id is not a number, or a pose has a stretch.
+    Their ids are numbers; models may be called ``obj_000001``. Translations are millimetres. Raises
+    InputError if an id is not a number, or a pose has a stretch.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -123,10 +115,7 @@ def write_scene_gt(path: Path, poses: Iterable[PoseEstimate]) -> None:
 def read_bop_results(path: Path) -> Estimates:
     """Read a CSV file of results of the BOP challenge; lines that cannot be read are told of.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or is not such a file.
+    Raises DataError if the file cannot be read, or is not such a file.
     """
     text = read_text(path)
     rows = list(csv.reader(io.StringIO(text)))
@@ -153,10 +142,7 @@ def read_scene_gt(path: Path) -> Estimates:
 
     The scene's id is the name of the file's folder, where that is a number.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, or is not such a file.
+    Raises DataError if the file cannot be read, or is not such a file.
     """
     table = read_json(path)
     is_table = isinstance(table, dict) and all(isinstance(each, list) for each in table.values())
@@ -285,27 +271,17 @@ class ModelInfo(ForeignDocument):
 
 @dataclass(frozen=True)
 class BopModels:
-    """The models' folder of a data set.
+    """The models' folder of a data set."""
 
-    Parameters
-    ----------
-    folder : Path
-        The folder of ``obj_000001.ply`` and ``models_info.json``.
-    info : dict
-        The parsed entries of ``models_info.json`` by the models' ids; empty where it is missing.
-    """
-
-    folder: Path
+    folder: Path  # the folder of ``obj_000001.ply`` and ``models_info.json``
     info: dict[str, Any]
+    """The parsed entries of ``models_info.json`` by the models' ids; empty where it is missing."""
 
     @classmethod
     def find(cls, scene: Path) -> BopModels | None:
         """Find the models of a scene: beside it, or in one of the three folders above it.
 
-        Raises
-        ------
-        DataError
-            If ``models_info.json`` cannot be read.
+        Raises DataError if ``models_info.json`` cannot be read.
         """
         for place in (scene, *scene.parents[:_LEVELS]):
             for name in _MODEL_FOLDERS:
@@ -333,10 +309,7 @@ class BopModels:
     def symmetry(self, obj_id: int) -> Symmetry:
         """The symmetries of a model.
 
-        Raises
-        ------
-        DataError
-            If a motion is not rigid, or an axis has no direction.
+        Raises DataError if a motion is not rigid, or an axis has no direction.
         """
         with in_file(self.folder / _MODELS_INFO), within(str(obj_id)):
             return self._entry(obj_id).symmetry()
@@ -364,10 +337,7 @@ def write_model(folder: Path, mesh: Mesh, number: int) -> dict[str, float]:
 def write_models_info(folder: Path, entries: Mapping[int, dict[str, float]]) -> None:
     """Add entries of models to ``models/models_info.json``; those of others are kept.
 
-    Raises
-    ------
-    DataError
-        If the file with the other models cannot be read.
+    Raises DataError if the file with the other models cannot be read.
     """
     path = folder / _MODEL_FOLDERS[0] / _MODELS_INFO
     table = read_json(path) if path.exists() else {}

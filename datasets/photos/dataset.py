@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,8 +16,8 @@ from msgspec import Raw
 
 from cadalign.datasets.photos.photo import Photo, PhotoObject
 from cadalign.datasets.photos.placed import PlacedObject
-from cadalign.datasets.photos.poses import PoseFile
 from cadalign.errors import CadalignError, DataError, InputError, brief
+from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import convert, in_file
 from cadalign.io.files import damaged, read_bytes
 
@@ -31,42 +31,32 @@ _LOGGED = 20
 
 @dataclass(frozen=True)
 class PhotoSummary:
-    """Counts of what a data set of photos holds.
-
-    Parameters
-    ----------
-    kind : str
-        The data set's format.
-    root : Path
-        Its folder.
-    records : int
-        Photos that its annotations list.
-    photos : int
-        Those that can be read.
-    images : int
-        Those whose image is there.
-    objects : int
-        Objects in them.
-    categories : dict
-        Number of objects of each category, the most frequent first.
-    with_keypoints, with_model, with_pose, with_mask : int
-        Objects that have these; a box counts as a pose.
-    problems : tuple of str
-        Why records or objects could not be read.
-    """
+    """Counts of what a data set of photos holds."""
 
     kind: str
+    """The data set's format."""
     root: Path
+    """Its folder."""
     records: int
+    """Photos that its annotations list."""
     photos: int
+    """Those that can be read."""
     images: int
+    """Those whose image is there."""
     objects: int
+    """Objects in them."""
     categories: dict[str, int]
+    """Number of objects of each category, the most frequent first."""
     with_keypoints: int
+    """Objects with keypoints."""
     with_model: int
+    """Objects with a CAD model."""
     with_pose: int
+    """Objects with a pose, of which a box is enough."""
     with_mask: int
+    """Objects with a mask."""
     problems: tuple[str, ...]
+    """Why records or objects could not be read."""
 
 
 class PhotoDataset(ABC):
@@ -111,12 +101,8 @@ class PhotoDataset(ABC):
     def __getitem__(self, key: int | str) -> Photo:
         """The photo of a number or name.
 
-        Raises
-        ------
-        DataError
-            If its record is bad, or there is none of this name.
-        IndexError
-            If the number is out of range.
+        Raises DataError if its record is bad, or there is none of this name; and IndexError if the
+        number is out of range.
         """
         if isinstance(key, str):
             if key not in self.names:
@@ -211,27 +197,18 @@ class PhotoDataset(ABC):
 
 @dataclass(frozen=True)
 class PhotoFormat:
-    """A format of data sets of photos: how it is told, read and written.
-
-    Parameters
-    ----------
-    name : str
-        Its short name, which `write_photos` knows it by.
-    signature : str
-        What tells it, for messages.
-    is_here : callable
-        Whether a folder holds it.
-    open : callable
-        Makes the data set of the folder.
-    write : callable, optional
-        Writes objects with their numbers into a folder; returns why some cannot be held.
-    """
+    """A format of data sets of photos: how it is recognised, read and written."""
 
     name: str
+    """Its short name, which `write_photos` knows it by."""
     signature: str
+    """What it is recognised by, for messages."""
     is_here: Callable[[Path], bool]
+    """Whether a folder holds it."""
     open: Callable[[Path], PhotoDataset]
+    """Makes the data set of the folder."""
     write: Callable[[Path, Iterable[tuple[int, PlacedObject]]], list[InputError]] | None = None
+    """Writes objects with their numbers into a folder; returns why some cannot be held."""
 
 
 def has(*patterns: str) -> Callable[[Path], bool]:
@@ -255,14 +232,8 @@ def read_each(
 ) -> tuple[tuple[PhotoObject, ...], tuple[DataError, ...]]:
     """Read a photo's objects, and the reasons why some could not be read.
 
-    Parameters
-    ----------
-    records : iterable
-        The objects' records.
-    read : callable
-        Makes the object of a number and a record; None for one that is left out on purpose.
-    where : str
-        The place of the records, for messages.
+    ``read`` makes the object of a number and a record, None for one that is left out on purpose;
+    ``where`` is the place of the records, for messages.
     """
     found: list[PhotoObject] = []
     problems: list[DataError] = []
@@ -284,10 +255,7 @@ def read_each(
 def read_list(path: Path) -> list[Raw]:
     """Read a JSON file that holds a list, its entries not yet parsed.
 
-    Raises
-    ------
-    DataError
-        If it cannot be read, is no valid JSON (cut short, say), or holds no list.
+    Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no list.
     """
     return list(_read_raw(path, list[Raw], "a list"))
 
@@ -295,10 +263,7 @@ def read_list(path: Path) -> list[Raw]:
 def read_table(path: Path) -> dict[str, Raw]:
     """Read a JSON file that holds an object, its values not yet parsed.
 
-    Raises
-    ------
-    DataError
-        If it cannot be read, is no valid JSON (cut short, say), or holds no object.
+    Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no object.
     """
     return dict(_read_raw(path, dict[str, Raw], "an object"))
 
@@ -306,10 +271,7 @@ def read_table(path: Path) -> dict[str, Raw]:
 def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
     """Parse an entry as a declared type; errors name the file and the place in it.
 
-    Raises
-    ------
-    DataError
-        If it is not of this type, or no valid JSON.
+    Raises DataError if it is not of this type, or no valid JSON.
     """
     try:
         data = msgspec.json.decode(raw)
@@ -331,3 +293,44 @@ def _read_raw(path: Path, kind: Any, name: str) -> Any:
         raise damaged(f"not valid JSON: {brief(error)}", path) from None
     except RecursionError:
         raise DataError("not valid JSON: nested too deeply", where=str(path)) from None
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate:
+    """A model's estimated pose in a photo."""
+
+    scene: str  # the scene's id; empty where the file has none
+    image: str  # the photo's id in its scene
+    model_id: str  # the model's id
+    cam_from_model: Alignment  # the pose, in the unit of the data set
+    score: float = 1.0  # confidence; higher is better
+    seconds: float | None = None  # time that the estimate took, of all objects in the photo
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """The poses in a result file, and why some of its records could not be read."""
+
+    path: Path
+    poses: tuple[PoseEstimate, ...]
+    problems: tuple[DataError, ...] = ()
+
+
+class PoseFile(ABC):
+    """The poses of a file that was opened on a data set, by photo.
+
+    Attributes
+    ----------
+    problems : tuple of DataError
+        Why some of its records could not be read.
+    """
+
+    problems: tuple[DataError, ...] = ()
+
+    @abstractmethod
+    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
+        """The estimates of a photo's objects, in the unit of the data set."""
+
+    @abstractmethod
+    def strays(self, names: Sequence[str]) -> int:
+        """Number of estimates, or scans, of photos that are not among these."""

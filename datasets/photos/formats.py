@@ -6,19 +6,11 @@ import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from cadalign.datasets.photos import (
-    bop,
-    kitti,
-    objectron,
-    pascal3d,
-    pix3d,
-    posed_photos,
-    scan2cad,
-)
+from cadalign.datasets.photos import bop, kitti, objectron, pascal3d, pix3d, posed_photos, scan2cad
 from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import placed_objects
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, InputError, unknown
 from cadalign.io.files import writing
 
 PHOTO_FORMATS = (
@@ -121,8 +113,7 @@ def write_photos(
     folder = Path(path)
     writers = {each.name: each.write for each in formats if each.write is not None}
     if form not in writers:
-        fix = f"known are {', '.join(writers)}"
-        raise InputError(f"unknown form {quote(form)}", where="form", fix=fix)
+        raise unknown("form", form, writers)
     photos = list(photos)
     count = sum(len(photo.objects) for photo in photos)
     if not count:

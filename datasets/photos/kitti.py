@@ -44,22 +44,12 @@ _NO_FRAME = -1
 
 @dataclass(frozen=True, eq=False)
 class KittiLabel:
-    """One line of a label file.
+    """One line of a label file."""
 
-    Parameters
-    ----------
-    kind : str
-        The object's type, such as "Car".
-    numbers : (14,) float
-        What follows the type.
-    frame, track : int, optional
-        The tracking benchmark's first two columns.
-    """
-
-    kind: str
-    numbers: FloatArray
-    frame: int | None = None
-    track: int | None = None
+    kind: str  # the object's type, such as "Car"
+    numbers: FloatArray  # (14,), what follows the type
+    frame: int | None = None  # the tracking benchmark's first column
+    track: int | None = None  # its second column
 
     @property
     def flags(self) -> frozenset[str]:
@@ -98,7 +88,7 @@ class KittiCars(PhotoDataset):
 
         label_2/000000.txt      image_2/000000.png             calib/000000.txt
         label_02/0000.txt       image_02/0000/000000.png       calib/0000.txt
-        cars.json, car_tracks.json          see `cadalign.datasets.photos.kitti_keypoints`
+        cars.json, car_tracks.json          see docs/formats/photo_files.md
 
     The truth is the box: its axes are the car's (x to its left, y to its rear, z up), its extents
     width, length and height, in metres. Boxes are in the frame of the left colour camera: the
@@ -214,9 +204,7 @@ def _list_tracking_labels(root: Path) -> Iterator[_LabelFrame | DataError]:
                 yield _LabelFrame(f"{path.stem}/{name}", path, image, calibration, frame)
 
 
-def _by_frame(
-    labels: Iterable[KittiLabel | DataError],
-) -> dict[int, list[KittiLabel | DataError]]:
+def _by_frame(labels: Iterable[KittiLabel | DataError]) -> dict[int, list[KittiLabel | DataError]]:
     """A sequence's labels by frame; lines that could not be read are those of frame -1."""
     found: dict[int, list[KittiLabel | DataError]] = {}
     for label in labels:
@@ -229,16 +217,8 @@ def _by_frame(
 def read_labels(path: Path, *, tracking: bool) -> list[KittiLabel | DataError]:
     """Read a label file; a bad line is the reason why, in its place.
 
-    Parameters
-    ----------
-    path : Path
-    tracking : bool
-        Whether frame and track come before the type.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read.
+    Where it is for ``tracking``, frame and track come before the type. Raises DataError if the file
+    cannot be read.
     """
     lines = read_text(path).splitlines()
     found: list[KittiLabel | DataError] = []
@@ -266,19 +246,10 @@ def _label(fields: list[str], *, tracking: bool) -> KittiLabel:
 
 
 def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArray]:
-    """Read the left colour camera's matrix P2 from a calibration file.
+    """Read the left colour camera from a calibration file's matrix P2, and its shift (3,) [m].
 
-    Returns
-    -------
-    camera : Camera
-    shift : (3,) float
-        What is added to the reference camera's coordinates, in which locations are given, to get
-        this camera's [m].
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or holds no valid P2.
+    The shift is added to the reference camera's coordinates, in which locations are given, to get
+    this camera's. Raises DataError if the file cannot be read, or holds no valid P2.
     """
     lines = read_text(path).splitlines()
     for line in lines:

@@ -1,25 +1,6 @@
 """Cars of KITTI: their boxes, files of their keypoints, read and written, and their linear shape.
 
-``cars.json`` is a list of cars, each with its photo, which is listed once for each car in it::
-
-    [{"image": "2_98.png", "K": 3 x 3, "bbox": [left, top, right, bottom],
-      "dims_hwl": [h, w, l], "location_bottom_centre": [x, y, z], "rotation_y": -1.5,
-      "keypoints": [{"name": "front wheel left", "xyz": [...], "uv": [...], "score": 0.6}]}]
-
-``car_tracks.json`` holds cars that are followed through a sequence, without photos::
-
-    {"names": [...], "model_xyz": k x 3,
-     "tracks": [{"sequence": 10, "track": 0, "K": 3 x 3, "dims_hwl": [h, w, l],
-                 "frames": [{"frame": 0, "bbox": [...], "location_bottom_centre": [...],
-                             "rotation_y": -1.7, "uv": k x 2, "score": [...]}]}]}
-
-``xyz`` is the keypoint on the model: x to the car's left, y to its rear, z up [m].
-
-Beside ``car_tracks.json`` may lie a linear shape model, as in Krishna et al., "Reconstructing
-Vehicles from a Single Image: Shape Priors for Road Scene Understanding", ICRA 2017::
-
-    meanShape_2.txt     the same mean in another unit and frame, k x 3
-    vectors2.txt        modes of deformation of unit norm, in that frame, each 3 k numbers
+The files are described in docs/formats/photo_files.md.
 """
 
 from __future__ import annotations
@@ -65,8 +46,8 @@ from cadalign.io.documents import (
 )
 from cadalign.io.files import damaged, read_text, write_json
 from cadalign.io.images import photo_size
+from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.reflections import find_reflection
 
 CARS = "cars.json"
 TRACKS = "car_tracks.json"
@@ -138,36 +119,19 @@ class MeanCar(ForeignDocument):
 
 @dataclass(frozen=True, eq=False)
 class KeypointFrame:
-    """One car in one photo, not yet checked.
+    """One car in one photo, not yet checked."""
 
-    Parameters
-    ----------
-    name : str
-        The photo's name.
-    path : Path
-        The file.
-    place : str
-        The entry's place in it, for messages.
-    entry : Raw or Any
-        The entry.
-    model, track : optional
-        What ``car_tracks.json`` says of all frames, and of the frames of one car.
-    """
-
-    name: str
-    path: Path
-    place: str
-    entry: Any
-    model: MeanCar | None = None
-    track: _Track | None = None
+    name: str  # the photo's name
+    path: Path  # the file
+    place: str  # the entry's place in it, for messages
+    entry: Any  # the entry
+    model: MeanCar | None = None  # the part of ``car_tracks.json`` for all frames
+    track: _Track | None = None  # and for the frames of one car
 
     def photo(self, size: tuple[int, int]) -> Photo:
         """Read the entry; ``size`` is that of photos that are not there.
 
-        Raises
-        ------
-        DataError
-            If the entry is bad.
+        Raises DataError if the entry is bad.
         """
         with in_file(self.path), within(self.place):
             if self.track is None or self.model is None:
@@ -203,20 +167,9 @@ def car_box(dims_hwl: FloatArray, location: FloatArray, rotation_y: float) -> Bo
     """The box of a car from KITTI's numbers.
 
     Its axes are the car's: x to its left, y to its rear, z up; its extents width, length, height.
-
-    Parameters
-    ----------
-    dims_hwl : (3,) float
-        Height, width and length [m].
-    location : (3,) float
-        The centre of its bottom in the camera frame [m].
-    rotation_y : float
-        The rotation about the camera's y [rad]; 0 for a car that heads along the camera's x.
-
-    Raises
-    ------
-    InputError
-        If a dimension is not positive.
+    ``dims_hwl`` (3,) are height, width and length [m], ``location`` (3,) is the centre of its
+    bottom in the camera frame [m], ``rotation_y`` [rad] 0 for a car that heads along the camera's
+    x. Raises InputError if a dimension is not positive.
     """
     height, width, length = dims_hwl.tolist()
     if not min(height, width, length) > 0:
@@ -366,10 +319,7 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
 def car_shape(folder: Path) -> ShapeModel | None:
     """The shape model of the cars of a folder, in metres; None without its three files.
 
-    Raises
-    ------
-    DataError
-        If a file cannot be read, or their sizes disagree.
+    Raises DataError if a file cannot be read, or their sizes disagree.
     """
     paths = [folder / name for name in (TRACKS, _MEAN, _MODES)]
     if not all(path.is_file() for path in paths):

@@ -71,26 +71,15 @@ _MOST_BYTES = 2**36  # of a video
 
 @dataclass(frozen=True)
 class VideoFrame:
-    """A frame of a video file.
+    """A frame of a video file."""
 
-    Parameters
-    ----------
-    path : Path
-        The video.
-    number : int
-        The frame, from 0.
-    """
-
-    path: Path
-    number: int
+    path: Path  # the video
+    number: int  # the frame, from 0
 
     def read(self) -> ByteImage:
         """Read the frame upright, (h, w, 3) uint8.
 
-        Raises
-        ------
-        DataError
-            If the video has no such frame, or cannot be read.
+        Raises DataError if the video has no such frame, or cannot be read.
         """
         import cv2  # on first use: it takes longer to import than all the rest
 

@@ -28,20 +28,11 @@ _MAX_VARINT = 10
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a message.
-
-    Parameters
-    ----------
-    name : str
-    kind : str or mapping
-        "int", "float", "double", "text", or the fields of a message.
-    repeated : bool
-        Whether it is a list; numbers in it may be packed.
-    """
+    """One field of a message."""
 
     name: str
-    kind: str | Mapping[int, Field]
-    repeated: bool = False
+    kind: str | Mapping[int, Field]  # "int", "float", "double", "text", or the fields of a message
+    repeated: bool = False  # whether it is a list; numbers in it may be packed
 
 
 _POINT_2D = {1: Field("x", "float"), 2: Field("y", "float"), 3: Field("depth", "float")}
@@ -130,28 +121,14 @@ class WorldObject(ForeignDocument):
 
 @dataclass(frozen=True)
 class Sequence:
-    """A sequence's objects and frames, not yet checked.
+    """A sequence's objects and frames, not yet checked."""
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    objects, frames : tuple
-        Messages as bytes, or as parsed JSON.
-    """
-
-    path: Path
+    path: Path  # the file
     objects: tuple[Any, ...]
-    frames: tuple[Any, ...]
+    frames: tuple[Any, ...]  # messages as bytes, or as parsed JSON
 
     def frame(self, number: int) -> ObjectronFrame:
-        """Decode a frame.
-
-        Raises
-        ------
-        DataError
-            If it is no valid frame.
-        """
+        """Decode a frame; raises DataError if it is no valid frame."""
         where = f"frame_annotations[{number}]"
         found: ObjectronFrame = self._convert(self.frames[number], _FRAME, ObjectronFrame, where)
         return found
@@ -174,10 +151,7 @@ class Sequence:
 def read_sequence(path: Path) -> Sequence:
     """Read an annotation file, ``.pbdata`` or ``.json``; its messages are decoded later.
 
-    Raises
-    ------
-    DataError
-        If it cannot be read, or is no such file.
+    Raises DataError if it cannot be read, or is no such file.
     """
     if path.suffix == ".json":
         data = _snake_case(read_json(path))
@@ -221,10 +195,7 @@ def _lower(found: re.Match[str]) -> str:
 def decode(data: bytes, fields: Mapping[int, Field]) -> dict[str, Any]:
     """Decode a message; unknown fields are skipped, lists without entries are empty.
 
-    Raises
-    ------
-    InputError
-        If the data are no such message, or cut short.
+    Raises InputError if the data are no such message, or cut short.
     """
     found: dict[str, Any] = {field.name: [] for field in fields.values() if field.repeated}
     for number, wire, value in entries(data):
@@ -242,10 +213,7 @@ def decode(data: bytes, fields: Mapping[int, Field]) -> dict[str, Any]:
 def entries(data: bytes) -> Iterator[tuple[int, int, Any]]:
     """The entries of a message, in order: field number, wire type, and the value.
 
-    Raises
-    ------
-    InputError
-        If the data are cut short, or no message.
+    Raises InputError if the data are cut short, or no message.
     """
     place = 0
     while place < len(data):

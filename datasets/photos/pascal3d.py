@@ -249,23 +249,14 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
 
 @dataclass(frozen=True)
 class PascalCad:
-    """One CAD model of a category.
-
-    Parameters
-    ----------
-    path : Path
-        The category's file, whose variable has the category's name: a struct array with
-        ``vertices``, ``faces`` (from 1), ``pnames`` and one field per named anchor. x is lateral,
-        y along the length, z up.
-    category : str
-        The category.
-    index : int
-        The model's number, from 1 as in the annotations.
-    """
+    """One CAD model of a category."""
 
     path: Path
-    category: str
-    index: int
+    """The category's file, whose variable has the category's name: a struct array with
+    ``vertices``, ``faces`` (from 1), ``pnames`` and one field per named anchor. x is lateral, y
+    along the length, z up."""
+    category: str  # the category
+    index: int  # the model's number, from 1 as in the annotations
 
     def load_mesh(self) -> Mesh:
         """Read the mesh."""

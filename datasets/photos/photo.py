@@ -27,17 +27,6 @@ from cadalign.io.meshes.load import load_mesh
 class PhotoKeypoints:
     """The keypoints of an object that are marked in a photo.
 
-    Parameters
-    ----------
-    points_2d : (k, 2) float
-        Pixels; integers are pixel centres.
-    names : tuple of k str
-        What each one is called: the model's keypoint of the same name is the same point.
-    visible : (k,) bool
-        False for a keypoint that is marked though something hides it.
-    scores : (k,) float, optional
-        How sure a detector is of each.
-
     Raises
     ------
     DataError
@@ -47,9 +36,13 @@ class PhotoKeypoints:
     """
 
     points_2d: FloatArray
+    """(k, 2), pixels; integers are pixel centres."""
     names: tuple[str, ...]
+    """(k,), what each one is called: the model's keypoint of the same name is the same point."""
     visible: BoolArray
+    """(k,), false for a keypoint that is marked though something hides it."""
     scores: FloatArray | None = None
+    """(k,), how sure a detector is of each."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name="keypoints", dimension=2)
@@ -70,18 +63,10 @@ class PhotoKeypoints:
 
 @dataclass(frozen=True, eq=False)
 class NamedPoints:
-    """Keypoints of a model.
+    """Keypoints of a model."""
 
-    Parameters
-    ----------
-    names : tuple of k str
-        What each one is called; no name occurs twice.
-    xyz : (k, 3) float
-        Where they lie [model units].
-    """
-
-    names: tuple[str, ...]
-    xyz: FloatArray
+    names: tuple[str, ...]  # (k,), what each one is called; no name occurs twice
+    xyz: FloatArray  # (k, 3), where they lie [model units]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -99,18 +84,10 @@ class ModelSource(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ModelFiles:
-    """A model whose mesh is a file of its own.
+    """A model whose mesh is a file of its own."""
 
-    Parameters
-    ----------
-    mesh_path : Path or None
-        The mesh file, None where there is none.
-    keypoints : NamedPoints, optional
-        The keypoints that the annotation gives.
-    """
-
-    mesh_path: Path | None
-    keypoints: NamedPoints | None = None
+    mesh_path: Path | None  # the mesh file, None where there is none
+    keypoints: NamedPoints | None = None  # the keypoints that the annotation gives
 
     def load_mesh(self) -> Mesh | None:
         """Read the mesh file."""
@@ -123,13 +100,7 @@ class ModelFiles:
 
 @dataclass(frozen=True, eq=False)
 class LoadedModel:
-    """A model that is in memory.
-
-    Parameters
-    ----------
-    mesh : Mesh, optional
-    keypoints : NamedPoints, optional
-    """
+    """A model that is in memory."""
 
     mesh: Mesh | None = None
     keypoints: NamedPoints | None = None
@@ -145,25 +116,17 @@ class LoadedModel:
 
 @dataclass(frozen=True, eq=False)
 class CadModel:
-    """The CAD model that an object is aligned with, read when it is asked for.
-
-    Parameters
-    ----------
-    model_id : str
-        The model's id in its data set.
-    source : ModelSource
-        Where mesh and keypoints are read from.
-    bounds : (2, 3) float, optional
-        The bounding box's lowest and highest corner, where the annotation gives it
-        [model units].
-    diameter : float, optional
-        The largest distance of two of the model's points, where the data set gives it.
-    """
+    """The CAD model that an object is aligned with, read when it is asked for."""
 
     model_id: str
+    """The model's id in its data set."""
     source: ModelSource
+    """Where mesh and keypoints are read from."""
     bounds: FloatArray | None = None
+    """(2, 3), the bounding box's lowest and highest corner, where the annotation gives it [model
+    units]."""
     diameter: float | None = None
+    """The largest distance of two of the model's points, where the data set gives it."""
 
     def load_mesh(self) -> Mesh:
         """Read the mesh.
@@ -191,25 +154,17 @@ class CadModel:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The known parts of an object's pose; anything may be missing.
-
-    Parameters
-    ----------
-    cam_from_model : Alignment, optional
-        Pose and stretch of the CAD model in the camera frame, where all of it is annotated.
-    box : Box, optional
-        The object's oriented box in the camera frame.
-    camera : Camera, optional
-        The camera that the pose was annotated with, where it is not the photo's: the pose fits the
-        photo under this camera, and its translation and focal length are conventions.
-    metres : float, optional
-        Length of one unit of the camera frame [m]; None where the size is not known.
-    """
+    """The known parts of an object's pose; anything may be missing."""
 
     cam_from_model: Alignment | None = None
+    """Pose and stretch of the CAD model in the camera frame, where all of it is annotated."""
     box: Box | None = None
+    """The object's oriented box in the camera frame."""
     camera: Camera | None = None
+    """The camera that the pose was annotated with, where it is not the photo's: the pose fits the
+    photo under this camera, and its translation and focal length are conventions."""
     metres: float | None = None
+    """Length of one unit of the camera frame [m]; None where the size is not known."""
 
     @property
     def rotation(self) -> FloatArray | None:
@@ -224,42 +179,28 @@ _no_symmetry = cache(Symmetry.none)
 
 @dataclass(frozen=True, eq=False)
 class PhotoObject:
-    """One object in a photo.
-
-    Parameters
-    ----------
-    object_id : str
-        The object's name within its photo.
-    category : str
-        The data set's name of its category.
-    truth : Truth
-        What is known of its pose.
-    keypoints : PhotoKeypoints, optional
-        Keypoints marked in the photo.
-    model : CadModel, optional
-        The CAD model annotated for it.
-    symmetry : Symmetry
-        Motions that take the model to itself.
-    mask_path : Path, optional
-        An image of the object's pixels; see `read_mask`.
-    bbox : (4,) float, optional
-        Left, top, right and bottom of its rectangle in the photo [px].
-    visible_fraction : float, optional
-        Share of its silhouette that is seen, 0 to 1.
-    flags : frozenset of str
-        Some of "truncated", "occluded", "difficult".
-    """
+    """One object in a photo."""
 
     object_id: str
+    """The object's name within its photo."""
     category: str
+    """The data set's name of its category."""
     truth: Truth = field(default_factory=Truth)
+    """What is known of its pose."""
     keypoints: PhotoKeypoints | None = None
+    """Keypoints marked in the photo."""
     model: CadModel | None = None
+    """The CAD model annotated for it."""
     symmetry: Symmetry = field(default_factory=_no_symmetry)
+    """Motions that take the model to itself."""
     mask_path: Path | None = None
+    """An image of the object's pixels; see `read_mask`."""
     bbox: FloatArray | None = None
+    """(4,), left, top, right and bottom of its rectangle in the photo [px]."""
     visible_fraction: float | None = None
+    """Share of its silhouette that is seen, 0 to 1."""
     flags: frozenset[str] = frozenset()
+    """Some of "truncated", "occluded", "difficult"."""
 
     def read_mask(self) -> BoolArray:
         """Read the object's pixels, (h, w) bool.
@@ -284,26 +225,15 @@ class ImageReader(Protocol):
 
 @dataclass(frozen=True)
 class DepthImage:
-    """A depth image file.
+    """A depth image file."""
 
-    Parameters
-    ----------
-    path : Path
-        A 16-bit PNG.
-    scale : float
-        Units of the camera frame that one step of its values is worth.
-    """
-
-    path: Path
-    scale: float
+    path: Path  # a 16-bit PNG
+    scale: float  # units of the camera frame that one step of its values is worth
 
     def read(self) -> FloatArray:
         """Read the camera's z at each pixel, (h, w) float; 0 where it was not measured.
 
-        Raises
-        ------
-        DataError
-            If the file cannot be read, or depths are not finite.
+        Raises DataError if the file cannot be read, or depths are not finite.
         """
         with open_photo(self.path) as image:
             values = np.asarray(image)
@@ -319,34 +249,24 @@ class DepthImage:
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """One photo with the objects in it.
-
-    Parameters
-    ----------
-    name : str
-        The photo's name within its data set; no other has it.
-    image : Path or ImageReader or None
-        The image, None where it is not there.
-    camera : Camera or None
-        Its camera, `Camera.without_focal` where the focal length is unknown; None where not even
-        the image's size is.
-    objects : tuple of PhotoObject
-        The objects whose annotation could be read.
-    depth : DepthImage, optional
-        The photo's depth image.
-    up : (3,) float, optional
-        The direction against gravity in the camera's frame, as a sensor or the rig tells it.
-    problems : tuple of DataError
-        Why further objects of this photo could not be read.
-    """
+    """One photo with the objects in it."""
 
     name: str
+    """The photo's name within its data set; no other has it."""
     image: Path | ImageReader | None
+    """The image, None where it is not there."""
     camera: Camera | None
+    """Its camera, `Camera.without_focal` where the focal length is unknown; None where not even the
+    image's size is."""
     objects: tuple[PhotoObject, ...]
+    """The objects whose annotation could be read."""
     depth: DepthImage | None = None
+    """The photo's depth image."""
     up: FloatArray | None = None
+    """(3,), the direction against gravity in the camera's frame, as a sensor or the rig tells
+    it."""
     problems: tuple[DataError, ...] = ()
+    """Why further objects of this photo could not be read."""
 
     @property
     def known_camera(self) -> Camera:

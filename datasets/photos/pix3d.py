@@ -33,15 +33,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import nearest_rotation
-from cadalign.io.documents import (
-    Finite,
-    ForeignDocument,
-    PathText,
-    Point2,
-    Point3,
-    Positive,
-    Text,
-)
+from cadalign.io.documents import Finite, ForeignDocument, PathText, Point2, Point3, Positive, Text
 from cadalign.io.files import write_json
 from cadalign.io.meshes.load import load_mesh
 

@@ -36,15 +36,7 @@ _Entry = TypeVar("_Entry")
 class PlacedObject:
     """An object of a photo whose camera, pose and model are known.
 
-    Parameters
-    ----------
-    photo : Photo
-    found : PhotoObject
-
-    Raises
-    ------
-    InputError
-        If the photo has no camera, or the object no pose or no model.
+    Raises InputError if the photo has no camera, or the object no pose or no model.
     """
 
     photo: Photo
@@ -169,7 +161,7 @@ class PlacedObject:
 
     def require_plain_camera(self, format: str) -> None:
         """Refuse lens distortion, for which a format has no place."""
-        if any(self.camera.distortion):
+        if self.camera.distortion:
             raise InputError(
                 f"{format} has no place for lens distortion",
                 where=self.photo.name,
@@ -228,8 +220,7 @@ def placed_objects(
 
 
 def converted(
-    numbered: Iterable[tuple[int, PlacedObject]],
-    convert: Callable[[int, PlacedObject], _Entry],
+    numbered: Iterable[tuple[int, PlacedObject]], convert: Callable[[int, PlacedObject], _Entry]
 ) -> tuple[list[_Entry], list[InputError]]:
     """Entries of the objects that a format can hold, and why the others are left out."""
     entries, problems = [], []

@@ -1,12 +1,6 @@
-"""A file of posed photos: `poses.json` names each photo's camera, model and pose.
+"""A file of posed photos: `poses.json` names each photo's camera, model and pose [mm].
 
-::
-
-    {"handal/000001.jpg": {"model": "handal/obj_000010.ply",
-                           "cam_from_model": 4 x 4 rows of numbers,
-                           "camera": {"fx", "fy", "cx", "cy", "width", "height"}}}
-
-Paths are relative to the file; models and translations are in millimetres, as in BOP.
+The file is described in docs/formats/photo_files.md.
 """
 
 from __future__ import annotations
@@ -17,14 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, parse, read_table
-from cadalign.datasets.photos.photo import (
-    CadModel,
-    ModelFiles,
-    Photo,
-    PhotoObject,
-    Truth,
-    existing,
-)
+from cadalign.datasets.photos.photo import CadModel, ModelFiles, Photo, PhotoObject, Truth, existing
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
@@ -50,7 +37,7 @@ class _Entry(ForeignDocument):
 
 
 class PosedPhotos(PhotoDataset):
-    """Photos of one object each, as ``poses.json`` lists them; see the module's documentation.
+    """Photos of one object each, as ``poses.json`` lists them; see docs/formats/photo_files.md.
 
     Parameters
     ----------

@@ -21,6 +21,8 @@ from cadalign.datasets.models.categories import name_of_synset
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     PhotoFormat,
+    PoseEstimate,
+    PoseFile,
     has,
     parse,
     read_each,
@@ -38,7 +40,6 @@ from cadalign.datasets.photos.photo import (
     first_existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
-from cadalign.datasets.photos.poses import PoseEstimate, PoseFile
 from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames, write_frame
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
@@ -338,18 +339,9 @@ def scan_entry(
 ) -> dict[str, Any]:
     """Entry of a scan with one model in Scan2CAD's annotations, in the scan's coordinates [m].
 
-    Parameters
-    ----------
-    scan_id : str
-        Such as ``scene0470_00``.
-    aligned : Alignment
-        Pose and stretch of the model in the scan.
-    model_id, category_id : str
-        The model's id and synset.
-    bounds : (2, 3) float
-        Its lowest and highest coordinates, before the stretch.
-    keypoints : mapping of str to (k, 3) float, optional
-        ``keypoints_cad`` and ``keypoints_scan``: pairs of points.
+    ``scan_id`` is such as ``scene0470_00``, ``category_id`` the model's synset, ``bounds`` (2, 3)
+    its coordinates before the stretch. ``keypoints`` are pairs of points (k, 3), ``keypoints_cad``
+    and ``keypoints_scan``.
     """
     low, high = bounds
     model = {
@@ -414,9 +406,5 @@ def _trs_of(alignment: Alignment) -> dict[str, Any]:
 
 
 FORMAT = PhotoFormat(
-    "scan2cad",
-    f"Scan2CAD: {FULL} or annot.json",
-    has(FULL, *_SAMPLES),
-    Scan2CAD,
-    write_scan2cad,
+    "scan2cad", f"Scan2CAD: {FULL} or annot.json", has(FULL, *_SAMPLES), Scan2CAD, write_scan2cad
 )

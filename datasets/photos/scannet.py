@@ -25,21 +25,12 @@ _IMAGES = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True)
 class ScanNetFrame:
-    """One frame of a ScanNet scene.
+    """One frame of a ScanNet scene."""
 
-    Parameters
-    ----------
-    frame_id : str
-        Its number, as its file writes it.
-    image_path, pose_path, intrinsics_path : Path
-        The photo, the camera's pose (4 x 4, the scan's coordinates from the camera's) and the
-        intrinsics (4 x 4) of photos of this size.
-    """
-
-    frame_id: str
+    frame_id: str  # its number, as its file writes it
     image_path: Path
-    pose_path: Path
-    intrinsics_path: Path
+    pose_path: Path  # (4, 4), the scan's coordinates from the camera's
+    intrinsics_path: Path  # (4, 4), of photos of this size
 
     def camera(self) -> Camera:
         """Read the intrinsics; integer pixels are taken for pixel centres."""
@@ -52,10 +43,8 @@ class ScanNetFrame:
     def cam_from_scan(self) -> Alignment:
         """Read the pose: the camera's coordinates from the scan's [m].
 
-        Raises
-        ------
-        DataError
-            If it is no pose, such as ScanNet's -inf of a frame whose tracking was lost.
+        Raises DataError if it is no pose, such as ScanNet's -inf of a frame whose tracking was
+        lost.
         """
         pose = read_matrix(self.pose_path, (4, 4))
         with in_file(self.pose_path):
@@ -102,10 +91,7 @@ def _beside_each_other(folder: Path, scene: str) -> Iterator[ScanNetFrame]:
 def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
     """Read a text file of a matrix, a row on each line; None for any number of rows.
 
-    Raises
-    ------
-    DataError
-        If it cannot be read, or is not a matrix of finite numbers of this shape.
+    Raises DataError if it cannot be read, or is not a matrix of finite numbers of this shape.
     """
     text = read_text(path)
     rows = [line.split() for line in text.splitlines() if line.strip()]

@@ -126,20 +126,11 @@ class Correspondences:
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """A camera and where it stands.
-
-    Parameters
-    ----------
-    camera : Camera
-    cam_from_world : Alignment
-        Its pose, with all scales 1.
-    name : str
-        The image's name; empty where the file has none.
-    """
+    """A camera and where it stands."""
 
     camera: Camera
-    cam_from_world: Alignment
-    name: str = ""
+    cam_from_world: Alignment  # its pose, with all scales 1
+    name: str = ""  # the image's name; empty where the file has none
 
     def rigid(self, where: str) -> Alignment:
         """The pose; raises InputError, which names the place, where it has a scale."""
@@ -279,26 +270,14 @@ def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment
 
 @dataclass(frozen=True)
 class CorrespondenceFormat:
-    """A format of correspondences, and the files that it is recognised by.
-
-    Parameters
-    ----------
-    name : str
-    load : callable
-        Makes the set of a folder.
-    sought : str
-        The files of this format, for messages.
-    layouts : tuple of tuples of str
-        Patterns of the files below a folder, which all belong to one of the layouts.
-    header : bytes
-        The first bytes of each file.
-    """
+    """A format of correspondences, and the files that it is recognised by."""
 
     name: str
-    load: Callable[[Path], CorrespondenceSet]
-    sought: str
+    load: Callable[[Path], CorrespondenceSet]  # makes the set of a folder
+    sought: str  # the files of this format, for messages
     layouts: tuple[tuple[str, ...], ...]
-    header: bytes = b""
+    """Patterns of the files below a folder, which all belong to one of the layouts."""
+    header: bytes = b""  # the first bytes of each file
 
     def fit(self, folder: Path) -> int:
         """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""

@@ -18,7 +18,7 @@ from cadalign.datasets.photos.bop_files import (
     write_bop_results,
     write_scene_gt,
 )
-from cadalign.datasets.photos.poses import PoseEstimate
+from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.errors import DataError, InputError
 from cadalign.export import export_object
 from cadalign.geometry.rotations import rotation_from_vector

@@ -31,6 +31,11 @@ MODELS = {
     "OPENCV": 4,
     "OPENCV_FISHEYE": 5,
     "FULL_OPENCV": 6,
+    "FOV": 7,
+    "SIMPLE_RADIAL_FISHEYE": 8,
+    "RADIAL_FISHEYE": 9,
+    "THIN_PRISM_FISHEYE": 10,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 11,
 }
 PARAMS = {
     "SIMPLE_PINHOLE": [500, 320, 240],
@@ -40,6 +45,11 @@ PARAMS = {
     "OPENCV": [500, 510, 321, 242, -0.1, 0.02, 0.001, -0.002],
     "OPENCV_FISHEYE": [500, 510, 321, 242, 0.1, 0, 0, 0],
     "FULL_OPENCV": [500, 510, 321, 242, -0.1, 0.02, 0.001, -0.002, 0.01, 0.02, 0.01, 0.003],
+    "FOV": [500, 510, 321, 242, 0.9],
+    "SIMPLE_RADIAL_FISHEYE": [500, 320, 240, -0.01],
+    "RADIAL_FISHEYE": [500, 320, 240, -0.01, 0.002],
+    "THIN_PRISM_FISHEYE": [500, 510, 321, 242, 0.1, 0.02, 0.001, -0.002, 0.01, 0.02, 0.01, 0.003],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [500, 510, 321, 242, *[0.0] * 12],
 }
 
 
@@ -237,10 +247,10 @@ def test_observing_points_that_do_not_exist_names_file_image_and_point(tmp_path,
 
 @either
 def test_unknown_camera_model_concerns_its_images_only(tmp_path, write):
-    images = Colmap(write(Model(["OPENCV_FISHEYE", "PINHOLE"]), tmp_path))
+    images = Colmap(write(Model(["RAD_TAN_THIN_PRISM_FISHEYE", "PINHOLE"]), tmp_path))
     assert len(images[1]) == 25
     with pytest.raises(
-        DataError, match=r"camera 10.*unknown model 'OPENCV_FISHEYE'.*known are SIMP"
+        DataError, match=r"camera 10.*unknown model 'RAD_TAN_THIN_PRISM_FISHEYE'.*known are SIMP"
     ):
         images[0]
 

@@ -174,7 +174,7 @@ def test_flags_are_told_from_scores(
         (
             {"frames": []},
             "{path}: top level: neither annotations nor instance_info; is it COCO's keypoint "
-            "JSON, or a detector's? see cadalign.datasets.detections.coco",
+            "JSON, or a detector's? see cadalign's page on keypoints of detectors",
         ),
         ([], "{path}: there are no keypoints"),
         ({"annotations": []}, "{path}: there are no keypoints"),
@@ -182,12 +182,12 @@ def test_flags_are_told_from_scores(
         (
             [{"bbox": [1, 2, 3, 4]}],
             "{path}: [0].keypoints: missing; is it COCO's keypoint JSON, or a detector's? "
-            "see cadalign.datasets.detections.coco",
+            "see cadalign's page on keypoints of detectors",
         ),
         (
             changed("annotations.0.keypoints", ...),
             "{path}: annotations[0].keypoints: missing; is it COCO's keypoint JSON, or a "
-            "detector's? see cadalign.datasets.detections.coco",
+            "detector's? see cadalign's page on keypoints of detectors",
         ),
         (
             changed("annotations.0.keypoints", []),

@@ -12,8 +12,7 @@ import pytest
 from fuzz.mutations import mutate
 from scipy.io import loadmat, savemat
 
-from cadalign.datasets.photos.mat_files import read_structs
-from cadalign.datasets.photos.mat_format import read_variables
+from cadalign.datasets.photos.mat_files import read_structs, read_variables
 from cadalign.errors import DataError, InputError
 
 RECORD = {

@@ -18,8 +18,8 @@ from cadalign.cli import main
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.api import run, simulate
 from cadalign.evaluation.experiments.simulation import SweepOptions, sweep_benchmark
-from cadalign.evaluation.runs.cluster import DaskWorkers
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.parallel import DaskWorkers
 from cadalign.evaluation.runs.run import Progress
 
 distributed = pytest.importorskip(

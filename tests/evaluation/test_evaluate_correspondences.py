@@ -31,7 +31,7 @@ from cadalign.evaluation.instances.correspondences import (
     errors_of,
     spoil,
 )
-from cadalign.evaluation.methods.fitted import fit_methods, fit_options
+from cadalign.evaluation.methods.method import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
@@ -316,18 +316,18 @@ class TestRows:
         pose = Alignment(turn, [0, 0.5, 10], [1, 1.005, 1.99])
         est = made(pose, np.array([True, False, True, True]))
         inlier_columns = ("inliers", "inlier_precision", "inlier_recall")
-        row = errors_of(est, truth, method=fit_methods()["ransac-optimal"])
+        row = errors_of(est, truth, is_robust=True)
         assert row["rotation_error_deg"] == pytest.approx(0.4)
         assert row["translation_error"] == pytest.approx(0.05)
         assert (row["scale_y_error"], row["scale_z_error"]) == pytest.approx((0.005, 0.005))
         assert row["success"]
         assert [row[name] for name in inlier_columns] == [3, 2 / 3, 2 / 3]
         every = made(pose, np.ones(4, dtype=bool))
-        row = errors_of(every, truth, method=fit_methods()["ransac-optimal"])
+        row = errors_of(every, truth, is_robust=True)
         assert [row[name] for name in inlier_columns] == [4, 3 / 4, 1]
         for scale in ([1, 1.02, 2.0], [1, 1.0, 1.97]):
             off = made(Alignment(turn, [0, 0, 10], scale), np.ones(4, dtype=bool))
-            assert not errors_of(off, truth, method=fit_methods()["epnp"])["success"]
+            assert not errors_of(off, truth)["success"]
 
     def test_options_of_the_search_reach_it(self):
         problem = spoil(seen_image("a", 3), 0.3, rng=np.random.default_rng(0))

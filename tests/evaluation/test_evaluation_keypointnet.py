@@ -171,7 +171,7 @@ def test_overlays_are_drawn_and_no_half_files_left(sample_root: Path, tmp_path: 
     assert main([*arguments, "--categories", "chair", "car"]) == 0
     models = KeypointNet(sample_root).subset(categories=["chair", "car"])
     wanted = {record_stem(*key) for key in models.ids()}
-    endings = {"overlays": ".png", "thumbs": ".webp", "pictures": ".webp", "sketches": ".json"}
+    endings = {"overlays": ".png", "thumbs": ".webp", "pictures": ".webp", "previews": ".json"}
     for folder, ending in endings.items():
         files = {path.name for path in (out / folder).iterdir()}
         assert files == {f"{name}{ending}" for name in wanted}

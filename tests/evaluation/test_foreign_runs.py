@@ -284,14 +284,14 @@ def test_records_that_are_no_objects_are_refused(
 ) -> None:
     run = tmp_path / "run"
     _keypointnet(sample_root, run)
-    table = pq.read_table(run / "exhibits.parquet")
+    table = pq.read_table(run / "records.parquet")
     cells = pa.array([record] * len(table), pa.string())
     index = table.column_names.index("exhibit")
-    pq.write_table(table.set_column(index, "exhibit", cells), run / "exhibits.parquet")
+    pq.write_table(table.set_column(index, "exhibit", cells), run / "records.parquet")
     line = refusal_line(capsys, "report", run, *assets)
     assert "is not an object of JSON; remove it: the run is shown without it" in line
     assert len(line) < 600
-    (run / "exhibits.parquet").unlink()
+    (run / "records.parquet").unlink()
     assert main(["report", str(run), *assets]) == 0
 
 

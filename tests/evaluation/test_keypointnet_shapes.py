@@ -86,7 +86,7 @@ def test_other_methods_are_as_without_shapes(
 def test_records_hold_the_estimated_box(root: Path, shapes: Path, tmp_path: Path) -> None:
     found = run(root, tmp_path / "run", shapes / "chair.shape", categories=["chair"])
     chosen = found[found.method == "shape"].set_index("model_id")
-    for row in read_table(tmp_path / "run" / "exhibits.parquet").to_pylist():
+    for row in read_table(tmp_path / "run" / "records.parquet").to_pylist():
         record = json.loads(row["exhibit"])
         estimate = record["estimates"][-1]
         assert estimate["method"] == "shape"

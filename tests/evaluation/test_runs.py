@@ -389,7 +389,7 @@ def test_a_real_run_killed_ten_times_ends_with_the_same_bytes(tmp_path: Path) ->
         kills += 1
     assert subprocess.run(command(tmp_path, killed, workers=2), check=False).returncode == 0
     assert kills == 10
-    for name in ("results.parquet", "exhibits.parquet", "summary.csv", "run.json"):
+    for name in ("results.parquet", "records.parquet", "summary.csv", "run.json"):
         assert (killed / name).read_bytes() == (calm / name).read_bytes(), name
     pictures = sorted(path.name for path in (calm / "figures").iterdir())
     assert pictures

@@ -1,20 +1,11 @@
-"""The experiment on real correspondences: images with a share of their points moved.
-
-Cells of a summary: ``inputs``, the number that the method was given; ``failed``, of those for which
-it found nothing; ``unreadable``, of inputs that there would be besides if all images could be read;
-``success``, the share with a rotation error of less than 0.5 degrees and at most 1 % on either
-scale, NaN where there are none; quartiles of the errors over all inputs, a failure counting as an
-error beyond all others, the translation error over the distance from the camera to the mean of the
-points; ``inlier_precision`` and ``inlier_recall``, medians over what it found, NaN for methods that
-do not search for inliers; ``milliseconds``, quartiles of the time of one call, failed ones too.
-"""
+"""The experiment on real correspondences: images with a share of their points moved."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -28,6 +19,7 @@ from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     Conclusion,
@@ -45,7 +37,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Cells, Run
     from cadalign.evaluation.runs.tables import Columns
-    from cadalign.evaluation.runs.work import Plan
 
 
 @dataclass(frozen=True)
@@ -116,12 +107,6 @@ class CorrespondenceOptions(FunctionOptions):
             max_reproj_error=self.max_reproj_error, max_iterations=self.max_iterations, seed=seed
         )
 
-    def as_config(self) -> dict[str, Any]:
-        """The options in a run's configuration, where the reader stands for the format."""
-        config = super().as_config()
-        del config["format"]
-        return config
-
 
 NAMES: Columns = (("image", str), ("draw", int), ("outliers", float), ("method", str))
 COLUMNS: Columns = (
@@ -131,7 +116,7 @@ COLUMNS: Columns = (
     *(("scale_y_error", float), ("scale_z_error", float), ("success", bool)),
     *(("inlier_precision", float), ("inlier_recall", float)),
 )
-"""Columns of the result table; see `cadalign.evaluation.instances.correspondences`."""
+"""Columns of the result table; see docs/formats/runs.md."""
 ERRORS = (metrics.ROTATION, metrics.TRANSLATION_OF_DISTANCE, metrics.SCALE_Y, metrics.SCALE_Z)
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.SUCCESS, *ERRORS),
@@ -145,9 +130,7 @@ def summarize(run: Run) -> list[Summary]:
     cells = run.cells
     return [
         with_medians(
-            _summarize(share, method, cells),
-            where(cells, cells["outliers"] == share),
-            run.metrics,
+            _summarize(share, method, cells), where(cells, cells["outliers"] == share), run.metrics
         )
         for share in np.unique(cells["outliers"]).tolist()
         for method in run.methods

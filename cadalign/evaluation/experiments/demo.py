@@ -8,11 +8,11 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError
 from cadalign.evaluation.experiments.keypointnet import ON_INSTANCES, TABLE, KeypointNetOptions
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import NoiseOption
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, csv_text
 from cadalign.io.files import write_text
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.runs.work import Plan
 
 METHOD = "optimal"
 _LEAST_SAMPLE = 12  # models of each category of a sample dataset
@@ -68,10 +67,9 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
 
     Another demonstration in the folder is replaced, one that was interrupted goes on.
     """
-    from cadalign.datasets import write_sample_dataset
+    from cadalign.datasets import KeypointNet, write_sample_dataset
     from cadalign.evaluation.instances.instance import AUTO, KeypointTask
     from cadalign.evaluation.instances.views import keypointnet_benchmark
-    from cadalign.evaluation.runs.work import Plan
 
     root = options.root
     if root is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -21,6 +20,7 @@ from cadalign.evaluation.experiments.photos import (
 )
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.runs.work import Plan, fingerprint
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import Conclusion, Summary
 from cadalign.io.files import read_bytes
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.runs.work import Plan
 
 logger = logging.getLogger("cadalign")
 
@@ -73,10 +72,7 @@ class EstimatesOptions(ExperimentOptions):
 def method_names(paths: Sequence[Path]) -> tuple[str, ...]:
     """A name for each file: its own without the ending, with its folder's where that is needed.
 
-    Raises
-    ------
-    InputError
-        If a file is given twice.
+    Raises InputError if a file is given twice.
     """
     twice = next((each for row, each in enumerate(paths) if each in paths[:row]), None)
     if twice is not None:
@@ -111,15 +107,11 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
         chunk=_CHUNK,
         kind=dataset.kind,
         methods=list(methods),
-        contents=[_fingerprint(path) for path in options.estimates],
+        contents=[fingerprint(read_bytes(path)) for path in options.estimates],
         unread=unread,
         strays=strays,
         annotations=tasks.fingerprint(),
     )
-
-
-def _fingerprint(path: Path) -> str:
-    return hashlib.sha256(read_bytes(path)).hexdigest()[:16]
 
 
 def _describe(run: Run) -> str:

@@ -1,15 +1,10 @@
-"""The experiment on evidence beyond keypoints.
-
-Cells of a summary: ``instances`` and ``failed``; over those that did not fail the mean number of
-``keypoints``, the medians of the result table's errors, ``over_limit``, the median ratio of the
-rotation error to its bound, and ``milliseconds``, the median time of an alignment. NaN where there
-is none.
-"""
+"""The experiment on evidence beyond keypoints."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -18,7 +13,8 @@ from cadalign.datasets import KeypointNet
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, SceneOptions
-from cadalign.evaluation.plots import Plot, cumulative_curves
+from cadalign.evaluation.plots import cumulative_curves
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ConsoleTable,
@@ -34,7 +30,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
     from cadalign.evaluation.runs.tables import Columns
-    from cadalign.evaluation.runs.work import Plan
 
 KEYPOINTS = "keypoints"
 MASK, DEPTH, GRAVITY, LENGTH = "mask", "depth", "gravity", "length"
@@ -95,7 +90,7 @@ COLUMNS: Columns = (
     *((name, float) for name in (*_ERRORS, "box_iou", *BOUNDS, "over_limit")),
     ("warnings", int),
 )
-"""Columns of the result table; see `cadalign.evaluation.instances.evidence`."""
+"""Columns of the result table; see docs/formats/runs.md."""
 ROTATION_BOUND = replace(
     metrics.ROTATION,
     key="rotation_bound_deg",
@@ -148,10 +143,8 @@ _CURVES = (
     (replace(metrics.BOX_IOU, log=False), np.arange(0, 1.01, 0.05)),
 )
 
-
-def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Shares of objects within an error, by evidence."""
-    return cumulative_curves(runs, _CURVES, of="by evidence")
+plots = partial(cumulative_curves, curves=_CURVES, of="by evidence")
+"""Shares of objects within an error, as `Spec.plots`."""
 
 
 _CHUNK = 2

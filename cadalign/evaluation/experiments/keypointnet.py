@@ -1,12 +1,4 @@
-"""The KeypointNet experiment: methods on views of annotated models.
-
-Cells of a summary: ``instances``, the number without skipped ones, ``failed`` and ``skipped``;
-``keypoints``, the mean number of the instances that did not fail; medians of the result table's
-errors over these, NaN where all failed, and the errors up to scale in runs that have them;
-``success_5deg_5pct`` and ``success_10deg_10pct``, the share of all instances, failed ones too, with
-symmetry-aware rotation error, translation error in diagonals of the model and both relative scale
-errors at most this; ``over_limit``, the median rotation error over the Cramer-Rao bound's.
-"""
+"""The KeypointNet experiment: methods on views of annotated models."""
 
 from __future__ import annotations
 
@@ -26,6 +18,7 @@ from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE, Met
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Reference, Spec
 from cadalign.evaluation.summary import (
     ALL,
@@ -43,7 +36,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Cells, Run
     from cadalign.evaluation.runs.tables import Columns
-    from cadalign.evaluation.runs.work import Plan
 
 
 @dataclass(frozen=True)
@@ -84,13 +76,6 @@ class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
         self.check_least(min_visible=1, views_per_model=1)
         self.check_known(visibility=("auto", "rays", "hull"), render=("none", "overlay"))
 
-    def as_config(self) -> dict[str, Any]:
-        """The options in a run's configuration: ``shape`` only where it is given."""
-        config = super().as_config()
-        if config["shape"] is None:
-            del config["shape"]
-        return config
-
 
 POSE_ERRORS = ("rotation_error_deg", "translation_error", "box_iou")
 """Errors that the symmetries of a model bear on."""
@@ -103,7 +88,7 @@ COLUMNS: Columns = (
     *((f"sym_{name}", float) for name in POSE_ERRORS),
     ("translation_error_up_to_scale", float),
 )
-"""Columns of every run; see `cadalign.evaluation.instances.views`."""
+"""Columns of every run; see docs/formats/runs.md."""
 TABLE = (
     *(metrics.KEYPOINTS, metrics.ROTATION, metrics.TRANSLATION),
     *(metrics.SCALE_Y, metrics.SCALE_Z, metrics.BOX_IOU),
@@ -325,11 +310,7 @@ def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
         return Reference((), "")
     keys = (*(metric.key for metric in TABLE[1:5]), metrics.KEYPOINTS.key)
     stated = tuple(
-        Summary(
-            name,
-            {"category": name, "method": STATED},
-            dict(zip(keys, row, strict=True)),
-        )
+        Summary(name, {"category": name, "method": STATED}, dict(zip(keys, row, strict=True)))
         for name, row in PAPER_TABLE.items()
         if name in groups
     )

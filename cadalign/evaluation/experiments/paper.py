@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from cadalign.datasets import write_sample_dataset
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.keypointnet import (
     PAPER_TABLE,
@@ -121,8 +122,6 @@ def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
 
 def _table_section(plan: PaperPlan, announce: Announce) -> str:
     """Evaluate on the sample dataset, and on the dataset that is given; write Table 1."""
-    from cadalign.datasets import write_sample_dataset
-
     sample = write_sample_dataset(plan.out / "sample_dataset", per_category=12)
     roots = {"sample": (sample, 2 if plan.quick else 40)}
     if plan.root is not None:

@@ -1,23 +1,11 @@
-"""The experiment on data sets of photos.
-
-Cells of a summary: ``instances``, those with rows that are not left out, ``failed`` and
-``left_out``; ``keypoints``, the mean number of those that did not fail; over these the medians of
-the result table's errors, ``yaw_error_deg_90``, the 90th percentile, and ``milliseconds``, the
-median time of an estimate. Shares of all instances, failures included: ``accuracy_pi_6``, rotation
-errors below 30 degrees; ``iou_25``, ``iou_50``, ``iou_75``, boxes with a larger IoU;
-``deg_5_cm_5`` and the like; ``scan2cad_aligned``; ``mssd_recall``, ``mspd_recall`` and
-``vsd_recall``, and their mean ``average_recall``. NaN where there is none, as for objects whose
-truth is not known.
-
-The categories of objects with simulated keypoints are marked so. Behind all categories comes
-``mean of categories``, as Scan2CAD and PASCAL3D+ report.
-"""
+"""The experiment on data sets of photos."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import tyro
 
+from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods.registry import is_registered
@@ -50,7 +39,8 @@ from cadalign.evaluation.photos.protocols import (
     is_own,
     protocol_of,
 )
-from cadalign.evaluation.plots import Plot, cumulative_curves
+from cadalign.evaluation.plots import cumulative_curves
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ALL,
@@ -64,18 +54,16 @@ from cadalign.evaluation.summary import (
 )
 
 if TYPE_CHECKING:
-    from cadalign.datasets.photos.dataset import PhotoDataset
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Cells, Run
     from cadalign.evaluation.runs.tables import Columns
-    from cadalign.evaluation.runs.work import Plan
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
     *(("rms_px", float), *score_columns(SETS)),
 )
-"""Columns of the result table; see `cadalign.evaluation.photos.objects`."""
+"""Columns of the result table; see docs/formats/runs.md."""
 
 
 @dataclass(frozen=True)
@@ -124,11 +112,7 @@ class PhotosOptions(FunctionOptions, KeypointOptions):
 
 
 MEAN = "mean of categories"
-GALLERY = (
-    *(metric for each in SETS for metric in each.medians),
-    metrics.RMS,
-    *BOP.shares,
-)
+GALLERY = (*(metric for each in SETS for metric in each.medians), metrics.RMS, *BOP.shares)
 """Errors of single objects."""
 # The data sets' own first.
 _OWN_FIRST = (SCAN2CAD, KITTI, BOP, VIEWPOINT, NINE_DOF)
@@ -228,10 +212,8 @@ _CURVES = (
     (replace(IOU_3D, log=False), np.arange(0, 1.01, 0.05)),
 )
 
-
-def plots(runs: Sequence[Run]) -> list[Plot]:
-    """Shares of objects within an error, for the errors that the data sets have."""
-    return cumulative_curves(runs, _CURVES, of="on photos")
+plots = partial(cumulative_curves, curves=_CURVES, of="on photos")
+"""Shares of objects within an error, as `Spec.plots`."""
 
 
 _CHUNK, _LARGE_CHUNK = 4, 32

@@ -1,16 +1,4 @@
-"""The retrieval experiment: views of a library's models, to be found again in it.
-
-Cells of a summary: ``queries``, the number made, without models of which no view shows enough
-keypoints; ``failed``, those without a match; ``rank_1`` and ``rank_5``, the share of the queries
-with the true model, or one that counts as it, first or among the first 5; ``reciprocal_rank``, the
-mean of one over the rank, 0 beyond 50 (these three are NaN in the leave-out protocol); ``score``,
-the mean probability of the best match, which is the rank-1 rate where it is calibrated; ``none``,
-the share of the queries whose object is more likely none of the models than one, which is false
-in the leave-in protocol and true in the other (NaN in runs without it); of the best match
-the medians ``shape_distance``, ``box_iou``, ``box_iou_up_to_scale`` (NaN in runs that have none),
-``rotation_error_deg`` and the mean ``mean_box_iou``; ``milliseconds``, the median time of a query
-on one core.
-"""
+"""The retrieval experiment: views of a library's models, to be found again in it."""
 
 from __future__ import annotations
 
@@ -30,6 +18,7 @@ from cadalign.evaluation.metrics.table import QUERIES, Metric
 from cadalign.evaluation.options import ModelOptions
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import Plot, Trace
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of
 
@@ -38,7 +27,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Cells, Run
     from cadalign.evaluation.runs.tables import Columns
-    from cadalign.evaluation.runs.work import Plan
     from cadalign.retrieval.library import Library
 
 NO_VIEW = "no view"

@@ -1,11 +1,8 @@
 """The AEPnP paper's simulation: errors of methods while one quantity is varied.
 
 640 x 480 px, f = 150 px, points in [-1, 1)^3, true scales in [0.5, 2]; see
-`cadalign.evaluation.simulation.problems.simulate_problem`.
-
-A summary is of one metric, over the problems that a method solved at one value. Its cells: ``runs``
-and ``failed``, the number of problems and of those that the method did not solve, and
-``lower_quartile``, ``median`` and ``upper_quartile``, NaN where it solved none.
+`cadalign.evaluation.simulation.problems.simulate_problem`. A summary is of one metric, over the
+problems that a method solved at one value.
 """
 
 from __future__ import annotations
@@ -18,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import tyro
 
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, unknown
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics import table as metrics
@@ -27,6 +24,7 @@ from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
     from cadalign.evaluation.runs.tables import Columns, Row
-    from cadalign.evaluation.runs.work import Plan
 
 
 @dataclass(frozen=True)
@@ -72,10 +69,7 @@ _NOISE = SweepKind(
     runs=2000,
 )
 _POINTS = replace(
-    _NOISE,
-    name="points",
-    column="points",
-    values=(6, 7, 8, 10, 15, 20, 50, 100, 200, 500, 1024),
+    _NOISE, name="points", column="points", values=(6, 7, 8, 10, 15, 20, 50, 100, 200, 500, 1024)
 )
 _OUTLIERS = replace(
     _NOISE,
@@ -121,8 +115,7 @@ class SweepOptions(FunctionOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.sweep not in SWEEPS:
-            fix = f"known are {', '.join(SWEEPS)}"
-            raise InputError(f"unknown sweep {self.sweep!r}", where="sweep", fix=fix)
+            raise unknown("sweep", self.sweep, SWEEPS)
         if self.methods is not None:
             self.check_methods()
         if self.values is not None:
@@ -394,8 +387,6 @@ _CHUNK, _CHUNK_TIMED = 64, 20
 
 def plan(options: SweepOptions, folder: RunFolder) -> Plan[SweepTask]:
     """Plan a sweep."""
-    from cadalign.evaluation.runs.work import Plan
-
     kind = options.kind
     benchmark = sweep_benchmark(kind, options.seed, options.metrics)
     config = {"experiment": options.experiment, "seed": options.seed, "sweep": asdict(kind)}

@@ -1,12 +1,4 @@
-"""The experiment on unseen objects, which are no stretched copy of any model.
-
-Cells of a summary: ``instances`` and ``failed``; ``keypoints``, the mean number of those that did
-not fail; over these the medians of the result table's errors, ``rotation_error_deg_90``, the 90th
-percentile, and ``milliseconds``, the median time of an estimate; ``rotation_in_68``,
-``rotation_in_95``, ``stretch_in_68``, ``stretch_in_95``, ``keypoints_within_68`` and
-``keypoints_within_95``, the share of the truths that lie within the regions of these probabilities.
-NaN where there is none.
-"""
+"""The experiment on unseen objects, which are no stretched copy of any model."""
 
 from __future__ import annotations
 
@@ -23,6 +15,7 @@ from cadalign.evaluation.methods.method import LIMIT, SHAPE
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
+from cadalign.evaluation.runs.work import Plan
 from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ConsoleTable,
@@ -40,7 +33,6 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Cells, Run
     from cadalign.evaluation.runs.tables import Columns
-    from cadalign.evaluation.runs.work import Plan
 
 METHODS = (
     *("random-rigid", "random-stretched", "nearest", "mean-rigid", "mean-stretched"),
@@ -103,7 +95,7 @@ COLUMNS: Columns = (
     *(("rotation_level", float), ("stretch_level", float)),
     *(("keypoints_within_68", float), ("keypoints_within_95", float)),
 )
-"""Columns of the result table; see `cadalign.evaluation.instances.unseen`."""
+"""Columns of the result table; see docs/formats/runs.md."""
 _MEDIANS = (
     *(metrics.ROTATION, metrics.BEST_ROTATION),
     *(metrics.TRANSLATION, metrics.TRANSLATION_UP_TO_SCALE),
@@ -175,7 +167,7 @@ _CALIBRATED = (("rotation_level", "rotation"), ("stretch_level", "stretch"))
 
 def plots(runs: Sequence[Run]) -> list[Plot]:
     """Shares of objects within an error, and of truths within stated regions, by method."""
-    curves = cumulative_curves(runs, _CURVES, of="of unseen objects")
+    curves = cumulative_curves(runs, curves=_CURVES, of="of unseen objects")
     return [*curves, *(_calibration(runs, column, name) for column, name in _CALIBRATED)]
 
 

@@ -1,36 +1,16 @@
 """Errors of methods on real images with known poses, stretched scenes and outliers.
 
 As in the AEPnP paper, the scene is stretched by scales that are drawn anew for every draw, and a
-share of the image points is moved to anywhere in the image. All methods get the same input.
-
-Columns of the result table, one row per input and method: what names the row (``image``, ``draw``,
-``outliers``, the share of the image points that were moved, and ``method``), ``status`` and
-``reason``, and then
-
-points
-    Number of points that the method was given; empty where the image could not be read.
-inliers
-    Number of points that it kept; empty for methods that do not search for inliers.
-rotation_error_deg
-    [degrees]
-translation_error
-    Relative to the distance from the camera to the mean of the image's points, a fraction.
-scale_y_error, scale_z_error
-    Relative errors, fractions.
-success
-    True if the rotation error is less than 0.5 degrees and neither scale is off by more than 1 %.
-inlier_precision
-    Share of the points that it kept that were not moved.
-inlier_recall
-    Share of the points that were not moved that it kept.
+share of the image points is moved to anywhere in the image. All methods get the same input. The
+result columns are those of docs/formats/runs.md, as in all settings.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -40,14 +20,11 @@ from cadalign.errors import DataError
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting, Tasks
-from cadalign.evaluation.experiments.correspondences import (
-    COLUMNS,
-    NAMES,
-    CorrespondenceOptions,
-)
+from cadalign.evaluation.experiments.correspondences import COLUMNS, NAMES, CorrespondenceOptions
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import fingerprint
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -111,18 +88,17 @@ class CorrespondenceTasks(Tasks[CorrespondenceTask]):
 
     def fingerprint(self) -> str:
         """Hash of all that is read: a run must not go on with other data."""
-        digest = hashlib.sha256()
+        parts: list[Any] = []
         for name in self._ids:
-            digest.update(f"{name}\0".encode())
+            parts.append(f"{name}\0")
             if name in self._problems:
-                digest.update(str(self._problems[name]).encode())
+                parts.append(str(self._problems[name]))
                 continue
             seen = self._read(name)
             pose = seen.cam_from_world
-            for values in (seen.points_3d, seen.points_2d, pose.rotation, pose.translation):
-                digest.update(np.ascontiguousarray(values).tobytes())
-            digest.update(repr(seen.camera).encode())
-        return digest.hexdigest()[:16]
+            parts += [seen.points_3d, seen.points_2d, pose.rotation, pose.translation]
+            parts.append(repr(seen.camera))
+        return fingerprint(*parts)
 
 
 SUCCESS_DEG = 0.5
@@ -180,7 +156,7 @@ class SpoiledImages(Setting):
         return MethodInput(*given, 1.0, ransac=image.ransac, gt=truth.alignment)
 
     def row(self, method: Method, image: SpoiledImage, estimate: Alignment | Result) -> Row:
-        return errors_of(estimate, image.truth, method=method)
+        return errors_of(estimate, image.truth, is_robust=method.is_robust)
 
 
 def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:
@@ -188,8 +164,8 @@ def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:
     return Benchmark.chosen(SpoiledImages(options), options.methods, metrics=options.metrics)
 
 
-def errors_of(found: Alignment | Result, truth: Problem, *, method: Method) -> Row:
-    """Errors of an estimate by column."""
+def errors_of(found: Alignment | Result, truth: Problem, *, is_robust: bool = False) -> Row:
+    """Errors of an estimate by column; of its inliers where they were searched for."""
     est = found if isinstance(found, Alignment) else found.alignment
     distance = np.linalg.norm(truth.alignment.apply(truth.points_3d).mean(axis=0))
     errors = alignment_errors(est=est, gt=truth.alignment, length=float(distance))
@@ -199,7 +175,7 @@ def errors_of(found: Alignment | Result, truth: Problem, *, method: Method) -> R
         **errors,
         "success": errors["rotation_error_deg"] < SUCCESS_DEG and scales <= SUCCESS_SCALE,
     }
-    if not method.is_robust or isinstance(found, Alignment):
+    if not is_robust or isinstance(found, Alignment):
         return row
     inliers = np.ones(len(truth.points_3d), bool) if truth.outliers is None else ~truth.outliers
     kept, kept_inliers = int(found.inliers.sum()), int((found.inliers & inliers).sum())
@@ -239,7 +215,7 @@ def _pixels_anywhere(camera: Camera, count: int, rng: np.random.Generator) -> Fl
     size = np.array([camera.width, camera.height])
     pixels = rng.uniform(-0.5, size - 0.5, (count, 2))
     for _ in range(_REDRAWS):
-        _, valid = camera.normalize_where_valid(pixels)
+        _, valid = camera.rays_where_valid(pixels)
         if valid.all():
             return pixels
         pixels[~valid] = rng.uniform(-0.5, size - 0.5, (int((~valid).sum()), 2))

@@ -1,28 +1,4 @@
-"""Keypoints with further evidence: methods, errors and their bounds.
-
-Columns of the result table, one row per view and method: what names the row (``category``,
-``model_id``, ``view``, ``method``), ``status`` and ``reason``, and then
-
-keypoints
-    Number of keypoints that were given, those of all views.
-rotation_error_deg
-    [degrees]
-translation_error
-    [diagonals of the object's bounding box]
-scale_y_error, scale_z_error
-    Relative errors, fractions.
-box_iou
-    Overlap of the object's true and estimated box; empty for a model without volume.
-rotation_bound_deg, translation_bound, scale_y_bound, scale_z_bound
-    Medians of the same errors of an ideal estimator, whose covariance is the instance's Cramer-Rao
-    bound.
-over_limit
-    The rotation error over its bound: 1 in the median for an ideal estimator.
-warnings
-    Number of warnings.
-
-The metrics of failed rows are empty.
-"""
+"""Keypoints with further evidence: methods, errors and their bounds."""
 
 from __future__ import annotations
 
@@ -55,11 +31,7 @@ from cadalign.evaluation.experiments.evidence import (
     VIEWS_KNOWN,
     EvidenceRunOptions,
 )
-from cadalign.evaluation.instances.instance import (
-    KEYPOINT_CAMERA,
-    KeypointTask,
-    example_view,
-)
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask, example_view
 from cadalign.evaluation.instances.scene import ObjectScene, Shot, make_scene, truth_in
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
@@ -246,7 +218,4 @@ def _errors(est: Alignment, scene: ObjectScene) -> Row:
     gt = scene.gt
     bounds = np.asarray(scene.model.bounds)
     boxes = {"est": Box.from_model(bounds, est), "gt": Box.from_model(bounds, gt)}
-    return {
-        **alignment_errors(est=est, gt=gt, length=scene.diagonal),
-        "box_iou": overlap(**boxes),
-    }
+    return {**alignment_errors(est=est, gt=gt, length=scene.diagonal), "box_iou": overlap(**boxes)}

@@ -79,10 +79,7 @@ def sample_hull_view(
 
     The camera has no lens distortion.
 
-    Raises
-    ------
-    TooFewVisibleError
-        If no view shows enough of the keypoints.
+    Raises TooFewVisibleError if no view shows enough of the keypoints.
     """
     (found,) = sample_hull_views([hull], camera, rngs=[rng], min_visible=min_visible)
     if isinstance(found, TooFewVisibleError):

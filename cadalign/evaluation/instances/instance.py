@@ -7,7 +7,7 @@ same place: that is no error. `cadalign.datasets.models.annotated_symmetry` find
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -44,21 +44,12 @@ HULL = "hull"
 
 @dataclass(frozen=True, eq=False)
 class InstanceSymmetry:
-    """Rotations about one point that map an object onto itself.
+    """Rotations about one point that map an object onto itself."""
 
-    Parameters
-    ----------
-    center : (3,) float
-        The point [model units].
-    rotations : (g, 3, 3) float
-        Single rotations; the first is the identity.
-    axis : (3,) float, optional
-        Any rotation about this axis, of length 1, through the point is a symmetry as well.
-    """
-
-    center: FloatArray
-    rotations: FloatArray
+    center: FloatArray  # (3,), the point [model units]
+    rotations: FloatArray  # (g, 3, 3), single rotations; the first is the identity
     axis: FloatArray | None = None
+    """(3,), any rotation about this axis, of length 1, through the point is a symmetry as well."""
 
     @property
     def is_trivial(self) -> bool:
@@ -113,30 +104,23 @@ def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> InstanceSymmetry:
 
 
 NO_SYMMETRY = InstanceSymmetry(np.zeros(3), np.eye(3)[None])
+NO_KEYPOINTS = KeypointHull(np.empty((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointTask:
-    """One view of one model.
-
-    Parameters
-    ----------
-    hull : KeypointHull
-        Keypoints (k, 3), and what views without a mesh need to know of them.
-    model : AnnotatedModel, optional
-        The model with its mesh; None where it is evaluated on its keypoints alone.
-    problem : str
-        Reason why the model cannot be evaluated; empty otherwise.
-    """
+    """One view of one model."""
 
     category: str
     model_id: str
-    view: int
-    hull: KeypointHull
-    semantic_ids: IntArray
-    symmetry: InstanceSymmetry
-    model: AnnotatedModel | None
-    problem: str = ""
+    view: int = 0
+    hull: KeypointHull = NO_KEYPOINTS
+    """Keypoints (k, 3), and what views without a mesh need to know of them."""
+    semantic_ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    symmetry: InstanceSymmetry = NO_SYMMETRY
+    model: AnnotatedModel | None = None
+    """The model with its mesh; None where it is evaluated on its keypoints alone."""
+    problem: str = ""  # reason why the model cannot be evaluated; empty otherwise
 
     @property
     def names(self) -> Row:
@@ -151,20 +135,10 @@ class KeypointTask:
         try:
             model = dataset[category, model_id]
         except CadalignError as error:
-            return cls(
-                category=category,
-                model_id=model_id,
-                view=0,
-                hull=KeypointHull(np.empty((0, 3))),
-                semantic_ids=np.empty(0, dtype=np.int64),
-                symmetry=NO_SYMMETRY,
-                model=None,
-                problem=str(error),
-            )
+            return cls(category, model_id, problem=str(error))
         return cls(
-            category=category,
-            model_id=model_id,
-            view=0,
+            category,
+            model_id,
             hull=KeypointHull(model.keypoints.xyz),
             semantic_ids=model.keypoints.semantic_ids,
             symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
@@ -184,38 +158,22 @@ class Instance:
 
     The image shows the model as it is. The method gets the same model stretched along y and z by
     factors it does not know, so the true scale is one over them.
-
-    Parameters
-    ----------
-    cam_from_model : Alignment
-        The pose of the model as the image shows it.
-    points_3d : (n, 3) float
-        The visible keypoints of the stretched model.
-    points_2d : (n, 2) float
-        Their noisy observations [px].
-    bounds : (2, 3) float
-        Lowest and highest coordinates of the stretched model; of its keypoints without a mesh.
-    gt : Alignment
-        The truth: pose, and the scale that undoes the stretch.
-    visibility : {"rays", "hull"}
-        Rule by which keypoints count as seen.
-    scene : Scene, optional
-        The model as the image shows it; None without a mesh.
-    diagonal : float
-        Of the bounding box of the model as the image shows it [model units]. Without a mesh it is
-        taken as 1, to which KeypointNet's models are normalised.
     """
 
     camera: Camera
-    cam_from_model: Alignment
-    points_3d: FloatArray
-    points_2d: FloatArray
+    cam_from_model: Alignment  # the pose of the model as the image shows it
+    points_3d: FloatArray  # (n, 3), the visible keypoints of the stretched model
+    points_2d: FloatArray  # (n, 2), their noisy observations [px]
     semantic_ids: IntArray
     bounds: FloatArray
-    gt: Alignment
-    visibility: str
-    scene: Scene | None
+    """(2, 3), lowest and highest coordinates of the stretched model; of its keypoints without a
+    mesh."""
+    gt: Alignment  # the truth: pose, and the scale that undoes the stretch
+    visibility: str  # rays or hull, rule by which keypoints count as seen
+    scene: Scene | None  # the model as the image shows it; None without a mesh
     diagonal: float
+    """Diagonal of the bounding box of the model as the image shows it [model units]; without a mesh
+    1, to which KeypointNet's models are normalised."""
 
     @cached_property
     def gt_box(self) -> Box:

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import RenderError
@@ -45,7 +46,7 @@ def draw_instance(
     """Render an instance; write its pictures and its mesh preview to a run's folder.
 
     ``overlays`` gets it with the boxes of truth and estimate and its keypoints, ``thumbs`` a small
-    one with the boxes, ``pictures`` it as it is, ``sketches`` the preview of its model's mesh. Each
+    one with the boxes, ``pictures`` it as it is, ``previews`` the preview of its model's mesh. Each
     file appears whole or not at all.
     """
     stem = record_stem(category, model_id, view)
@@ -85,8 +86,6 @@ def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage,
 
 def write_webp(path: Path, image: ByteImage, *, quality: int = _QUALITY) -> None:
     """Write a picture for a page, whole or not at all."""
-    from PIL import Image
-
     picture = Image.fromarray(image)
     write_whole(path, lambda unfinished: picture.save(unfinished, quality=quality, method=_EFFORT))
 

@@ -2,35 +2,9 @@
 
 Every model of the library is stretched by factors from 0.5 to 2 along y and z, seen from a random
 view, and some of its visible keypoints are handed over with noise. Models whose keypoints are the
-same after stretch, to within 1 % of their extent and with the same set of keypoints, count as the
+same after a stretch, to within 1 % of their extent and with the same set of keypoints, count as the
 true model. Two protocols: ``leave-in``, where the library holds the model, and ``leave-out``, where
 it and all that count as it are taken out. All methods get the same keypoints.
-
-Columns of the result table, one row per query, protocol and method: what names the row
-(``category``, ``model_id``, ``noise_px``, ``keypoints``, ``protocol``, ``method``), ``status``,
-which is ``no view`` where there was nothing to ask, ``reason``, and then
-
-alike
-    Number of models that count as the true one, itself included.
-rank
-    Place of the first of these, 1 for the best; empty beyond 50, and in the leave-out protocol.
-matched_category, matched_id, score
-    The best match and its probability.
-none_probability
-    Probability that the object is none of the library's models.
-shared, rms_px
-    Keypoints that it shares with the image, and their residuals [px].
-shape_distance
-    Distance of its keypoints from the true model's after stretch, as a share of their extent; empty
-    for another category.
-box_iou
-    Overlap of its box with the true model's, both posed and stretched; empty for a model without
-    volume.
-box_iou_up_to_scale
-    The same after its box was scaled about the camera centre: one image leaves the size open
-    of an object that is not in the library.
-rotation_error_deg
-    [degrees]
 """
 
 from __future__ import annotations

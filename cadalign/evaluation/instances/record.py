@@ -1,30 +1,6 @@
 """Instance records: camera, keypoints, truth and estimates, enough to draw an instance.
 
-A record is a row of ``exhibits.parquet``: category, model id, view, and a JSON object ::
-
-    {
-      "camera": {"width": 640, "height": 480, "fx": 935.0, "fy": 935.0, "cx": 319.5, "cy": 239.5},
-      "gt": {"rotation": [9, row by row], "translation": [3], "scale": [3]},
-      "stretch": [1.0, s_y, s_z],
-      "bounds": [[3 lowest], [3 highest]],
-      "points_3d": [[3], ...], "points_2d": [[2], ...], "semantic_ids": [...],
-      "estimates": [
-        {"method": "optimal", "rotation": [9], "translation": [3], "scale": [3],
-         "rms_px": 0.9, "sigma": 1.0,
-         "std": {"rotation_deg": 0.6, "translation": [3], "scale": [3]},
-         "warnings": ["..."],
-         "alternatives": [{"rotation": [9], "translation": [3], "scale": [3], "likelihood": 0.1}]},
-        {"method": "epnp", "reason": "why it failed"}
-      ]
-    }
-
-``bounds`` and ``points_3d`` are those of the model that the methods were given, which is the
-dataset's times ``stretch``. ``gt`` is null where the truth is not known. Estimates of the object's
-own shape take the model's box to the estimated one; their ``std`` is that of lengths relative to
-the mean shape, or the model that was stretched. They and their alternatives have, besides,
-``"warp": {"from": [[3], ...], "to": [[3], ...]}``: keypoints of that model, and their places on the
-estimated object in the coordinates of the model, by which the model is warped before the pose.
-``std`` and ``sigma`` are null for methods that have none.
+A record is a row of ``records.parquet``, whose form docs/formats/runs.md describes.
 """
 
 from __future__ import annotations
@@ -33,7 +9,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -51,15 +27,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 
-if TYPE_CHECKING:
-    pass
-
-RECORD_COLUMNS: Columns = (
-    ("category", str),
-    ("model_id", str),
-    ("view", int),
-    ("exhibit", str),
-)
+RECORD_COLUMNS: Columns = (("category", str), ("model_id", str), ("view", int), ("exhibit", str))
 # More than any picture can show, and little enough to store.
 _MODEL_DIGITS = 9
 _PIXEL_DIGITS = 4
@@ -97,41 +65,18 @@ class Warp:
 
 
 @dataclass(frozen=True, eq=False)
-class AlignedAlternative:
-    """Another likely estimate; see `AlignedShape`."""
-
-    alignment: Alignment
-    relative_likelihood: float
-    warp: Warp
-
-
-@dataclass(frozen=True, eq=False)
 class AlignedShape:
-    """The estimate of an object's own shape, for an instance's record.
-
-    Parameters
-    ----------
-    alignment : Alignment
-        Takes the box of the model that other methods are given to the estimated one.
-    std : Uncertainty, optional
-        None for a method that states none.
-    rms : float
-        Of the residuals [px].
-    sigma : float
-        Standard deviation of the keypoints [px].
-    warnings : tuple of str
-    alternatives : tuple of AlignedAlternative
-    warp : Warp
-        What remains of the shape after the alignment.
-    """
+    """The estimate of an object's own shape, or an alternative to it, for an instance's record."""
 
     alignment: Alignment
-    std: Uncertainty | None
-    rms: float
-    sigma: float
-    warnings: tuple[str, ...]
-    alternatives: tuple[AlignedAlternative, ...]
-    warp: Warp
+    """Takes the box of the model that other methods are given to the estimated one."""
+    warp: Warp  # what remains of the shape after the alignment
+    rms: float = np.nan  # of the residuals [px]
+    sigma: float = np.nan  # standard deviation of the keypoints [px]
+    std: Uncertainty | None = None  # None for a method that states none
+    warnings: tuple[str, ...] = ()
+    alternatives: tuple[AlignedShape, ...] = ()
+    relative_likelihood: float = 1.0  # of an alternative
 
 
 def align_instance(
@@ -144,22 +89,9 @@ def align_instance(
 ) -> AlignedShape:
     """Align a category's shape with an instance's keypoints, of which the shape knows.
 
-    Parameters
-    ----------
-    shape : ShapeModel
-    instance : Instance
-    own_ids : (k,) int
-        Semantic ids of all keypoints of the instance's model, whose extent is its box where it has
-        no mesh.
-    own_xyz : (k, 3) float
-        These keypoints as the image shows them.
-    sigma : float
-        Standard deviation of the keypoints [px].
-
-    Raises
-    ------
-    DegenerateError
-        As `cadalign.align`.
+    ``own_ids`` (k,) and ``own_xyz`` (k, 3) are the semantic ids of all keypoints of the instance's
+    model, whose extent is its box where it has no mesh, and their places as the image shows them;
+    ``sigma`` is the keypoints' standard deviation [px]. Raises DegenerateError as `cadalign.align`.
     """
     # Only here: their kernels take time to import, and most experiments do without.
     from cadalign.estimation.align import align
@@ -221,14 +153,15 @@ def shape_of_result(
 
     ``rms`` and ``sigma`` are those of `AlignedShape` [px].
     """
-    alternatives = []
-    for other in result.alternatives:
-        alignment, warp = placed_in_model(other, rows, source, **how)
-        alternatives.append(AlignedAlternative(alignment, other.relative_likelihood, warp))
-    alignment, warp = placed_in_model(result, rows, source, **how)
-    return AlignedShape(
-        alignment, result.std, rms, sigma, result.warnings, tuple(alternatives), warp
+    alternatives = tuple(
+        AlignedShape(
+            *placed_in_model(other, rows, source, **how),
+            relative_likelihood=other.relative_likelihood,
+        )
+        for other in result.alternatives
     )
+    placed = placed_in_model(result, rows, source, **how)
+    return AlignedShape(*placed, rms, sigma, result.std, result.warnings, alternatives)
 
 
 def box_alignment(
@@ -369,7 +302,7 @@ def _rms_px(outcome: Outcome, estimate: object) -> float | None:
 
 def _warp(estimate: object) -> dict[str, Any]:
     """The deformation of an estimated shape; nothing for the given model."""
-    if not isinstance(estimate, AlignedShape | AlignedAlternative):
+    if not isinstance(estimate, AlignedShape):
         return {}
     ends = {"from": estimate.warp.source, "to": estimate.warp.target}
     return {"warp": {name: _rounded(points, _WARP_DIGITS) for name, points in ends.items()}}

@@ -26,63 +26,28 @@ _TURNS = (0, 1, -1, 2, -2)  # places of the cameras around the object
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One camera's image.
+    """One camera's image."""
 
-    Parameters
-    ----------
-    cam_from_first : (4, 4) float
-        Motion of the camera.
-    rows : (n,) int
-        The visible keypoints.
-    points_2d : (n, 2) float
-        With noise [px].
-    depths : (n,) float
-        With noise [model units].
-    up : (3,) float
-        With noise.
-    """
-
-    cam_from_first: FloatArray
-    rows: IntArray
-    points_2d: FloatArray
-    depths: FloatArray
-    up: FloatArray
+    cam_from_first: FloatArray  # (4, 4), motion of the camera
+    rows: IntArray  # (n,), the visible keypoints
+    points_2d: FloatArray  # (n, 2), with noise [px]
+    depths: FloatArray  # (n,), with noise [model units]
+    up: FloatArray  # (3,), with noise
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectScene:
-    """An object, its stretched model, and shots from all cameras.
+    """An object, its stretched model, and shots from all cameras."""
 
-    Parameters
-    ----------
-    model : Model
-        The stretched model with its mesh.
-    gt : Alignment
-        The truth in the first camera.
-    shots : tuple of Shot
-    height : float
-        Of the object, with noise [model units].
-    diagonal : float
-        Of the object's box [model units].
-    shown : Scene
-        The object as it is.
-    cam_from_shown : Alignment
-        Its pose in the first camera.
-    names : tuple of str
-        Names of the instance, for its randomness.
-    options : SceneOptions
-        The seed, and the accuracy of the evidence.
-    """
-
-    model: Model
-    gt: Alignment
+    model: Model  # the stretched model with its mesh
+    gt: Alignment  # the truth in the first camera
     shots: tuple[Shot, ...]
-    height: float
-    diagonal: float
-    shown: Scene
-    cam_from_shown: Alignment
-    names: tuple[str, ...]
-    options: SceneOptions
+    height: float  # of the object, with noise [model units]
+    diagonal: float  # of the object's box [model units]
+    shown: Scene  # the object as it is
+    cam_from_shown: Alignment  # its pose in the first camera
+    names: tuple[str, ...]  # names of the instance, for its randomness
+    options: SceneOptions  # the seed, and the accuracy of the evidence
 
     def mask(self, damage: str = "exact") -> BoolArray:
         """The object's mask in the first camera; see `damaged_mask`."""
@@ -189,10 +154,7 @@ _SIZE = 0.13  # radius of holes and blobs, relative to the root of the area
 def damaged_mask(mask: npt.ArrayLike, kind: str, rng: np.random.Generator) -> BoolArray:
     """A mask (h, w) with a damage of one of the kinds `DAMAGES`.
 
-    Raises
-    ------
-    InputError
-        If the kind is unknown.
+    Raises InputError if the kind is unknown.
     """
     pixels = np.asarray(mask).astype(np.uint8)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _SHIFT + 1, 2 * _SHIFT + 1))

@@ -1,42 +1,7 @@
-"""Unseen objects, which are no stretched copy of any model: tasks, errors and records.
-
-Columns of the result table, one row per view and method: what names the row (``category``,
-``model_id``, ``view``, ``method``), ``status`` and ``reason``, and then
-
-keypoints
-    Number of keypoints that were given.
-rotation_error_deg
-    [degrees]
-best_rotation_error_deg
-    The least of the estimate and its alternatives [degrees].
-translation_error, translation_error_up_to_scale
-    Distance of the boxes' centres, since models differ in the place of their origin [diagonals of
-    the object's bounding box]; the second after the estimate was scaled about the camera centre,
-    since one image does not determine an object's size.
-box_iou, box_iou_up_to_scale
-    Overlap of the boxes that the object's keypoints span, in truth and as estimated, the second
-    likewise; empty for an object without volume.
-stated_box_iou_up_to_scale
-    The same of the estimate's own box, which also holds keypoints that the object may lack.
-keypoint_error
-    Root mean square distance of all keypoints of the object that the method estimates, also of
-    those not given, from the true ones, after the estimate was scaled about the camera centre for
-    it to be least [diagonals].
-rotation_level, stretch_level
-    Probability that the method gives the smallest region that holds the truth, about its estimate:
-    of 3 coordinates for the rotation, and of 2 for the ratios of the box's lengths, which are free
-    of the object's size; Gaussian, or of as heavy tails as the shape model found. Uniform over
-    [0, 1] where uncertainties are right; empty where the method states none.
-keypoints_within_68, keypoints_within_95
-    Share of the object's keypoints that lie within the ellipsoids of these probabilities about
-    their estimates in the model's frame, whose unit is the diagonal of every model.
-
-The metrics of failed rows are empty.
-"""
+"""Unseen objects, which are no stretched copy of any model: tasks, errors and records."""
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -58,7 +23,6 @@ from cadalign.evaluation.experiments.unseen import COLUMNS, UnseenOptions
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
-    NO_SYMMETRY,
     KeypointTask,
     example_view,
 )
@@ -84,6 +48,7 @@ from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import fingerprint
 from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -121,13 +86,13 @@ class UnseenTasks(KeypointTasks):
         return tuple(sorted({category for category, _ in self.keys}))
 
     def fingerprint(self) -> str:
-        """Hash of the annotations: a run must not go on with others."""
-        digest = hashlib.sha256()
+        """Hash of the annotations."""
+        parts: list[Any] = []
         for place in range(0, len(self), len(self) // len(self.keys)):
             task = self.task(place)
-            digest.update(f"{task.category}\0{task.model_id}\0{task.problem}".encode())
-            digest.update(task.hull.xyz.tobytes() + task.semantic_ids.tobytes())
-        return digest.hexdigest()[:16]
+            parts.append(f"{task.category}\0{task.model_id}\0{task.problem}")
+            parts += [task.hull.xyz, task.semantic_ids]
+        return fingerprint(*parts)
 
 
 def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
@@ -143,10 +108,7 @@ def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
     xyz = task.hull.xyz
     count = len(xyz)
     gt, _ = sample_hull_view(
-        task.hull,
-        KEYPOINT_CAMERA,
-        rng=instance_rng(options.seed, *names),
-        min_visible=0,
+        task.hull, KEYPOINT_CAMERA, rng=instance_rng(options.seed, *names), min_visible=0
     )
     rng = instance_rng(options.seed, *names, "keypoints")
     order, noise = rng.permutation(count), rng.standard_normal((count, 2))
@@ -165,20 +127,11 @@ def probability_level(
 ) -> float | None:
     """Probability of the smallest ellipsoid about the estimate that holds the truth.
 
-    Parameters
-    ----------
-    error : (k,) float
-        Estimate minus truth.
-    covariance : (k, k) float
-        As the estimator states it. Directions without variance are held to be known.
-    degrees_of_freedom : float, optional
-        Of a t distribution; None for a Gaussian.
-
-    Returns
-    -------
-    float or None
-        In [0, 1], uniform where the covariance is that of the errors; 1 if the error has a part in
-        a direction without variance; None if there is no variance at all.
+    ``error`` (k,) is estimate minus truth, ``covariance`` (k, k) as the estimator states it, where
+    directions without variance are held to be known; with ``degrees_of_freedom`` errors follow a t
+    distribution, without a Gaussian. The level is uniform over [0, 1] where the covariance is that
+    of the errors, 1 if the error has a part in a direction without variance, and None if there is
+    no variance at all.
 
     Examples
     --------
@@ -213,7 +166,7 @@ class UnseenObjects(Setting):
     def warm_up(self) -> Sequence[KeypointTask]:
         """Compile the kernels."""
         (points, pixels, pose), ids = example_view(), np.arange(9)
-        task = KeypointTask("", "", 0, KeypointHull(points), ids, NO_SYMMETRY, None)
+        task = KeypointTask("", "", hull=KeypointHull(points), semantic_ids=ids)
         seen = UnseenObject(task, pose, ids, pixels, np.zeros(9, dtype=bool))
         view = View(KEYPOINT_CAMERA, pixels)
         for model in (Model(points_3d=points), ShapeModel.from_basis(points, [points], [0.1])):
@@ -398,7 +351,7 @@ def _aligned(found: ShapeEstimate, seen: UnseenObject, sigma: float) -> AlignedS
     alignment, warp = placed_in_model(found, rows, source, **how)
     rms = _rms(alignment, warp, seen, known)
     if found.result is None:
-        return AlignedShape(alignment, None, rms, sigma, (), (), warp)
+        return AlignedShape(alignment, warp, rms, sigma)
     return shape_of_result(found.result, rows, source, rms=rms, sigma=sigma, **how)
 
 

@@ -1,42 +1,7 @@
-"""Views of annotated models: tasks, instances, errors and pictures of the KeypointNet experiment.
-
-Columns of the result table, one row per view and method: what names the row (``category``,
-``model_id``, ``view``, ``method``), ``status`` and ``reason``, and then
-
-visibility
-    Rule by which keypoints count as seen, ``rays`` or ``hull``; empty if it failed before.
-keypoints
-    Number of keypoints that the method was given.
-stretch_y, stretch_z
-    Factors that the model was stretched by; the true scales are one over these.
-rotation_error_deg
-    [degrees]
-translation_error
-    [diagonals of the model's bounding box]
-translation_error_up_to_scale
-    The same after the estimate was scaled about the camera centre, since one image leaves the
-    size of an object open; empty in earlier runs.
-scale_y_error, scale_z_error
-    Relative errors, fractions.
-box_iou
-    Overlap of the stretched model's true and predicted box; empty for a model without volume.
-rms_px
-    Root mean square of the residuals [px].
-symmetry
-    The model's: ``none``, ``circle``, or the number of rotations that map it onto itself.
-sym_rotation_error_deg, sym_translation_error, sym_box_iou
-    The same errors from the nearest truth that looks the same; see
-    `cadalign.evaluation.instances.instance`. Errors of the scale do not depend on it.
-box_iou_up_to_scale
-    The overlap after the estimate was scaled about the camera centre; in runs with learned shapes.
-
-The metrics of failed rows are empty. Rows of instances that no view shows enough keypoints of have
-the status ``skipped``; they count in no share and no median.
-"""
+"""Views of annotated models: tasks, instances, errors and pictures of the experiment."""
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -60,7 +25,6 @@ from cadalign.evaluation.benchmark import (
 from cadalign.evaluation.experiments.keypointnet import COLUMNS, KeypointNetOptions
 from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
-    NO_SYMMETRY,
     Instance,
     KeypointTask,
     load_scene,
@@ -81,6 +45,7 @@ from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
 from cadalign.evaluation.outcome import FAILED, Outcome, reason_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import fingerprint
 from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -128,19 +93,18 @@ class KeypointTasks(Tasks[KeypointTask]):
 
     def fingerprint(self) -> str:
         """Hash of the annotations: a run must not go on with others."""
-        digest = hashlib.sha256()
-        for category, model_id in self.keys:
-            digest.update(f"{category}\0{model_id}\0".encode())
+        parts: list[Any] = []
+        for key in self.keys:
+            parts.append("".join(f"{name}\0" for name in key))
             try:
-                model = self.dataset[category, model_id]
+                model = self.dataset[key]
             except CadalignError as error:
-                digest.update(str(error).encode())
+                parts.append(str(error))
                 continue
-            digest.update(model.keypoints.xyz.tobytes())
             rotations = [rotation.keypoints for rotation in model.symmetries.rotations]
-            digest.update(repr((model.symmetries.reflections, rotations)).encode())
-            digest.update(b"mesh" if mesh_of(model, self._visibility) else b"")
-        return digest.hexdigest()[:16]
+            parts += [model.keypoints.xyz, repr((model.symmetries.reflections, rotations))]
+            parts.append("mesh" if mesh_of(model, self._visibility) else "")
+        return fingerprint(*parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,17 +140,8 @@ class KeypointViews(Setting):
     def warm_up(self) -> Sequence[KeypointTask]:
         """A task whose evaluation compiles solvers and metrics."""
         rng = np.random.default_rng(0)
-        return [
-            KeypointTask(
-                category="warm-up",
-                model_id="",
-                view=0,
-                hull=KeypointHull(rng.uniform(-0.3, 0.3, (12, 3))),
-                semantic_ids=np.arange(12),
-                symmetry=NO_SYMMETRY,
-                model=None,
-            )
-        ]
+        hull = KeypointHull(rng.uniform(-0.3, 0.3, (12, 3)))
+        return [KeypointTask("warm-up", "", hull=hull, semantic_ids=np.arange(12))]
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
         start, found = time.perf_counter(), []

@@ -1,25 +1,28 @@
-"""Methods, what they are given of an instance, and what they may answer."""
+"""Methods, what they are given and may answer, and those of `cadalign.fit`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.options import METHODS, RansacOptions
 from cadalign.evaluation.portable import Portable
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
-    from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.view import View
     from cadalign.shapes.model import ShapeModel
+
 
 LIMIT = "limit"
 """The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.cramer_rao`."""
@@ -31,38 +34,19 @@ POINTS, VIEWS = "points", "views"
 
 @dataclass(frozen=True, eq=False)
 class MethodInput:
-    """An instance as general methods are given it.
+    """An instance as general methods are given it."""
 
-    Parameters
-    ----------
-    points_3d : (n, 3) float
-        Keypoints on the model [model units].
-    points_2d : (n, 2) float
-        Their observations [px].
-    camera : Camera
-    sigma : float
-        Standard deviation of the observations that methods are given [px].
-    bounds : (2, 3) float, optional
-        Least and greatest coordinates of the model.
-    ransac : RansacOptions, optional
-        Options of searches for inliers.
-    gt : Alignment, optional
-        The truth, for metrics and for the Cramer-Rao bound; no method is given it.
-    inliers : (n,) bool, optional
-        The true inliers, for the bound.
-    make_views : callable, optional
-        Makes the model and its views where they hold more than the keypoints.
-    """
-
-    points_3d: FloatArray
-    points_2d: FloatArray
+    points_3d: FloatArray  # (n, 3), keypoints on the model [model units]
+    points_2d: FloatArray  # (n, 2), their observations [px]
     camera: Camera
-    sigma: float
-    bounds: FloatArray | None = None
-    ransac: RansacOptions | None = None
+    sigma: float  # standard deviation of the observations that methods are given [px]
+    bounds: FloatArray | None = None  # (2, 3), least and greatest coordinates of the model
+    ransac: RansacOptions | None = None  # options of searches for inliers
     gt: Alignment | None = None
-    inliers: BoolArray | None = None
+    """The truth, for metrics and for the Cramer-Rao bound; no method is given it."""
+    inliers: BoolArray | None = None  # (n,), the true inliers, for the bound
     make_views: Callable[[], tuple[Model | ShapeModel, Sequence[View]]] | None = None
+    """Makes the model and its views where they hold more than the keypoints."""
 
     def model_and_views(self) -> tuple[Model | ShapeModel, list[View]]:
         """The arguments of `cadalign.align`."""
@@ -78,30 +62,19 @@ class MethodInput:
 
 @dataclass(frozen=True)
 class Method:
-    """A method by name.
-
-    Parameters
-    ----------
-    name : str
-    solve : callable
-        Makes an estimate; raises where it has none. A general method takes a `MethodInput` and
-        returns an alignment or a result of `cadalign.fit` or `cadalign.align`; another one takes an
-        instance of its benchmark, and returns what that measures.
-    solve_many : callable, optional
-        Makes estimates of a sequence, with an error in the place of one that there is not.
-    is_general : bool
-    has_statistics : bool
-        ``solve`` states uncertainties and alternatives, ``solve_many`` does not.
-    is_robust : bool
-        It searches for inliers.
-    """
+    """A method by name."""
 
     name: str
     solve: Callable[[Any], Any]
+    """Makes an estimate; raises where it has none. A general method takes a `MethodInput` and
+    returns an alignment or a result of `cadalign.fit` or `cadalign.align`; another one takes an
+    instance of its benchmark, and returns what that measures."""
     solve_many: Callable[[Sequence[Any]], list[Any]] | None = None
+    """Makes estimates of a sequence, with an error in the place of one that there is not."""
     is_general: bool = False
     has_statistics: bool = False
-    is_robust: bool = False
+    """``solve`` states uncertainties and alternatives, ``solve_many`` does not."""
+    is_robust: bool = False  # it searches for inliers
 
     @property
     def is_registered(self) -> bool:
@@ -138,10 +111,7 @@ class RegisteredFunction:
 def checked_answer(answer: object) -> Alignment | Result:
     """The answer of a function, if it is a valid alignment or a result.
 
-    Raises
-    ------
-    InputError
-        If it is something else, or its alignment is none.
+    Raises InputError if it is something else, or its alignment is none.
     """
     from cadalign.estimation.result import Result
 
@@ -158,3 +128,93 @@ def checked_answer(answer: object) -> Alignment | Result:
 def vars_of(alignment: Alignment) -> tuple[Any, Any, Any]:
     """Rotation, translation and scale of an alignment, which may not have been checked."""
     return alignment.rotation, alignment.translation, alignment.scale
+
+
+# Names for a method together with options of `cadalign.fit`.
+_VARIANTS: dict[str, dict[str, Any]] = {
+    "optimal-huber": {"method": "optimal", "loss": "huber"},
+    "optimal-cauchy": {"method": "optimal", "loss": "cauchy"},
+}
+# Robust ones, named after what they return: the optimum over all inliers, or the best hypothesis of
+# a minimal solver as it is. With the linear solver, on 6 points, these are the AEPnP paper's two
+# steps: RANSAC-AEPnP, and the same with non-linear refinement.
+_RANSAC: dict[str, dict[str, Any]] = {
+    "ransac-optimal": {"minimal": "ap4p", "refine": True},
+    "ransac-ap4p": {"minimal": "ap4p", "refine": False},
+    "ransac-aepnp": {"minimal": "aepnp", "refine": False},
+    "ransac-aepnp-refined": {"minimal": "aepnp", "refine": True},
+}
+# 99.8 % of Gaussian errors in the plane are shorter than this, in standard deviations.
+_INLIER_BOUND = 3.5
+
+
+@cache
+def fit_methods() -> dict[str, Method]:
+    """The methods by name, the Cramer-Rao bound last."""
+    found = [_fit_method(name) for name in (*METHODS, *_VARIANTS, *_RANSAC)]
+    limit = Method(LIMIT, bound_estimate, is_general=True)
+    return {method.name: method for method in (*found, limit)}
+
+
+def _fit_method(name: str) -> Method:
+    call = FitCall(name)
+    return Method(
+        name,
+        call,
+        call.many,
+        is_general=True,
+        has_statistics=name == "optimal" or name in _VARIANTS or name in _RANSAC,
+        is_robust=name in _RANSAC,
+    )
+
+
+def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None) -> dict[str, Any]:
+    """The options of `cadalign.fit` and `cadalign.fit_batch` that make it a method.
+
+    Robust methods take what lies within 3.5 ``sigma`` [px] for an inlier, or go by ``ransac``, but
+    for the minimal solver and the refinement, which are the method's own.
+    """
+    if name in _RANSAC:
+        common = ransac or RansacOptions(max_reproj_error=_INLIER_BOUND * sigma)
+        return {"sigma": sigma, "ransac": replace(common, **_RANSAC[name])}
+    return {"sigma": sigma, **_VARIANTS.get(name, {"method": name})}
+
+
+@dataclass(frozen=True)
+class FitCall:
+    """The call of `cadalign.fit` of a method; see `fit_options`."""
+
+    name: str
+
+    def __call__(self, given: MethodInput) -> Result:
+        """The fit of one instance."""
+        from cadalign.estimation.fit import fit
+
+        how = fit_options(self.name, sigma=given.sigma, ransac=given.ransac)
+        return fit(given.points_3d, given.points_2d, given.camera, **how)
+
+    def many(self, inputs: Sequence[MethodInput]) -> list[Alignment | CadalignError]:
+        """The alignments of many instances, in batches of one standard deviation."""
+        from cadalign.estimation.fit import fit_batch
+
+        found: list[Alignment | CadalignError] = []
+        for sigma, group in groupby(inputs, key=lambda given: given.sigma):
+            some = list(group)
+            batch = fit_batch(
+                [given.points_3d for given in some],
+                [given.points_2d for given in some],
+                [given.camera for given in some],
+                **fit_options(self.name, sigma=sigma, ransac=None),
+            )
+            found += [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
+        return found
+
+
+def bound_estimate(given: MethodInput) -> Alignment:
+    """The estimate of an ideal estimator that knows the outliers."""
+    from cadalign.evaluation.metrics.cramer_rao import limit_estimate
+
+    if given.gt is None:
+        raise InputError("the Cramer-Rao bound needs the true alignment", where="methods")
+    kept = slice(None) if given.inliers is None else given.inliers
+    return limit_estimate(given.points_3d[kept], given.points_2d[kept], given.camera, given.gt)

@@ -14,7 +14,6 @@ its functions by entry points of the group ``cadalign.methods``.
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -25,9 +24,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal
 
-from cadalign.errors import InputError, quote
-from cadalign.evaluation.methods.fitted import fit_methods
-from cadalign.evaluation.methods.method import POINTS, VIEWS, Method, RegisteredFunction
+from cadalign.errors import InputError, quote, unknown
+from cadalign.evaluation.methods.method import (
+    POINTS,
+    VIEWS,
+    Method,
+    RegisteredFunction,
+    fit_methods,
+)
 from cadalign.evaluation.portable import Portable, code_hash, module_of
 
 ENTRY_POINTS = "cadalign.methods"
@@ -112,16 +116,8 @@ def choose_methods(
 ) -> tuple[Method, ...]:
     """The methods of these names, each once.
 
-    Parameters
-    ----------
-    names : iterable of str
-    own : mapping of str to Method, optional
-        A benchmark's own methods; by default those of `cadalign.fit`.
-
-    Raises
-    ------
-    InputError
-        If one is unknown, or none is given.
+    ``own`` are a benchmark's own methods by name, by default those of `cadalign.fit`. Raises
+    InputError if a method is unknown, or none is given.
     """
     table = fit_methods() if own is None else own
     checked = checked_names(names, table)
@@ -156,10 +152,7 @@ def _unknown(name: object, known: Sequence[str]) -> InputError:
     if callable(name):
         fix = "give it a name by cadalign.evaluation.register_method, and that name"
         return InputError("a function is no name of a method", where="methods", fix=fix)
-    nearest = difflib.get_close_matches(str(name), known, n=1)
-    hint = f", did you mean {nearest[0]!r}?" if nearest else ""
-    fix = f"known are {', '.join(known)}"
-    return InputError(f"unknown method {name!r}{hint}", where="methods", fix=fix)
+    return unknown("method", name, known, where="methods")
 
 
 def is_registered(name: str) -> bool:
@@ -172,10 +165,7 @@ def is_registered(name: str) -> bool:
 def registered_method(name: str) -> Method:
     """The method that was registered by a name; one of an entry point is loaded.
 
-    Raises
-    ------
-    InputError
-        If there is none, or its package cannot be imported.
+    Raises InputError if there is none, or its package cannot be imported.
     """
     if not is_registered(name):
         raise _unknown(name, known_names(()))
@@ -196,17 +186,10 @@ def _entry_points() -> dict[str, EntryPoint]:
 def load_plugin(text: str) -> str | None:
     """Import a module and register a function of it; returns the name, None for a module alone.
 
-    Parameters
-    ----------
-    text : str
-        ``module:function``, ``name=module:function``, or ``module``, which registers methods when
-        it is imported. The module may be a file, ``path/to/module.py``; the working directory is
-        searched first.
-
-    Raises
-    ------
-    InputError
-        If it cannot be imported, or has no such function.
+    ``text`` is ``module:function``, ``name=module:function``, or ``module``, which registers
+    methods when it is imported. The module may be a file, ``path/to/module.py``; the working
+    directory is searched first. Raises InputError if it cannot be imported, or has no such
+    function.
     """
     alias, _, place = text.rpartition("=")
     module_name, _, name = place.rpartition(":") if ":" in place else (place, "", "")

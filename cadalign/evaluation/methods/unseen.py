@@ -33,25 +33,13 @@ _LEAST_SHARED = 6
 
 @dataclass(frozen=True, eq=False)
 class ShapeEstimate:
-    """Pose and shape of an object as a method found them.
-
-    Parameters
-    ----------
-    alignment : Alignment
-    bounds : (2, 3) float
-        Least and greatest coordinates before the stretch.
-    ids : (m,) int
-    points_3d : (m, 3) float
-        Keypoints before the stretch.
-    result : Result, optional
-        With the covariances; None for methods that have none.
-    """
+    """Pose and shape of an object as a method found them."""
 
     alignment: Alignment
-    bounds: FloatArray
-    ids: IntArray
-    points_3d: FloatArray
-    result: Result | None = None
+    bounds: FloatArray  # (2, 3), least and greatest coordinates before the stretch
+    ids: IntArray  # (m,)
+    points_3d: FloatArray  # (m, 3), keypoints before the stretch
+    result: Result | None = None  # with the covariances; None for methods that have none
 
     @property
     def poses(self) -> tuple[Alignment, ...]:
@@ -62,26 +50,13 @@ class ShapeEstimate:
 
 @dataclass(frozen=True, eq=False)
 class UnseenObject:
-    """View of an object, whose scale is 1.
+    """View of an object, whose scale is 1."""
 
-    Parameters
-    ----------
-    task : KeypointTask
-        Names and keypoints of the object.
-    gt : Alignment
-        The pose.
-    rows : (n,) int
-        Rows of the given keypoints among all of the object.
-    points_2d : (n, 2) float
-        The given keypoints [px], with noise and outliers.
-    is_outlier : (n,) bool
-    """
-
-    task: KeypointTask
-    gt: Alignment
-    rows: IntArray
-    points_2d: FloatArray
-    is_outlier: BoolArray
+    task: KeypointTask  # names and keypoints of the object
+    gt: Alignment  # the pose
+    rows: IntArray  # (n,), rows of the given keypoints among all of the object
+    points_2d: FloatArray  # (n, 2), the given keypoints [px], with noise and outliers
+    is_outlier: BoolArray  # (n,)
 
     @property
     def xyz(self) -> FloatArray:
@@ -96,18 +71,14 @@ class UnseenObject:
 
 @dataclass(frozen=True, eq=False)
 class UnseenInstance:
-    """A view of an object, what was learned of its category from others, and the run's options.
-
-    ``sigma`` is the standard deviation of the keypoints that methods are given, ``noise_px`` that
-    of their noise [px], ``outliers`` the share of wrong ones.
-    """
+    """A view of an object, what was learned of its category from others, and the run's options."""
 
     seen: UnseenObject
     learned: LearnedFiles
     seed: int
-    noise_px: float
-    sigma: float
-    outliers: float
+    noise_px: float  # standard deviation of the keypoints' noise [px]
+    sigma: float  # the same as methods are given it [px]
+    outliers: float  # share of wrong keypoints
 
     @property
     def shape(self) -> ShapeModel:

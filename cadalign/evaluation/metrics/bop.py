@@ -49,24 +49,11 @@ def mssd(
     symmetry: Symmetry,
     max_step: float = MAX_STEP,
 ) -> float:
-    """Maximum symmetry-aware surface distance: in units of the camera frame.
+    """Maximum symmetry-aware surface distance, in units of the camera frame.
 
     The smallest, over the model's symmetries S, of the largest distance |est(x) - gt(S x)| of its
-    vertices x.
-
-    Parameters
-    ----------
-    est, gt : Alignment
-    vertices : (n, 3) float
-        The model's vertices.
-    symmetry : Symmetry
-    max_step : float
-        Step of rotations about axes; see `Symmetry.poses`.
-
-    Raises
-    ------
-    InputError
-        If there are no vertices.
+    ``vertices`` x (n, 3); ``max_step`` is the step of rotations about axes, see `Symmetry.poses`.
+    Raises InputError if there are no vertices.
     """
     points = _vertices(vertices)
     at_est = est.apply(points)
@@ -88,17 +75,6 @@ def mspd(
     """Maximum symmetry-aware projection distance [px].
 
     As `mssd`, of the vertices' projections; infinite where a vertex lies behind the camera.
-
-    Parameters
-    ----------
-    est, gt, vertices, symmetry, max_step
-        See `mssd`.
-    camera : Camera
-
-    Raises
-    ------
-    InputError
-        If there are no vertices.
     """
     points = _vertices(vertices)
     at_est = camera.project_where_ahead(est.apply(points))
@@ -123,22 +99,9 @@ def vsd(
 ) -> FloatArray:
     """Visible surface discrepancy for each tolerance tau, (t,) float, 0 to 1.
 
-    The model is drawn in both poses; see `vsd_of_depths`.
-
-    Parameters
-    ----------
-    est, gt : Alignment
-    scene : Scene
-        The model.
-    camera : Camera
-    depth : (h, w) float
-        The photo's depth image; 0 where nothing was measured.
-    diameter : float
-        The model's diameter.
-    delta : float
-        Tolerance of the visibility test, in units of the camera frame.
-    taus : sequence of float
-        Misalignment tolerances, as fractions of the diameter.
+    The model, ``scene``, is drawn in both poses and compared with the photo's ``depth`` (h, w), 0
+    where nothing was measured; see `vsd_of_depths`. ``delta`` is the tolerance of the visibility
+    test in units of the camera frame; ``taus`` are fractions of the model's ``diameter``.
     """
     from cadalign.render.raycast.renderer import cast_geometry
 
@@ -167,10 +130,7 @@ def vsd_of_depths(
     visible, of those where only one is, or where the two differ by ``tau`` diameters or more; 1
     where neither is visible.
 
-    Raises
-    ------
-    InputError
-        If sizes don't match the camera, or the diameter is not positive.
+    Raises InputError if sizes don't match the camera, or the diameter is not positive.
     """
     if not diameter > 0:
         raise InputError(f"{diameter} is not positive", where="diameter")
@@ -192,38 +152,22 @@ def vsd_of_depths(
 
 
 def vsd_recall(errors: npt.ArrayLike) -> float:
-    """Average recall of VSD: over tolerances and thresholds, the share of errors below.
-
-    Parameters
-    ----------
-    errors : (n, t) float
-        `vsd` of each object.
-    """
+    """Average recall of VSD ``errors`` (n, t): over tolerances and thresholds, the share below."""
     table = as_floats(errors, name="errors", shape=(None, None))
     return _recall([table < limit for limit in THRESHOLDS])
 
 
 def mssd_recall(errors: npt.ArrayLike, diameters: npt.ArrayLike) -> float:
-    """Average recall of MSSD: over thresholds of 5 % to 50 % of the diameters.
-
-    Parameters
-    ----------
-    errors, diameters : (n,) float
-    """
+    """Average recall of MSSD ``errors`` (n,): over thresholds of 5 % to 50 % of the diameters."""
     values = as_floats(errors, name="errors", shape=(None,), finite=False)
     sizes = as_floats(diameters, name="diameters", shape=(len(values),))
     return _recall([values < limit * sizes for limit in THRESHOLDS])
 
 
 def mspd_recall(errors: npt.ArrayLike, *, width: int) -> float:
-    """Average recall of MSPD: over thresholds of 5 to 50 px, in images of the width 640.
+    """Average recall of MSPD ``errors`` (n,) [px]: over thresholds of 5 to 50 px at a width of 640.
 
-    Parameters
-    ----------
-    errors : (n,) float
-        [px]
-    width : int
-        The images' width [px].
+    ``width`` is the images' [px].
     """
     values = as_floats(errors, name="errors", shape=(None,), finite=False)
     return _recall([values < limit * width / _WIDTH for limit in MSPD_THRESHOLDS])

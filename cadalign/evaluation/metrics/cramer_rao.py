@@ -6,10 +6,11 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError
+from cadalign.estimation.facing import faced, turned_alignment, turned_covariance
 from cadalign.estimation.options import Sigma
 from cadalign.estimation.problems import focal_slopes, full_covariance, whitening_of
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
+from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.geometry.projection import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.solvers.alignment import covariance_of, keypoint_objective
@@ -25,12 +26,7 @@ _OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns where x has the scale 1
 
 
 def cramer_rao_bound(
-    points_3d: FloatArray,
-    camera: Camera,
-    gt: Alignment,
-    *,
-    sigma: Sigma,
-    focal: str,
+    points_3d: FloatArray, camera: Camera, gt: Alignment, *, sigma: Sigma, focal: str
 ) -> FloatArray:
     """The least covariance that any unbiased estimate of an alignment can have.
 
@@ -39,6 +35,12 @@ def cramer_rao_bound(
     (10, 10). ``sigma`` and ``focal`` are as for `cadalign.fit`.
     """
     in_camera = gt.apply(points_3d)
+    if needs_facing([camera]):
+        facing = faced(camera, camera.project(in_camera))
+        turn = facing.lens_from_camera
+        turned = turned_alignment(gt, turn.T)
+        bound = cramer_rao_bound(points_3d, facing, turned, sigma=sigma, focal=focal)
+        return turned_covariance(bound, turn)
     rays = perspective(in_camera)
     objective = keypoint_objective(points_3d, rays, whitening_of(sigma, rays, camera))
     unknowns = UNKNOWNS + (focal == "estimate")

@@ -29,7 +29,6 @@ from cadalign.geometry.pose_errors import (
     translation_errors,
     translation_errors_up_to_scale,
 )
-from cadalign.geometry.projection import perspective
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import Instance, InstanceSymmetry
@@ -133,7 +132,7 @@ def _rms_px(estimates: Sequence[Alignment], instances: Sequence[Instance]) -> Fl
     pairs = zip(estimates, instances, strict=True)
     placed = [each.points_3d @ est.linear.T + est.translation for est, each in pairs]
     camera = instances[0].camera
-    projected = camera.pixels_from_normalized(perspective(np.concatenate(placed)))
+    projected = camera.pixels_of_rays(np.concatenate(placed))
     observed = np.concatenate([each.points_2d for each in instances])
     squares = ((projected - observed) ** 2).sum(axis=1)
     ends = np.cumsum([len(each.points_2d) for each in instances]).tolist()

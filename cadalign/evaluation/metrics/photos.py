@@ -69,18 +69,8 @@ def nine_dof_iou(*, est: Box, gt: Box, symmetry: Symmetry) -> float:
     """Largest IoU of the true box and the estimated one over the object's symmetries.
 
     As in NOCS, the estimate is turned about its own centre by the symmetries' rotations, those
-    about an axis in 20 steps.
-
-    Parameters
-    ----------
-    est, gt : Box
-        Boxes whose axes are the model's.
-    symmetry : Symmetry
-
-    Raises
-    ------
-    InputError
-        If a box has no volume.
+    about an axis in 20 steps; the boxes' axes are the model's. Raises InputError if a box has no
+    volume.
     """
     rotations = symmetry.poses(max_step=_MAX_STEP)[:, :3, :3]
     return max(
@@ -93,12 +83,7 @@ def degree_cm(
 ) -> tuple[float, float]:
     """Rotation error [degrees], symmetry-aware, and translation error [cm].
 
-    Parameters
-    ----------
-    est, gt : Alignment
-    symmetry : Symmetry
-    metres : float
-        Length of one unit of the camera frame [m].
+    ``metres`` is the length of one unit of the camera frame [m].
 
     Examples
     --------
@@ -179,27 +164,13 @@ NINE_DOF = MetricSet(
 
 @dataclass(frozen=True)
 class KittiErrors:
-    """Errors and overlaps of one car.
+    """Errors and overlaps of one car."""
 
-    Parameters
-    ----------
-    yaw_deg : float
-        Difference of the headings [degrees], 0 to 180.
-    depth : float
-        Difference of the centres' depths [m].
-    depth_relative : float
-        The same as a fraction of the true depth.
-    iou_3d : float
-        Intersection over union of the boxes.
-    iou_bev : float
-        The same of their footprints: from a bird's eye.
-    """
-
-    yaw_deg: float
-    depth: float
-    depth_relative: float
-    iou_3d: float
-    iou_bev: float
+    yaw_deg: float  # difference of the headings [degrees], 0 to 180
+    depth: float  # difference of the centres' depths [m]
+    depth_relative: float  # the same as a fraction of the true depth
+    iou_3d: float  # intersection over union of the boxes
+    iou_bev: float  # the same of their footprints: from a bird's eye
 
 
 def kitti_errors(*, est: Box, gt: Box) -> KittiErrors:
@@ -209,10 +180,7 @@ def kitti_errors(*, est: Box, gt: Box) -> KittiErrors:
     `cadalign.datasets.KittiCars`). KITTI knows cars by their yaw alone: an estimate that is tilted
     counts as the upright box of its heading, centre and extents.
 
-    Raises
-    ------
-    InputError
-        If a box has no volume.
+    Raises InputError if a box has no volume.
 
     Examples
     --------

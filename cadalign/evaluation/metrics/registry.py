@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from cadalign.arrays import is_number
-from cadalign.errors import InputError, quote
+from cadalign.errors import InputError, quote, unknown
 from cadalign.evaluation.methods.method import MethodInput
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.portable import Portable, code_hash
@@ -64,10 +64,7 @@ class RegisteredMetric:
     def measure(self, found: Compared, given: MethodInput) -> float | None:
         """The number of an estimate; None for NaN, and where the truth is not known.
 
-        Raises
-        ------
-        InputError
-            If the function raises, or returns no number.
+        Raises InputError if the function raises, or returns no number.
         """
         if "gt" in self.parameters and found.gt is None:
             return None
@@ -157,20 +154,16 @@ def _parameters(function: Callable[..., Any]) -> tuple[str, ...]:
     parameters = inspect.signature(function).parameters.values()
     variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     required = [p.name for p in parameters if p.default is p.empty and p.kind not in variable]
-    unknown = [name for name in required if name not in ARGUMENTS]
-    if unknown:
-        what = f"unknown parameter {quote(unknown[0])}"
-        raise InputError(what, where="function", fix=f"known are {', '.join(ARGUMENTS)}")
+    others = [name for name in required if name not in ARGUMENTS]
+    if others:
+        raise unknown("parameter", others[0], ARGUMENTS, where="function")
     return tuple(each.name for each in parameters if each.name in ARGUMENTS)
 
 
 def choose_metrics(names: Iterable[str], columns: Columns = ()) -> tuple[RegisteredMetric, ...]:
     """The registered metrics of these names, each once.
 
-    Raises
-    ------
-    InputError
-        If one is unknown, or has the name of a column that is there already.
+    Raises InputError if one is unknown, or has the name of a column that is there already.
     """
     chosen = []
     for name in dict.fromkeys(names):

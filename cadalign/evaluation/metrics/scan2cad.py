@@ -40,25 +40,14 @@ OTHER = "other"
 
 @dataclass(frozen=True)
 class Scan2CadErrors:
-    """Errors of one alignment.
+    """Errors of one alignment."""
 
-    Parameters
-    ----------
-    translation : float
-        Distance of the positions [m].
-    rotation_deg : float
-        Angle to the nearest rotation that looks the same [degrees].
-    scale : float
-        The benchmark's: the mean over the axes of the ratio to the truth, less 1; a fraction.
-        Errors of opposite sign cancel in it.
-    scale_axes : (3,) float
-        Relative error along each axis.
-    """
-
-    translation: float
-    rotation_deg: float
+    translation: float  # distance of the positions [m]
+    rotation_deg: float  # angle to the nearest rotation that looks the same [degrees]
     scale: float
-    scale_axes: FloatArray
+    """The benchmark's: the mean over the axes of the ratio to the truth, less 1; a fraction. Errors
+    of opposite sign cancel in it."""
+    scale_axes: FloatArray  # (3,), relative error along each axis
 
     @property
     def is_aligned(self) -> bool:
@@ -77,41 +66,25 @@ class Scan2CadErrors:
 
 @dataclass(frozen=True, eq=False)
 class PlacedModel:
-    """A model placed in a scene, estimated or true.
-
-    Parameters
-    ----------
-    category : str
-    alignment : Alignment
-        In metres.
-    model_id : str, optional
-        The model's id; estimates of a model count as often as the scene has it at most.
-    symmetry : Symmetry
-        Of a true model: motions that take it to itself.
-    center : (3,) float
-        Of a true model: the point of the model whose positions are compared [model units]. The
-        benchmark's script takes minus the centre of the model's box.
-    """
+    """A model placed in a scene, estimated or true."""
 
     category: str
-    alignment: Alignment
+    alignment: Alignment  # in metres
     model_id: str | None = None
+    """The model's id; estimates of a model count as often as the scene has it at most."""
     symmetry: Symmetry = field(default_factory=Symmetry.none)
+    """Motions that take a true model to itself."""
     center: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """(3,), of a true model: the point of the model whose positions are compared [model units]. The
+    benchmark's script takes minus the centre of the model's box."""
 
 
 @dataclass(frozen=True)
 class Scan2CadAccuracy:
-    """Share of the true models that an estimate is aligned with.
+    """Share of the true models that an estimate is aligned with."""
 
-    Parameters
-    ----------
-    aligned, total : dict
-        Numbers of models by category.
-    """
-
-    aligned: dict[str, int]
-    total: dict[str, int]
+    aligned: dict[str, int]  # numbers of aligned models by category
+    total: dict[str, int]  # and all of them
 
     @property
     def by_category(self) -> dict[str, float]:
@@ -158,17 +131,11 @@ def scan2cad_accuracy(
     *,
     categories: Collection[str] = BENCHMARK_CATEGORIES,
 ) -> Scan2CadAccuracy:
-    """Alignment accuracy over scenes.
+    """Alignment accuracy over scenes, pairs of estimates and truths in one frame.
 
     Estimates are taken in their order. Each is matched with the first true model of its category,
-    not matched before, that it is aligned with.
-
-    Parameters
-    ----------
-    scenes : iterable of (estimates, truths)
-        The models of each scene, in one frame.
-    categories : collection of str
-        Those that are reported; the others are pooled as "other".
+    not matched before, that it is aligned with. ``categories`` are reported, the others pooled as
+    "other".
 
     Examples
     --------

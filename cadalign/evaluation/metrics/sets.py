@@ -38,40 +38,22 @@ class Rate:
 
 @dataclass(frozen=True)
 class MetricSet:
-    """Metrics of a protocol.
-
-    Parameters
-    ----------
-    name : str
-    measure : callable
-        Errors by column, some of which may be None: of an object, an estimate of the data set's
-        model, the true one, and the estimated box.
-    columns : tuple of str
-        Columns of the result table, numbers.
-    medians : tuple of Metric
-        Columns whose medians are shown.
-    tails : tuple of (Metric, Metric)
-        90th percentiles, each of a column.
-    rates : tuple of Rate
-    shares : tuple of Metric
-        Columns between 0 and 1 whose means over all objects are shown.
-    means : tuple of (Metric, tuple of Metric)
-        Means of such shares.
-    headline, details, console : tuple of Metric
-        Columns of the headline table, first and last ones, and of the console's.
-    """
+    """Metrics of a protocol."""
 
     name: str
     measure: Callable[[PhotoTarget, Alignment, Alignment, Box], Row]
-    columns: tuple[str, ...]
-    medians: tuple[Metric, ...]
-    tails: tuple[tuple[Metric, Metric], ...] = ()
+    """Errors by column, some of which may be None: of an object, an estimate of the data set's
+    model, the true one, and the estimated box."""
+    columns: tuple[str, ...]  # columns of the result table, numbers
+    medians: tuple[Metric, ...]  # columns whose medians are shown
+    tails: tuple[tuple[Metric, Metric], ...] = ()  # 90th percentiles, each of a column
     rates: tuple[Rate, ...] = ()
     shares: tuple[Metric, ...] = ()
-    means: tuple[tuple[Metric, tuple[Metric, ...]], ...] = ()
-    headline: tuple[Metric, ...] = ()
-    details: tuple[Metric, ...] = ()
-    console: tuple[Metric, ...] = ()
+    """Columns between 0 and 1 whose means over all objects are shown."""
+    means: tuple[tuple[Metric, tuple[Metric, ...]], ...] = ()  # means of such shares
+    headline: tuple[Metric, ...] = ()  # first columns of the headline table
+    details: tuple[Metric, ...] = ()  # its last columns
+    console: tuple[Metric, ...] = ()  # columns of the console's table
 
 
 def score_columns(sets: Iterable[MetricSet]) -> Columns:
@@ -84,16 +66,8 @@ def score_alignment(
 ) -> Row:
     """Errors of an estimate by column; none where the truth is not known.
 
-    Parameters
-    ----------
-    target : PhotoTarget
-        The object.
-    sets : sequence of MetricSet
-        Those of its data set.
-    est : Alignment
-        Of the data set's model, in the frame of the photo's camera.
-    box : Box
-        The estimated box in that frame.
+    ``est`` aligns the data set's model, ``box`` is the estimated box, both in the frame of the
+    photo's camera.
     """
     gt = target.gt
     if gt is None:

@@ -16,42 +16,20 @@ LOW, HIGH = "low", "high"
 
 @dataclass(frozen=True)
 class Metric:
-    """A number of a result table or of a summary.
+    """A number of a result table or of a summary."""
 
-    Parameters
-    ----------
-    key : str
-        Name of the column or field.
-    label : str
-        Name in figures and on pages.
-    unit : str
-        Empty for pure numbers.
-    digits : int
-        Shown after the point.
-    better : {"low", "high"}, optional
-        Direction; None for what is no quality, such as a count.
-    factor : float
-        Shown is the value times this.
-    head : str
-        Name at the head of tables; the label by default.
-    symbol : str
-        Name, with unit, at the head of the console's narrow tables; the head by default.
-    log : bool
-        Best seen on a logarithmic axis.
-    limit : float
-        End of cumulative curves, as shown.
-    """
-
-    key: str
-    label: str
-    unit: str = ""
-    digits: int = 2
+    key: str  # name of the column or field
+    label: str  # name in figures and on pages
+    unit: str = ""  # empty for pure numbers
+    digits: int = 2  # shown after the point
     better: str | None = LOW
-    factor: float = 1.0
-    head: str = ""
+    """Low or high, direction; None for what is no quality, such as a count."""
+    factor: float = 1.0  # shown is the value times this
+    head: str = ""  # name at the head of tables; the label by default
     symbol: str = ""
-    log: bool = True
-    limit: float = 1.0
+    """Name, with unit, at the head of the console's narrow tables; the head by default."""
+    log: bool = True  # best seen on a logarithmic axis
+    limit: float = 1.0  # end of cumulative curves, as shown
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "head", self.head or self.label)

@@ -1,7 +1,4 @@
-"""Poses that somebody else estimated, on the objects of photos: methods that read a file.
-
-Rows have the columns of `cadalign.evaluation.photos.objects`.
-"""
+"""Poses that somebody else estimated, on the objects of photos: methods that read a file."""
 
 from __future__ import annotations
 
@@ -14,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.datasets.photos.dataset import PhotoDataset
+from cadalign.datasets.photos.dataset import PhotoDataset, PoseEstimate, PoseFile
 from cadalign.datasets.photos.photo import NamedPoints
-from cadalign.datasets.photos.poses import PoseEstimate, PoseFile
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
 from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting, write_picture
 from cadalign.evaluation.experiments.estimates import EstimatesOptions
@@ -26,10 +22,9 @@ from cadalign.evaluation.methods.method import Method
 from cadalign.evaluation.metrics.bop import mssd
 from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LeftOutError, Outcome
-from cadalign.evaluation.photos.methods import PhotoEstimate
+from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
 from cadalign.evaluation.photos.objects import draw_sighting, sighting_record, targets_of
 from cadalign.evaluation.photos.protocols import Protocol, protocol_of
-from cadalign.evaluation.photos.sighting import Sighting
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
@@ -70,19 +65,12 @@ class PosesOfObjects(Setting):
 
 @dataclass(frozen=True)
 class PosesOfFiles(PosesOfObjects):
-    """Poses of files on the objects of photos: the setting of the experiment.
-
-    Parameters
-    ----------
-    options : EstimatesOptions
-    drawn_in : RunFolder
-        The folder that pictures go to.
-    """
+    """Poses of files on the objects of photos: the setting of the experiment."""
 
     record_columns = RECORD_COLUMNS
 
     options: EstimatesOptions
-    drawn_in: RunFolder = field(repr=False)
+    drawn_in: RunFolder = field(repr=False)  # the folder that pictures go to
 
     def failed(self, task: PhotoTask) -> list[Case]:
         return [Case(task.names, _FACTS)]
@@ -155,8 +143,7 @@ def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -
     Returns
     -------
     list of dict
-        A row for each object with a true pose, with the columns of
-        `cadalign.evaluation.photos.objects`.
+        A row for each object with a true pose; see docs/formats/runs.md for its columns.
 
     Raises
     ------

@@ -1,30 +1,4 @@
-"""Objects in photos: errors of methods, records and pictures.
-
-Columns of the result table, one row per object and method: what names the row (``category``,
-``model_id``, the photo's name and the object's, ``view``, ``method``), ``status`` (``left out``
-where the object, or the method on it, lacks what is asked for) and ``reason``, and then
-
-keypoints, source
-    Number of the given keypoints, and where they come from: annotated, detected or simulated.
-rms_px
-    Root mean square residual of the given keypoints [px].
-rotation_error_deg, translation_cm
-    Symmetry-aware, and of the model's origin.
-box_iou, box_iou_up_to_scale
-    Overlap of the boxes, the first symmetry-aware, the second after the estimate was scaled about
-    the camera centre.
-scan2cad_translation_m, scan2cad_scale, scan2cad_aligned, scan2cad_aligned_axes
-    Scan2CAD's errors, 1 where all are within their thresholds, and 1 where the scale of each axis
-    is too; see `cadalign.evaluation.metrics.scan2cad`.
-yaw_error_deg, depth_error, depth_error_relative, iou_3d, iou_bev
-    KITTI's; see `cadalign.evaluation.metrics.photos`.
-mssd, mspd_px, mssd_recall, mspd_recall, vsd_recall
-    BOP's: the first in diameters, the last three averaged over the thresholds; see
-    `cadalign.evaluation.metrics.bop`.
-
-Metrics of other data sets are empty, as are those of rows that are not ok, and of objects whose
-truth is not known.
-"""
+"""Objects in photos: errors of methods, records and pictures."""
 
 from __future__ import annotations
 
@@ -66,12 +40,13 @@ from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.photos.methods import (
     PhotoEstimate,
     PhotoInstance,
+    Sighting,
     estimate_of_answer,
     given_of,
     photo_method,
+    sight,
 )
 from cadalign.evaluation.photos.protocols import TRUTH, is_own, protocol_of
-from cadalign.evaluation.photos.sighting import Sighting, sight
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
@@ -87,15 +62,7 @@ from cadalign.shapes.model import ShapeModel
 
 @dataclass(frozen=True)
 class PhotoObjects(Setting):
-    """Objects in photos: the setting of the experiment.
-
-    Parameters
-    ----------
-    options : PhotosOptions
-    shapes : tuple of ShapeModel
-    drawn_in : RunFolder
-        The folder that pictures go to.
-    """
+    """Objects in photos: the setting of the experiment."""
 
     names = VIEW_NAMES
     columns = COLUMNS
@@ -103,7 +70,7 @@ class PhotoObjects(Setting):
 
     options: PhotosOptions
     shapes: tuple[ShapeModel, ...]
-    drawn_in: RunFolder
+    drawn_in: RunFolder  # the folder that pictures go to
 
     def warm_up(self) -> Sequence[PhotoTask]:
         """Compile the kernels."""

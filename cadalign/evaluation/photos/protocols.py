@@ -54,10 +54,7 @@ def is_own(method: str) -> bool:
 def check_method(method: str) -> None:
     """Check the name of a method.
 
-    Raises
-    ------
-    InputError
-        If there is none of this name, or EPnP or the truth is given evidence.
+    Raises InputError if there is none of this name, or EPnP or the truth is given evidence.
     """
     base, evidence = parts_of(method)
     is_known = base in (*BASES, TRUTH) and evidence <= set(EVIDENCE)
@@ -129,30 +126,17 @@ SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI, BOP)
 
 @dataclass(frozen=True)
 class Protocol:
-    """Evaluation of a data set: its metrics, and what it is given.
-
-    Parameters
-    ----------
-    metrics : tuple of MetricSet
-    best : str
-        The method whose estimates are drawn, and which gets the evidence besides the rigid one.
-    up_axis : str
-        The upward axis of its models.
-    sigma_of_side : float
-        Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
-        networks' heatmaps have 64 cells.
-    sigma_of_width : float, optional
-        The same as a share of the image's width.
-    marks_are_truth : bool
-        Its keypoints are projections of the truth: noise is added.
-    """
+    """Evaluation of a data set: its metrics, and what it is given."""
 
     metrics: tuple[MetricSet, ...]
     best: str
-    up_axis: str = "y"
+    """The method whose estimates are drawn, and which gets the evidence besides the rigid one."""
+    up_axis: str = "y"  # the upward axis of its models
     sigma_of_side: float = 1 / 64
-    sigma_of_width: float | None = None
-    marks_are_truth: bool = False
+    """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
+    networks' heatmaps have 64 cells."""
+    sigma_of_width: float | None = None  # the same as a share of the image's width
+    marks_are_truth: bool = False  # its keypoints are projections of the truth: noise is added
 
 
 _EXACT = Protocol((VIEWPOINT, BOP, NINE_DOF), RIGID, up_axis="z")

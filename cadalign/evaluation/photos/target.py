@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -19,6 +18,7 @@ from cadalign.evaluation.benchmark import Tasks
 from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.outcome import UNREADABLE, LeftOutError
 from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import fingerprint
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -32,20 +32,11 @@ _MOST_OF_HULL = 1000  # points whose distances are compared
 
 @dataclass(frozen=True)
 class PhotoTask:
-    """One photo of a data set, by its number.
+    """One photo of a data set, by its number."""
 
-    Parameters
-    ----------
-    index : int
-        Its number in the data set; -1 of a record that is no photo.
-    name : str
-    problem : str
-        Reason why the record cannot be read at all; empty otherwise.
-    """
-
-    index: int
+    index: int  # its number in the data set; -1 of a record that is no photo
     name: str
-    problem: str = ""
+    problem: str = ""  # reason why the record cannot be read at all; empty otherwise
 
     @property
     def names(self) -> Row:
@@ -74,9 +65,7 @@ class PhotoTasks(Tasks[PhotoTask]):
 
     def fingerprint(self) -> str:
         """Hash of the photos' names: a run must not go on with others."""
-        digest = hashlib.sha256("\0".join(self._names).encode("utf-8", "replace"))
-        digest.update(repr(self._bad).encode("utf-8", "replace"))
-        return digest.hexdigest()[:16]
+        return fingerprint("\0".join(self._names), repr(self._bad))
 
 
 opened = lru_cache(maxsize=1)(open_photos)
@@ -85,20 +74,11 @@ opened = lru_cache(maxsize=1)(open_photos)
 
 @dataclass(frozen=True)
 class Cad:
-    """A CAD model of the data set in a folder.
+    """A CAD model of the data set in a folder."""
 
-    Parameters
-    ----------
-    root : str
-        The folder.
-    model_id : str
-    model : CadModel
-        Where it is read from.
-    """
-
-    root: str
+    root: str  # the folder
     model_id: str
-    model: CadModel = field(compare=False, repr=False)
+    model: CadModel = field(compare=False, repr=False)  # where it is read from
 
     @property
     def scene(self) -> Scene:
@@ -203,19 +183,11 @@ def farthest_points(points: FloatArray, count: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class PhotoTarget:
-    """An object of a photo with its truth, as metrics need it.
-
-    Parameters
-    ----------
-    photo : Photo
-    found : PhotoObject
-    root : str
-        The data set's folder.
-    """
+    """An object of a photo with its truth, as metrics need it."""
 
     photo: Photo
     found: PhotoObject
-    root: str
+    root: str  # the data set's folder
 
     @property
     def cad(self) -> Cad | None:

@@ -1,18 +1,4 @@
-"""Folder of a run: its files, its lock, and its configuration.
-
-A run's folder::
-
-    run.json          configuration and versions; the same command makes the same file
-    results.parquet   one row per task and method; the same bytes however the run went
-    exhibits.parquet  instance records: what a report shows of a task besides its errors
-    timings.parquet   seconds of each row: differs from run to run
-    progress.json     progress, start and host: differs, too
-    parts/            tables of finished chunks while the run is not finished
-    summary.csv, figures/             summary of the results
-    overlays/, thumbs/                instances with their boxes, large and small
-    pictures/, sketches/              instances without boxes, and previews of their models' meshes
-    report.html                       all of it as one page
-"""
+"""Folder of a run: its files (docs/formats/runs.md), its lock, and its configuration."""
 
 from __future__ import annotations
 
@@ -39,13 +25,15 @@ _FIX = "give another folder (--out), or remove this one"
 
 
 class _Inside:
-    """A file or folder inside a run's folder."""
+    """A file or folder inside a run's folder, by the name of earlier versions where it has that."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, earlier: str = "") -> None:
         self._name = name
+        self._earlier = earlier
 
     def __get__(self, folder: RunFolder, owner: type[RunFolder]) -> Path:
-        return folder.path / self._name
+        is_earlier = self._earlier and (folder.path / self._earlier).exists()
+        return folder.path / (self._earlier if is_earlier else self._name)
 
 
 @dataclass(frozen=True)
@@ -57,14 +45,14 @@ class RunFolder:
     config_file = _Inside("run.json")
     results = _Inside("results.parquet")
     timings = _Inside("timings.parquet")
-    records = _Inside("exhibits.parquet")
+    records = _Inside("records.parquet", earlier="exhibits.parquet")
     progress = _Inside("progress.json")
     summary = _Inside("summary.csv")
     figures = _Inside("figures")
     overlays = _Inside("overlays")
     pictures = _Inside("pictures")
     thumbs = _Inside("thumbs")
-    previews = _Inside("sketches")
+    previews = _Inside("previews", earlier="sketches")
     report = _Inside("report.html")
     parts = _Inside("parts")
 
@@ -76,6 +64,9 @@ class RunFolder:
     def part(self, table: Path, index: int) -> Path:
         """A chunk's rows of the results, timings or records."""
         kind = "" if table == self.results else f".{table.stem}"
+        earlier = self.parts / f"{index:07d}.exhibits.parquet"
+        if table == self.records and earlier.exists():
+            return earlier
         return self.parts / f"{index:07d}{kind}.parquet"
 
     def make(self) -> None:

@@ -22,9 +22,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cadalign.errors import InputError
-from cadalign.evaluation.runs.cluster import DaskWorkers
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import Chunk, InProcess, LocalProcesses, Workers
+from cadalign.evaluation.runs.parallel import Chunk, DaskWorkers, InProcess, LocalProcesses, Workers
 from cadalign.evaluation.runs.tables import Columns, is_whole, read_table, write_rows, write_tables
 from cadalign.evaluation.runs.work import Experiment, Plan
 from cadalign.io.files import write_json, writing

@@ -16,7 +16,7 @@ from cadalign.io.files import write_whole
 Row = dict[str, Any]
 """Cells of a table by column; what is missing or None is an empty cell."""
 Columns = tuple[tuple[str, Any], ...]
-"""Names of a table's columns and their types: str, int, float, bool, list[float] or list[bool]."""
+"""Names of a table's columns and their types: str, int, float, bool, or list of one but int."""
 
 DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
 # A table's row groups must not show in which pieces its rows came.
@@ -28,6 +28,7 @@ _TYPES = {
     bool: pa.bool_(),
     list[float]: pa.list_(pa.float64()),
     list[bool]: pa.list_(pa.bool_()),
+    list[str]: pa.list_(pa.string()),
 }
 
 
@@ -104,10 +105,7 @@ def is_whole(path: Path, columns: Columns) -> bool:
 def checked(table: pa.Table, columns: Columns, *, path: Path, fix: str) -> pa.Table:
     """The table of a file, with empty columns for numbers that an older one does not have.
 
-    Raises
-    ------
-    DataError
-        If another column is missing, a type is another, or a text is missing.
+    Raises DataError if another column is missing, a type is another, or a text is missing.
     """
     for name, kind in columns:
         what, wanted = "", _TYPES[kind]

@@ -8,9 +8,13 @@ rows depend on that: all randomness comes from the run's seed and the task's nam
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from cadalign.errors import DataError
 from cadalign.evaluation.outcome import Outcome
@@ -73,23 +77,25 @@ class Experiment(Protocol[T_contra]):
 
 @dataclass(frozen=True)
 class Plan(Generic[T]):
-    """All that a run needs to be done.
-
-    Parameters
-    ----------
-    tasks : sequence
-        In the order of the result table. Sliced, and only as far as chunks are handed out.
-    config : dict
-        All that the results depend on, JSON; the run can only go on with the same.
-    chunk_size : int
-        Number of tasks that a worker gets at a time. Part of the configuration: another size would
-        cut a half-done run into other chunks.
-    """
+    """All that a run needs to be done."""
 
     experiment: Experiment[T]
     tasks: Sequence[T]
+    """In the order of the result table. Sliced, and only as far as chunks are handed out."""
     config: dict[str, Any]
+    """All that the results depend on, JSON; the run can only go on with the same."""
     chunk_size: int
+    """Number of tasks that a worker gets at a time. Part of the configuration: another size would
+    cut a half-done run into other chunks."""
+
+
+def fingerprint(*parts: str | bytes | npt.NDArray[Any]) -> str:
+    """Hash for a run's configuration of what it must not go on without, or with another."""
+    digest = hashlib.sha256()
+    for part in parts:
+        data = np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else part
+        digest.update(data.encode("utf-8", "replace") if isinstance(data, str) else data)
+    return digest.hexdigest()[:16]
 
 
 class AbortError(DataError):

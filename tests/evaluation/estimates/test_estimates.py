@@ -17,7 +17,7 @@ from cadalign import Alignment
 from cadalign.cli import main
 from cadalign.datasets import Bop, Scan2CAD
 from cadalign.datasets.photos.bop_files import write_bop_results, write_scene_gt
-from cadalign.datasets.photos.poses import PoseEstimate
+from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.estimates import method_names
 from cadalign.evaluation.photos.given import match_estimates

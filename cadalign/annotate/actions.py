@@ -11,10 +11,9 @@ from typing import Any, get_type_hints
 import msgspec
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
-from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS
 from cadalign.annotate.masks import nearest_corner
 from cadalign.annotate.models import SAME_PLACE
-from cadalign.annotate.object_actions import OBJECT_ACTIONS, bring_back
+from cadalign.annotate.object_actions import EVIDENCE_ACTIONS, OBJECT_ACTIONS, bring_back
 from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.photos import Mark
 from cadalign.annotate.session import ActionOutcome, Session
@@ -48,9 +47,7 @@ def perform(
         function = ACTIONS.get(name) if isinstance(name, str) else None
         if function is None:
             raise InputError(
-                f"{quote(name)} is not an action",
-                where="do",
-                fix=f"known are {', '.join(ACTIONS)}",
+                f"{quote(name)} is not an action", where="do", fix=f"known are {', '.join(ACTIONS)}"
             )
         before = {id(each): each.history.document for each in session.states}
         arguments = convert(action, _arguments_of(function))

@@ -43,25 +43,17 @@ class FocalChoice:
 
 @dataclass(frozen=True)
 class Priors:
-    """Priors on stretch and focal length until the pairs say otherwise; None for none.
+    """Priors on stretch and focal length until the pairs say otherwise; None for none."""
 
-    Parameters
-    ----------
-    stretch : float, optional
-        Standard deviation of the logarithm of each scale about 1.
-    focal : FocalPrior, optional
-        On a focal length that is estimated.
-    """
+    stretch: float | None = None  # standard deviation of the logarithm of each scale about 1
+    focal: FocalPrior | None = None  # on a focal length that is estimated
 
-    stretch: float | None = None
-    focal: FocalPrior | None = None
-
-    def fit_options(self, exif: FocalPrior | None) -> dict[str, Any]:
-        """Options with which `cadalign fit` has them, where it takes the EXIF data's otherwise."""
+    def fit_options(self, likely: FocalPrior) -> dict[str, Any]:
+        """Options with which `cadalign fit` has them, where it takes the likely focal length's."""
         options: dict[str, Any] = {}
         if self.stretch is not None:
             options["scale_prior_sigma"] = self.stretch
-        if self.focal != exif:
+        if self.focal != likely:
             options["focal_prior"] = None if self.focal is None else asdict(self.focal)
         return options
 

@@ -23,7 +23,8 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.outliers import Rows, find_outliers
+from cadalign.estimation.scene import SceneObject, focal_prior_by_others
+from cadalign.estimation.uncertainty.misfit import Rows, find_outliers
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -51,42 +52,25 @@ _FOCAL_ASSUMED = "The focal length is assumed: add a pair elsewhere to have it e
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Knowledge of an object beside its observation.
+    """Knowledge of an object beside its observation."""
 
-    Parameters
-    ----------
-    shape : ObjectShape, optional
-        The object's own shape; None for the stretched model.
-    mesh : Mesh
-        The model's.
-    stretch : float, optional
-        Standard deviation of a prior on the logarithms of the scales.
-    sigma : float, optional
-        Stored standard deviation of all pairs [px].
-    anchors : mapping
-        The model's keypoints that the shape knows, by their ids there.
-    assumed_focal : tuple of str
-        Photos whose focal length is neither known nor estimated, this one by an empty name.
-    estimates_focal : bool
-        Estimate the focal lengths of all photos.
-    focal_prior : FocalPrior, optional
-        On these.
-    """
-
-    shape: ObjectShape | None
-    mesh: Mesh
-    stretch: float | None = None
-    sigma: float | None = None
+    shape: ObjectShape | None  # the object's own shape; None for the stretched model
+    mesh: Mesh  # the model's
+    stretch: float | None = None  # standard deviation of a prior on the logarithms of the scales
+    sigma: float | None = None  # stored standard deviation of all pairs [px]
     anchors: Mapping[Any, ModelKeypoint] = field(default_factory=dict)
+    """The model's keypoints that the shape knows, by their ids there."""
     assumed_focal: tuple[str, ...] = ()
-    estimates_focal: bool = False
-    focal_prior: FocalPrior | None = None
+    """Photos whose focal length is neither known nor estimated, this one by an empty name."""
+    estimates_focal: bool = False  # estimate the focal lengths of all photos
+    focal_prior: FocalPrior | None = None  # on these
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
         """The model that `cadalign fit` aligns to the observation."""
         shape = self.shape
         if shape is not None and (shape.learned is not None or not observation.others):
-            return shape.model_with(self.anchors.values(), self.mesh)
+            points = self.anchors.values()
+            return shape.model_with(points, self.mesh, up_axis=observation.up_axis)
         sigma = None if shape is None else shape.sigma
         options = FitOptions(scale_prior_sigma=self.stretch)
         return model_of(observation, options=options, shape_sigma=sigma, mesh=self.mesh)
@@ -96,8 +80,8 @@ class Known:
 class LiveEstimate:
     """An alignment from all photos of an object, and what it was computed from.
 
-    ``assumed`` says what was assumed of it; ``sigma`` [px] and ``fit_options`` are as of
-    `LiveAlignment`.
+    ``assumed`` says what was assumed of it; ``sigma`` [px], ``fit_options``, ``others_focal`` and
+    ``contradictions`` are as of `LiveAlignment`.
     """
 
     problem: LiveProblem
@@ -105,6 +89,8 @@ class LiveEstimate:
     sigma: float = LEAST_SIGMA
     fit_options: Mapping[str, Any] = field(default_factory=dict)
     assumed: str = ""
+    others_focal: FocalPrior | None = None
+    contradictions: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, known: Known, observation: Observation) -> LiveEstimate:
@@ -123,6 +109,39 @@ class LiveEstimate:
             return cls(attempt, result, sigma, options, text)
         assert reason is not None
         raise reason
+
+    @property
+    def tells_focal(self) -> bool:
+        """True if one focal length of all photos was estimated, with nothing assumed."""
+        result, is_estimated = self.result, self.problem.estimates_focal and not self.assumed
+        one = all(camera == result.camera for camera in result.cameras)
+        return is_estimated and one and result.covariance is not None
+
+    def beside(self, name: str, others: Mapping[str, LiveEstimate]) -> LiveEstimate:
+        """The estimate with what others of the photo, by their names, say of the focal length.
+
+        Options of the fit stay those of the object alone, which its file holds.
+        """
+        if not (others and self.tells_focal):
+            return self
+        estimates = {name: self, **others}
+        prior, contradictions = focal_prior_by_others(
+            [
+                SceneObject(each.problem.model, each.problem.views[0], name=own)
+                for own, each in estimates.items()
+            ],
+            [each.result for each in estimates.values()],
+            [each.problem.focal_prior for each in estimates.values()],
+        )
+        told = replace(self, contradictions=contradictions)
+        if prior is self.problem.focal_prior:
+            return told
+        problem = replace(self.problem, focal_prior=prior)
+        try:
+            result, sigma, _ = problem.solve()
+        except CadalignError:
+            return told
+        return replace(told, problem=problem, result=result, sigma=sigma, others_focal=prior)
 
 
 @dataclass(frozen=True, eq=False)

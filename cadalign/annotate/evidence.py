@@ -35,30 +35,16 @@ _MOST_UP_SIGMA = 20.0  # [degrees]
 
 @dataclass(frozen=True, eq=False)
 class FurtherEvidence:
-    """Evidence of an observation beside the keypoints of the photo that is annotated.
+    """Evidence of an observation beside the keypoints of the photo that is annotated."""
 
-    Parameters
-    ----------
-    image : ImageEvidence
-        The photo's.
-    others : tuple of ObservedImage
-        The observation's other images.
-    place : int
-        The photo's number among all of them.
-    size : Size, optional
-        Known lengths of the object.
-    sigma : float, optional
-        Stored standard deviation of all keypoints in place of their own [px].
-    symmetry : Symmetry, optional
-        The model's; kept, but without effect while pairs are marked.
-    """
-
-    image: ImageEvidence = field(default_factory=ImageEvidence)
-    others: tuple[ObservedImage, ...] = ()
-    place: int = 0
-    size: Size | None = None
+    image: ImageEvidence = field(default_factory=ImageEvidence)  # the photo's
+    others: tuple[ObservedImage, ...] = ()  # the observation's other images
+    place: int = 0  # the photo's number among all of them
+    size: Size | None = None  # known lengths of the object
     sigma: float | None = None
-    symmetry: Symmetry | None = None
+    """Stored standard deviation of all keypoints in place of their own [px]."""
+    symmetry: Symmetry | None = None  # the model's; kept, but without effect while pairs are marked
+    up_axis: str | None = "y"  # the model's
 
     @classmethod
     def of(cls, observation: Observation, photo: Path, *, where: Path) -> FurtherEvidence:
@@ -75,6 +61,7 @@ class FurtherEvidence:
             observation.size,
             sigma if isinstance(sigma, float) else None,
             observation.symmetry,
+            observation.up_axis,
         )
 
     def added_to_image(self, photo: ObservedImage) -> ObservedImage:
@@ -91,7 +78,8 @@ class FurtherEvidence:
         """
         photo = self.added_to_image(photo)
         views = [*self.others[: self.place], photo, *self.others[self.place :]]
-        kept = {"others": tuple(views[1:]), "symmetry": self.symmetry, "size": self.size}
+        kept = {name: getattr(self, name) for name in ("symmetry", "size", "up_axis")}
+        kept["others"] = tuple(views[1:])
         return Observation(**{**vars(views[0]), **kept, **of_the_object})
 
 

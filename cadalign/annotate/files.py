@@ -1,8 +1,9 @@
 """Files of an object: its observation, which holds all that must last, and its alignment.
 
 Beside the observation `photo.json` is `photo_fit/fit.json`, the alignment as `cadalign fit` finds
-and writes it. The observation's field ``unfinished`` has what a fit cannot use: pairs with only one
-half placed, those whose keypoint the category's shape lacks, and further photos without any pair.
+and writes it, but for what other objects of the photo say of its focal length. The observation's
+field ``unfinished`` has what a fit cannot use: pairs with only one half placed, those whose
+keypoint the category's shape lacks, and further photos without any pair.
 Sessions of earlier versions kept these in a file of their own, `photo.unfinished.json`.
 """
 
@@ -53,7 +54,7 @@ logger = logging.getLogger("cadalign")
 _RENAME = "rename it: the annotator writes a file of this name"
 _EARLIER_FORMAT = "cadalign unfinished pairs"
 _OF_THE_OBJECT = (
-    *("init", "model", "object", "shape", "size", "symmetry", "fit", "unfinished"),
+    *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
 )  # fields that are not of one image
 
 
@@ -104,14 +105,14 @@ class Stored:
     fit_options: Mapping[str, Any]
     views: tuple[StoredView, ...] = ()
 
-    def priors_or(self, likely: Priors, *, exif: FocalPrior | None) -> Priors:
+    def priors_or(self, likely: Priors) -> Priors:
         """The priors of `cadalign fit` on the stored pairs; the likely ones before there are any.
 
-        ``exif`` is the prior of the photo, which `cadalign fit` takes where none is stored.
+        Where no prior on the focal length is stored, `cadalign fit` takes the likely one, too.
         """
         if self.camera is None or not self.document.complete_pairs:
             return likely
-        focal = exif
+        focal = likely.focal
         if "focal_prior" in self.fit_options:
             stored = self.fit_options["focal_prior"]
             focal = None if stored is None else FocalPrior(**stored)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
@@ -31,26 +31,15 @@ _LONGEST = 1000  # documents in memory
 _MOST = 200  # documents in the file, on each side of the current one
 
 
+@dataclass(eq=False)
 class History:
-    """Documents of an object: the current one, earlier ones, and undone ones.
+    """Documents of an object: the current one, earlier ones, and undone ones."""
 
-    ``revision`` grows with every change, those by undo and redo included; ``before`` and ``after``
-    are the documents that undo and redo lead to, the next one last.
-    """
-
-    def __init__(
-        self,
-        document: AnnotationDocument,
-        *,
-        before: Iterable[AnnotationDocument] = (),
-        after: Iterable[AnnotationDocument] = (),
-        revision: int = 0,
-    ) -> None:
-        self.document = document
-        self.before = list(before)
-        self.after = list(after)
-        self.revision = revision
-        self._step: object = None
+    document: AnnotationDocument
+    before: list[AnnotationDocument] = field(default_factory=list)  # for undo, the next one last
+    after: list[AnnotationDocument] = field(default_factory=list)  # for redo, the next one last
+    revision: int = 0  # grows with every change, those by undo and redo included
+    _step: object = None
 
     def record(self, document: AnnotationDocument, *, step: object = None) -> None:
         """Go on to another document.
@@ -76,12 +65,8 @@ class History:
 
     def changed(self, change: Callable[[AnnotationDocument], AnnotationDocument]) -> History:
         """The history with a change made to each of its documents."""
-        return History(
-            change(self.document),
-            before=map(change, self.before),
-            after=map(change, self.after),
-            revision=self.revision + 1,
-        )
+        before, after = ([change(each) for each in side] for side in (self.before, self.after))
+        return History(change(self.document), before, after, self.revision + 1)
 
     def _go(self, source: list[AnnotationDocument], target: list[AnnotationDocument]) -> bool:
         self._step = None

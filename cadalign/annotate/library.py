@@ -31,17 +31,10 @@ _SEEN_FROM = Angles(azimuth=150.0, elevation=20.0)
 
 @dataclass(frozen=True, eq=False)
 class ModelChoice:
-    """A library of models, of which the session's is one, or one category of it.
-
-    Parameters
-    ----------
-    library : Library
-    category : str, optional
-        Name of the only category to choose from.
-    """
+    """A library of models, of which the session's is one, or one category of it."""
 
     library: Library
-    category: str | None = None
+    category: str | None = None  # name of the only category to choose from
 
     @classmethod
     def open(cls, options: FileOptions) -> ModelChoice | None:

@@ -15,6 +15,7 @@ from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
@@ -29,48 +30,29 @@ _LEAST_PAIRS, _LEAST_JOINT_PAIRS = 4, 3  # without and with evidence beside them
 
 @dataclass(frozen=True, eq=False)
 class LiveAlignment:
-    """Alignment of what is marked so far, as one photo of the object shows it.
+    """Alignment of what is marked so far, as one photo of the object shows it."""
 
-    Parameters
-    ----------
-    result : Result, optional
-        The estimate from all photos, as it is shown and saved.
-    message : str
-        Reason for a missing result, or an assumption that was made.
-    provisional : bool
-        True if the marks alone did not suffice, so that nothing is saved.
-    place : int
-        The photo's number among the views.
-    sigma : float
-        Standard deviation of the pairs [px], larger if the residuals are.
-    fit_options : mapping
-        With which, and the priors, `cadalign fit` finds the result.
-    counts : (n,) bool
-        The complete pairs whose keypoints the shape knows.
-    residuals : (n, 2) float
-        Projected minus placed points of all complete pairs [px].
-    outliers : mapping
-        Distances [px] of the pairs that contradict the others, by their rows.
-    wireframe : Wireframe, optional
-        Lines of the model, warped to an own shape, in its frame before the stretch.
-    prior_lengths : (3,) float
-        Standard deviations of the logarithms of the lengths before any pair.
-    also_used : tuple of str
-        Evidence beyond the photo's pairs.
-    """
-
-    result: Result | None = None
-    message: str = ""
-    provisional: bool = False
-    place: int = 0
-    sigma: float = LEAST_SIGMA
+    result: Result | None = None  # the estimate from all photos, as it is shown and saved
+    message: str = ""  # reason for a missing result, or an assumption that was made
+    provisional: bool = False  # True if the marks alone did not suffice, so that nothing is saved
+    place: int = 0  # the photo's number among the views
+    sigma: float = LEAST_SIGMA  # standard deviation of the pairs [px], larger if the residuals are
     fit_options: Mapping[str, Any] = field(default_factory=dict)
+    """With which, and the priors, `cadalign fit` finds the result of this object alone."""
+    others_focal: FocalPrior | None = None
+    """Prior on the focal length that other objects of the photo and the object's own prior say."""
+    contradictions: tuple[str, ...] = ()  # of objects of the photo about its focal length
     counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    """(n,), the complete pairs whose keypoints the shape knows."""
     residuals: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    """(n, 2), projected minus placed points of all complete pairs [px]."""
     outliers: Mapping[int, float] = field(default_factory=dict)
+    """Distances [px] of the pairs that contradict the others, by their rows."""
     wireframe: Wireframe | None = None
+    """Lines of the model, warped to an own shape, in its frame before the stretch."""
     prior_lengths: FloatArray = field(default_factory=lambda: np.zeros(3))
-    also_used: tuple[str, ...] = ()
+    """(3,), standard deviations of the logarithms of the lengths before any pair."""
+    also_used: tuple[str, ...] = ()  # evidence beyond the photo's pairs
 
     @property
     def camera(self) -> Camera:
@@ -96,17 +78,8 @@ def live_alignment(
 ) -> LiveAlignment:
     """An estimate as the photo of a number shows it.
 
-    Parameters
-    ----------
-    estimate : LiveEstimate
-    known : Known
-    wireframe : Wireframe
-        The model's.
-    observation : Observation
-        What the estimate was computed from.
-    place : int
-    points, uv
-        Model points and photo points (n, 2) [px] of all complete pairs of the photo.
+    ``points`` and ``uv`` (n, 2) [px] are the model points and photo points of all complete pairs of
+    the photo; the estimate was computed from the observation, and the wireframe is the model's.
     """
     result, problem, shape = estimate.result, estimate.problem, known.shape
     counts = known_points(shape, points)
@@ -130,6 +103,8 @@ def live_alignment(
         place=place,
         sigma=estimate.sigma,
         fit_options={} if message else estimate.fit_options,
+        others_focal=estimate.others_focal,
+        contradictions=estimate.contradictions,
         counts=counts,
         residuals=residuals,
         outliers=outliers,
@@ -172,11 +147,7 @@ def _assumed_text(photos: tuple[str, ...], camera: Camera) -> str:
 
 
 def _warped(
-    wireframe: Wireframe,
-    result: Result,
-    model: Model | ShapeModel,
-    known: Known,
-    free: FloatArray,
+    wireframe: Wireframe, result: Result, model: Model | ShapeModel, known: Known, free: FloatArray
 ) -> tuple[Wireframe, FloatArray]:
     """The model warped such that its known keypoints come to the estimated ones, with points."""
     if known.shape is None:
@@ -212,7 +183,7 @@ def drawing_of(
         return drawing
     in_camera = result.alignment.apply(result.points_3d)
     names = {shape.id_of(point): (point.name, number in used) for number, point in registry}
-    ahead = in_camera[:, 2] > 0
+    ahead = live.camera.sees(in_camera)
     pixels = live.camera.project(in_camera[ahead])
     of_points = cast(FloatArray, result.points_cam_covariance)
     covariances = projected_covariances(in_camera[ahead], of_points[ahead], live.camera)

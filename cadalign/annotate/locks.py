@@ -39,14 +39,8 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
 class WriterLocks:
     """Locks on the files of one folder that a session writes, as a context.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        The files, all in one folder.
-    whole_folder : bool
-        Hold the folder's lock in place of one for each file.
-    address : str
-        Address of the session's page, for the message to others.
+    ``whole_folder`` holds the folder's lock in place of one for each file. The address of the
+    session's page is for the message to others.
     """
 
     def __init__(self, files: Sequence[Path], *, whole_folder: bool, address: str) -> None:
@@ -202,11 +196,7 @@ class Claims:
     """Claims of browsers on the photos that they change.
 
     Another browser of the same person takes a claim over at once, another person after `LEASE`.
-
-    Parameters
-    ----------
-    clock : callable
-        Seconds since any moment.
+    ``clock`` gives the seconds since any moment.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -216,10 +206,7 @@ class Claims:
     def take(self, photos: Collection[int], browser: str, person: str) -> None:
         """Claim photos for a browser, all or none, or renew its claims.
 
-        Raises
-        ------
-        InputError
-            If another person has changed one of them within the last `LEASE` seconds.
+        Raises InputError if another person has changed one of them within the last `LEASE` seconds.
         """
         now = self._clock()
         for claim in (self._claims[photo] for photo in photos if photo in self._claims):

@@ -194,17 +194,17 @@ def _proposals(
     return tuple(proposals)
 
 
+@dataclass(eq=False)
 class OpenedModel:
     """A model that can be clicked on, its keypoints, and the file they are written to."""
 
-    def __init__(
-        self, path: Path, cad: ClickableModel, registry: KeypointRegistry, keypoints_path: Path
-    ) -> None:
-        self.path = path
-        self.cad = cad
-        self.registry = registry
-        self.keypoints_path = keypoints_path
-        self.wireframe = Wireframe.of_model(cad)
+    path: Path
+    cad: ClickableModel
+    registry: KeypointRegistry
+    keypoints_path: Path
+
+    def __post_init__(self) -> None:
+        self.wireframe = Wireframe.of_model(self.cad)
         self._mirrored: dict[int, ModelKeypoint | None] = {}
 
     def mirrored(self, keypoint: int) -> ModelKeypoint | None:
@@ -230,18 +230,8 @@ class OpenedModel:
 class Models:
     """The models that objects can have, by number; each is opened when it is first needed.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        The first one, and further ones.
-    folder : Path
-        Where the keypoints are written.
-    keypoints : Path, optional
-        The first model's keypoints, where they are not beside it.
-    shape : ObjectShape, optional
-        Its keypoints' ids are reserved.
-    choice : ModelChoice, optional
-        A library, whose models' keypoints are given by it.
+    Keypoints are written into ``folder``; ``keypoints`` are the first model's, where they are not
+    beside it. The ids of a shape's keypoints are reserved; a library gives its models' keypoints.
     """
 
     def __init__(

@@ -82,7 +82,9 @@ class ObjectShape:
         """True if pairs of this point count."""
         return self.id_of(point) is not None
 
-    def model_with(self, points: Iterable[ModelKeypoint], mesh: Mesh) -> Model | ShapeModel:
+    def model_with(
+        self, points: Iterable[ModelKeypoint], mesh: Mesh, *, up_axis: str | None = "y"
+    ) -> Model | ShapeModel:
         """The model to align, similar to these points.
 
         Those that no pair shows do not change the estimate: it is that of `cadalign fit`.
@@ -95,6 +97,7 @@ class ObjectShape:
             ids=[point.semantic_id for point in known],
             mesh=mesh,
             shape_sigma=self.sigma,
+            up_axis=up_axis,
         )
 
     def length_sigmas(self, model: Model | ShapeModel) -> FloatArray:

@@ -22,7 +22,7 @@ from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.photos import Intrinsics, PhotoFile
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import CadalignError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
@@ -52,12 +52,12 @@ class PhotoState:
     """The mask that was written last, its file, and whether anything is in it."""
     fit_pending: bool = False
     """True if the alignment's file is still to be written, since the solvers were not ready."""
-    live: tuple[AnnotationDocument, LiveAlignment, Suggestion | None] | None = field(
+    live: tuple[object, LiveAlignment, Suggestion | None] | None = field(default=None, repr=False)
+    """The last alignment and suggestion, with their document and estimates of the others."""
+    estimate: tuple[AnnotationDocument, LiveEstimate | CadalignError] | None = field(
         default=None, repr=False
     )
-    """The last alignment and suggestion, with the document that they belong to."""
-    estimate: tuple[AnnotationDocument, LiveEstimate] | None = field(default=None, repr=False)
-    """The last estimate from all photos, with the document that it belongs to."""
+    """The last estimate of the object alone, from all photos, with the document it belongs to."""
 
     @property
     def document(self) -> AnnotationDocument:
@@ -227,10 +227,8 @@ class Observer:
                 others.append(each)
             elif has_evidence(image := self.image(each, to_write=to_write)):
                 others.append(image)
-        kept = owner.further
-        return replace(
-            own, others=tuple(others), place=place, sigma=kept.sigma, symmetry=kept.symmetry
-        )
+        kept = {name: getattr(owner.further, name) for name in ("sigma", "symmetry", "up_axis")}
+        return replace(own, others=tuple(others), place=place, **kept)
 
     def image(self, state: PhotoState, *, to_write: bool = False) -> ObservedImage:
         """A photo with its pairs that count and what is known beside them."""

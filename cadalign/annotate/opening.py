@@ -39,6 +39,7 @@ from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
+from cadalign.io.observation import with_lens
 from cadalign.io.observation_file import SizeFields, read_size
 
 logger = logging.getLogger("cadalign")
@@ -171,6 +172,9 @@ class _Opener:
         if options.library is not None and file.exists():  # another one may have been chosen
             model = named_model(file) or model
         files = AnnotationFiles(file, photo.path, self._models.of(model).path)
+        if options.focal is not None or options.fov is not None:
+            camera = camera or Camera.without_focal(photo.width, photo.height)
+            camera = with_lens(camera, options.focal, fov=options.fov)
         states = [self._open_object(files, photo, camera, options if is_first else None)]
         for path in object_files(file, photo.path):
             model = self._models.of(named_model(path) or options.model).path
@@ -190,10 +194,11 @@ class _Opener:
         stored = files.read(model, self._shape)
         intrinsics, focal = _intrinsics(photo, stored.camera, camera)
         likely = Priors(LIKELY_STRETCH, intrinsics.likely_focal)
-        priors = stored.priors_or(likely, exif=intrinsics.prior)
+        priors = stored.priors_or(likely)
         if self._shape is not None:  # which has a prior of its own on the stretch
             priors = replace(priors, stretch=None)
         further = stored.further if options is None else _with_options(stored.further, options)
+        further = replace(further, up_axis=self._options.up_axis or further.up_axis)
         evidence = MarkedEvidence.of(further)
         document = replace(stored.document, focal=focal, priors=priors, evidence=evidence)
         state = PhotoState(photo, files, intrinsics, History(document), model, further)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -23,6 +23,10 @@ class FileOptions:
     camera: Path | None = None
     """File of the calibrated camera: a matrix K (text, .npy or JSON), or JSON in COLMAP's form,
     Open3D's or NeRF's. Without one the focal length is estimated."""
+    focal: float | None = None
+    """Focal length of the photos [px], where no file has it, or in its place."""
+    fov: float | None = None
+    """Horizontal field of view of the photos [degrees], in the place of the focal length."""
     keypoints: Path | None = None
     """The model's keypoints: model.keypoints.json, or KeypointNet's annotations."""
     mask: Path | None = None
@@ -30,6 +34,9 @@ class FileOptions:
     size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
     """Known lengths of a single photo's object: width, height, length (along the model's x, y, z)
     and sigma, their relative standard deviation, as in --size height 0.91 sigma 0.005."""
+    up_axis: Literal["x", "y", "z"] | None = None
+    """The models' axis that points up, for their view and for gravity; by default the observation
+    file's, or y."""
     models: tuple[Path, ...] = ()
     """Further models that objects in the photos can have."""
     further_photos: tuple[Path, ...] = ()

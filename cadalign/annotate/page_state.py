@@ -49,6 +49,7 @@ def page_state(
                 "width": state.photo.width,
                 "height": state.photo.height,
                 "model": state.files.model.name,
+                "up_axis": state.owner.further.up_axis or "y",
                 "model_number": session.models.number_of(state.model.path),
                 "has_library": session.choice is not None,
                 "state": session.work_state(state),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -16,11 +15,12 @@ from PIL import ImageOps
 
 from cadalign.annotate.document import FocalChoice
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.focal import FocalPrior
 from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
-from cadalign.io.documents import Document, read_document
+from cadalign.io.documents import Document, in_file, read_document
 from cadalign.io.files import read_bytes, reading, write_json
 from cadalign.io.images import open_photo, photo_size, read_photo
 
@@ -37,8 +37,6 @@ _ORIENTATION = 0x0112  # the EXIF tag
 _TURNED = range(2, 9)  # its values for photos that are not stored upright
 _QUALITY = 95
 _THUMBNAIL = (240, 180)  # [px]
-_USUAL_LENSES = 0.4  # standard deviation of the logarithm of their focal lengths
-_DEFAULT_FOV = 60.0  # of a telephone's or a compact camera's lens [degrees]
 
 
 @dataclass(frozen=True)
@@ -132,8 +130,7 @@ class Intrinsics:
         """Prior on an unknown focal length: of the EXIF data, or that of usual lenses."""
         if self.prior is not None:
             return self.prior
-        width, height = self.camera.width, self.camera.height
-        return FocalPrior(_default_focal(width, height), _USUAL_LENSES)
+        return FocalPrior.of_usual_lenses(self.camera.width, self.camera.height)
 
     @property
     def note(self) -> str:
@@ -183,16 +180,13 @@ def intrinsics_of(photo: PhotoFile, camera: Camera | None) -> Intrinsics:
             where=str(photo.path),
             fix="give the camera of this photo",
         )
+    with in_file(photo.path):
+        require_perspective(camera, "the annotator")
     prior = FocalPrior.from_exif(photo.path)
     if camera.focal_known:
         return Intrinsics(camera, calibrated=True, prior=prior)
-    default = _default_focal(photo.width, photo.height)
-    likely = default if prior is None else prior.focal
-    return Intrinsics(camera.with_focal(likely), calibrated=False, prior=prior)
-
-
-def _default_focal(width: int, height: int) -> float:
-    return max(width, height) / 2 / math.tan(math.radians(_DEFAULT_FOV / 2))
+    likely = prior or FocalPrior.of_usual_lenses(photo.width, photo.height)
+    return Intrinsics(camera.with_focal(likely.focal), calibrated=False, prior=prior)
 
 
 def natural_key(name: str) -> tuple[tuple[str, int, str], ...]:

@@ -72,6 +72,7 @@ def notes_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[str
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
             f"{'as well' if shape is None else 'nearly as well'}: one more pair tells them apart"
         )
+    notes += live.contradictions
     return (*notes, *(warning.replace("+-", "± ") for warning in result.warnings))
 
 
@@ -193,7 +194,12 @@ def _focal(live: LiveAlignment) -> Fact:
     relative = result.std.focal
     if relative > _UNCERTAIN:
         return Fact("Focal length", *_UNDETERMINED)
-    return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", "estimated")
+    others = live.others_focal
+    note = "estimated"
+    if others is not None:
+        percent = short(100 * others.relative_sigma)
+        note += f" with the photo's other objects, which say {others.focal:.0f} px ± {percent} %"
+    return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", note)
 
 
 def _unit(shape: ObjectShape | None) -> str:

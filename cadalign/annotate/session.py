@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.document import AnnotationDocument
 from cadalign.annotate.estimate import Known, LiveEstimate, warm_up
 from cadalign.annotate.history import history_path, write_history
 from cadalign.annotate.library import ModelChoice
@@ -19,7 +19,7 @@ from cadalign.annotate.live import LiveAlignment, known_points, live_alignment, 
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry, Models
 from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.objects import Deletions, Observer, PhotoState, shown_objects
+from cadalign.annotate.objects import Deletions, Observer, PhotoState, label_of, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
 from cadalign.errors import CadalignError, DegenerateError, InputError
@@ -40,34 +40,17 @@ class ActionOutcome:
 
 @dataclass(eq=False)
 class Session:
-    """All state of an annotator; safe to use from several threads.
-
-    Parameters
-    ----------
-    models : Models
-    objects : list of lists of PhotoState
-        The objects of each photo, its own observation's first.
-    before_saving : callable
-        Raises a CadalignError where nothing may be written.
-    worklist : WorkList
-    shape : ObjectShape, optional
-        The objects', if it is estimated.
-    choice : ModelChoice, optional
-        The library that objects' models are chosen from.
-    ready : bool
-        True once the solvers are compiled and loaded, so that a fit is instant.
-    reserve : callable
-        Keeps other annotators off an object's files; raises a CadalignError if one has them.
-    """
+    """All state of an annotator; safe to use from several threads."""
 
     models: Models
-    objects: list[list[PhotoState]]
-    before_saving: Callable[[], None]
+    objects: list[list[PhotoState]]  # the objects of each photo, its own observation's first
+    before_saving: Callable[[], None]  # raises a CadalignError where nothing may be written
     worklist: WorkList
-    shape: ObjectShape | None = None
-    choice: ModelChoice | None = None
-    ready: bool = False
+    shape: ObjectShape | None = None  # the objects', if it is estimated
+    choice: ModelChoice | None = None  # the library that objects' models are chosen from
+    ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
     reserve: Callable[[Sequence[Path]], None] = lambda paths: None
+    """Keeps other annotators off an object's files; raises a CadalignError if one has them."""
 
     def __post_init__(self) -> None:
         self.lock = threading.RLock()
@@ -157,42 +140,82 @@ class Session:
 
     def live(self, state: PhotoState) -> tuple[LiveAlignment, Suggestion | None]:
         """Compute the alignment and the next-best keypoint of the current annotation."""
-        document = state.history.document
-        if state.live is not None and state.live[0] is document:
-            return state.live[1:]
         if not self.ready:
             return LiveAlignment(message="Solvers and model are being prepared."), None
+        others = self._others_focal(state)
+        key = (state.history.document, others)
+        if state.live is not None and state.live[0] == key:
+            return state.live[1:]
         suggestion = None
         try:
-            live = self._align(state, document)
+            live = self._align(state, others)
             used = state.document.keypoints
             suggestion = suggest(live, state.model.cad, state.model.registry, used, self.shape)
         except DegenerateError as error:
             live = LiveAlignment(message=f"No alignment yet: {error.what}.")
         except CadalignError as error:  # also of a mask that cannot be written or read
             live = LiveAlignment(message=f"No alignment: {error}.")
-        state.live = (document, live, suggestion)
+        state.live = (key, live, suggestion)
         return live, suggestion
 
-    def _align(self, state: PhotoState, document: AnnotationDocument) -> LiveAlignment:
+    def _align(self, state: PhotoState, others: Mapping[str, LiveEstimate]) -> LiveAlignment:
         """The alignment with all photos of the object, as this one shows it."""
-        owner, pairs = state.owner, state.document.complete_pairs
-        observation, place = self.observed(state)
+        missing = self._missing(state)
+        if missing:
+            return LiveAlignment(message=missing)
+        estimate = self._alone(state).beside(label_of(state), others)
+        pairs = state.document.complete_pairs
         points = [state.model.registry[pair.keypoint or 0] for pair in pairs]
-        missing = missing_text(
-            known_points(self.shape, points),
+        uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
+        known, lines = self._known(state), state.model.wireframe
+        return live_alignment(estimate, known, lines, *self.observed(state), points, uv)
+
+    def _missing(self, state: PhotoState) -> str:
+        """Say what the first alignment needs; empty if nothing."""
+        observation, _ = self.observed(state)
+        pairs = state.document.complete_pairs
+        return missing_text(
+            known_points(self.shape, [state.model.registry[pair.keypoint or 0] for pair in pairs]),
             self.shape,
             is_plain=observation.is_plain and self.shape is None,
             has_others=len(observation.views) > 1,
         )
-        if missing:
-            return LiveAlignment(message=missing)
-        known = self._known(state)
+
+    def _alone(self, state: PhotoState) -> LiveEstimate:
+        """The estimate from all photos of the object, apart from others; raises a CadalignError."""
+        owner, document = state.owner, state.history.document
         if owner.estimate is None or owner.estimate[0] is not document:
-            owner.estimate = document, LiveEstimate.of(known, observation)
-        uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
-        lines = state.model.wireframe
-        return live_alignment(owner.estimate[1], known, lines, observation, place, points, uv)
+            try:
+                estimate = LiveEstimate.of(self._known(state), self.observed(state)[0])
+            except CadalignError as error:
+                owner.estimate = document, error
+            else:
+                owner.estimate = document, estimate
+        found = owner.estimate[1]
+        if isinstance(found, CadalignError):
+            raise found
+        return found
+
+    def _others_focal(self, state: PhotoState) -> dict[str, LiveEstimate]:
+        """Estimates of the photo's other objects that tell of its focal length, by their labels.
+
+        Each is of the object alone, so that they depend neither on each other nor on the order.
+        """
+        others = self._beside(state.owner)
+        if not (others and self.estimates_focal(state)):
+            return {}
+        found = {}
+        for each in others:
+            with suppress(CadalignError):
+                if self.estimates_focal(each) and not self._missing(each):
+                    found[label_of(each)] = self._alone(each)
+        return {label: estimate for label, estimate in found.items() if estimate.tells_focal}
+
+    def _beside(self, state: PhotoState) -> list[PhotoState]:
+        """The other objects of a photo of the object."""
+        number, _ = self.place_of(state)
+        shown = shown_objects(self.objects[number])
+        return [each for each in shown if each.owner is not state.owner]
 
     def observed(self, state: PhotoState) -> tuple[Observation, int]:
         """The pairs that count with the evidence beside them, and the photo's number in it."""
@@ -245,6 +268,7 @@ class Session:
         Objects that could not be written before are written too.
         """
         self._write(state.owner)
+        self._write_others(state.owner)
         if not state.owner.save_error:
             for other in self.unsaved:
                 self._write(other)
@@ -290,6 +314,20 @@ class Session:
             state.save_error = ""
             state.saved_at = time.time()
 
+    def _write_others(self, owner: PhotoState) -> None:
+        """Write the alignments of saved objects that share the focal length of a changed one."""
+        for view in (owner, *owner.views):
+            for other in (each.owner for each in self._beside(view)):
+                before = other.live
+                if not self.ready or other.saved_at is None or other.save_error:
+                    continue
+                self.live(other)
+                if other.live is not before:
+                    try:
+                        self._write_fit(other)
+                    except CadalignError as error:
+                        other.save_error = str(error)
+
     def _write_object(self, state: PhotoState, *, with_fit: bool) -> None:
         """Write keypoints, observation and alignment of an object; raises DataError on failure."""
         live, _ = self.live(state)
@@ -299,9 +337,16 @@ class Session:
         # First the keypoints, which the observation names.
         state.model.write_keypoints(used)
         stored = {} if state.further.sigma is None else {"sigma": state.further.sigma}
-        priors = state.document.priors.fit_options(state.intrinsics.prior)
+        priors = state.document.priors.fit_options(state.intrinsics.likely_focal)
         options = {**stored, **priors, **live.fit_options}
         state.files.write(self.observer.observation(state, fit_options=options, to_write=True))
         if with_fit:
-            # An alignment by assumptions is shown but not written: `cadalign fit` would refuse it.
-            state.files.write_fit(None if live.provisional else live.result)
+            self._write_fit(state)
+
+    def _write_fit(self, state: PhotoState) -> None:
+        """Write the alignment of an object; raises DataError on failure.
+
+        An alignment by assumptions is shown but not written: `cadalign fit` would refuse it.
+        """
+        live, _ = self.live(state)
+        state.files.write_fit(None if live.provisional else live.result)

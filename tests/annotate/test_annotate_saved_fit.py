@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from support.annotating import Case
+from support.annotating import Case, fitted, place_all
 
 from cadalign import Result
 from cadalign.annotate.actions import perform
@@ -68,13 +68,13 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     saved = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
     assert page.std is not None
     np.testing.assert_allclose(flat(command["std"]), flat(asdict(page.std)), rtol=1e-9)
-    for fitted in (Result.from_json(json.dumps(command)), saved):
-        np.testing.assert_allclose(fitted.covariance, page.covariance, rtol=1e-9, atol=1e-15)
+    for read in (Result.from_json(json.dumps(command)), saved):
+        np.testing.assert_allclose(read.covariance, page.covariance, rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(
-            flat(fitted.alignment.to_dict()), flat(page.alignment.to_dict()), rtol=1e-9, atol=1e-9
+            flat(read.alignment.to_dict()), flat(page.alignment.to_dict()), rtol=1e-9, atol=1e-9
         )
-        assert fitted.camera.fx == pytest.approx(page.camera.fx, rel=1e-9)
-        assert fitted.warnings == page.warnings
+        assert read.camera.fx == pytest.approx(page.camera.fx, rel=1e-9)
+        assert read.warnings == page.warnings
     shown = page_state(session, 0)["alignment"]
     assert flat(shown["alignment"]) == flat(page.alignment.to_dict())
     assert shown["rms"] == page.rms
@@ -135,4 +135,16 @@ def test_a_stored_sigma_counts_and_is_kept(
     assert live.sigma == 3.0
     assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
     command = Result.from_json(capsys.readouterr().out)
+    np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_a_prior_that_is_switched_off_is_so_in_fit(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = case.open(camera=None)
+    place_all(session, case)
+    perform(session, 0, {"do": "prior", "focal": False})
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None
+    command = Result.from_json(json.dumps(fitted(case, capsys)))
     np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)

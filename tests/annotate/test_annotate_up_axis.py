@@ -1,0 +1,132 @@
+"""Models whose up axis is not y: files, gravity, and how the page shows them."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+from support.annotating import IDLE, Case, fitted, flat, opened_page, place, place_all, wait
+
+from cadalign.annotate.actions import perform
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session
+from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
+from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.write import write_obj_mesh
+from cadalign.io.observation import Observation
+
+pytestmark = pytest.mark.long
+
+FROM_Y_UP = {
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+}
+
+
+def turned(case: Case, axis: str) -> Case:
+    """The same photo with the model turned such that an axis of it points up."""
+    mesh, path = load_mesh(case.model), case.folder / f"{axis}_up.obj"
+    write_obj_mesh(path, replace(mesh, vertices=mesh.vertices @ FROM_Y_UP[axis].T))
+    given = ModelKeypoints.load(case.keypoints)
+    points = [
+        ModelKeypoint(each.name, tuple(FROM_Y_UP[axis] @ each.xyz), each.semantic_id)
+        for each in given.keypoints
+    ]
+    keypoints = path.with_suffix(".given.keypoints.json")
+    ModelKeypoints(tuple(points), path).save(keypoints)
+    return replace(case, model=path, keypoints=keypoints)
+
+
+def add_verticals(session: Session, case: Case) -> None:
+    """Mark vertical edges about the object, as the photo shows them."""
+    camera, pose = case.instance.camera, case.instance.cam_from_model
+    for x, z in ((-0.3, -0.3), (0.3, -0.3), (0.3, 0.3)):
+        ends = camera.project(pose.apply(np.array([[x, -0.2, z], [x, 0.2, z]]))).tolist()
+        perform(session, 0, {"do": "vertical", "ends": ends})
+
+
+def test_the_up_axis_is_written_and_kept(case: Case) -> None:
+    z_up = turned(case, "z")
+    place_all(z_up.open(up_axis="z"), z_up)
+    assert Observation.load(case.observation).up_axis == "z"
+    again = z_up.open()
+    assert page_state(again, 0)["image"]["up_axis"] == "z"
+    place(again, again.registry.add(again.model.samples[0]), [300.0, 200.0])
+    assert Observation.load(case.observation).up_axis == "z"
+    perform(again, 0, {"do": "add_object"})
+    assert page_state(again, 0, slot=1)["image"]["up_axis"] == "z"
+    for pair in again.objects[0][0].document.pairs:  # a file without keypoints keeps it, too
+        perform(again, 0, {"do": "delete", "pair": pair.number}, slot=0)
+    assert page_state(z_up.open(), 0)["image"]["up_axis"] == "z"
+
+
+def test_a_model_with_y_up_needs_no_word(case: Case) -> None:
+    place(case.open(), *case.clicks[0])
+    assert "up_axis" not in json.loads(case.observation.read_text())
+
+
+def test_gravity_is_that_of_the_up_axis(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    z_up = turned(case, "z")
+    session = z_up.open(up_axis="z")
+    place_all(session, z_up)
+    add_verticals(session, z_up)
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None
+    assert not any("gravity" in warning for warning in live.result.warnings)
+    wanted = case.instance.cam_from_model.rotation @ FROM_Y_UP["z"].T
+    error = np.trace(wanted.T @ live.result.alignment.rotation)
+    assert np.degrees(np.arccos(np.clip((error - 1) / 2, -1, 1))) < 3
+    page = live.result.to_dict()["alignment"]
+    command = fitted(z_up, capsys)["alignment"]
+    np.testing.assert_allclose(flat(command), flat(page), rtol=1e-9, atol=1e-12)
+    wrong = z_up.open(up_axis="y")
+    notes = page_state(wrong, 0)["alignment"]["notes"]
+    assert any("up axis (up_axis='z')" in note for note in notes)
+
+
+def up_on_screen(page: Page, axis: str) -> list[float]:
+    """Where a step along an axis of the model goes on the screen [px], y upwards."""
+    step = {"x": [0.3, 0, 0], "y": [0, 0.3, 0], "z": [0, 0, 0.3]}[axis]
+    return list(
+        page.evaluate(
+            """step => {
+                const { x, y } = annotator.model.toPage([0, 0, 0]);
+                const end = annotator.model.toPage(step);
+                return [end.x - x, y - end.y];
+            }""",
+            step,
+        )
+    )
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_the_model_stands_upright_on_the_page(case: Case, browser: Browser, axis: str) -> None:
+    case = turned(case, axis)
+    session = case.open(up_axis=axis)
+    place_all(session, case)
+    with opened_page(browser, session) as page:
+        for key in ("", "ArrowLeft", "ArrowUp", "1", "2", "3"):
+            if key in ("1", "2", "3"):
+                page.keyboard.press(key)
+            elif key:
+                page.locator("section[aria-label=Model] canvas").press(key)
+            page.wait_for_timeout(50)
+            aside, up = up_on_screen(page, axis)
+            assert up > 20
+            assert abs(aside) < 0.02 * up
+        page.keyboard.press("r")  # the result stands as the photo does
+        wait(page, f"{IDLE} && annotator.model.result")
+        assert page.evaluate("annotator.model.stage.camera.up.toArray()") == [0, 1, 0]
+        page.keyboard.press("r")
+        wait(page, f"{IDLE} && !annotator.model.result")
+        aside, up = up_on_screen(page, axis)
+        assert up > 20
+        assert abs(aside) < 0.02 * up
+        folder = os.environ.get("SHOTS")
+        if folder:
+            page.wait_for_timeout(300)
+            page.screenshot(path=f"{folder}/{axis}_up.png")

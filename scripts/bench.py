@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from benchmarks.accuracy import Coverage, Solvers, UnknownFocal
+from benchmarks.accuracy import Coverage, Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
-from benchmarks.fits import Fits
+from benchmarks.cameras import PhotoLenses, Scenes
 from benchmarks.masks import Masks
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
-from benchmarks.runs import Evaluation, Ransac
+from benchmarks.runs import Evaluation, Fits, Ransac, RealDetections
 from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Section
 from benchmarks.shapes import Align, FocalShapes, Similar
 from benchmarks.speed import Calls, Cold, Rendering
@@ -37,8 +37,11 @@ SECTIONS: dict[str, type[Section]] = {
     "solvers": Solvers,
     "cold": Cold,
     "calls": Calls,
+    "wide": WideLenses,
     "focal": UnknownFocal,
     "focal_shapes": FocalShapes,
+    "lenses": PhotoLenses,
+    "scenes": Scenes,
     "calibration": Coverage,
     "render": Rendering,
     "annotator": Annotator,
@@ -47,11 +50,12 @@ SECTIONS: dict[str, type[Section]] = {
     "retrieval": Retrieval,
     "evaluation": Evaluation,
     "fits": Fits,
+    "detections": RealDetections,
     "ransac": Ransac,
     "unseen_retrieval": UnseenRetrieval,
     "similar": Similar,
 }
-ON_REQUEST = ("unseen_retrieval", "similar")
+ON_REQUEST = ("detections", "unseen_retrieval", "similar")
 STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2
 

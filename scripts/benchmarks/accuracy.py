@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,7 @@ from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
+from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
@@ -58,6 +59,8 @@ _UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.heigh
 _ROBUST_POINTS = 100
 _LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25
 _COVERED = 0.95
+_FIELDS = (120, 180, 200)  # of view [degrees]
+_WIDE_SIDE = 1000  # of their images [px]
 _CALIBRATED_SIZES = (5, 6, 7, 8, 10, 20, 50, 100)
 
 Draw = Callable[[np.random.Generator], Problem]
@@ -104,12 +107,7 @@ class Solvers:
         ]
         if given.keypointnet is not None:
             sources += _keypointnet_sources(given.keypointnet)
-        for name, noise, draw in sources:
-            rng = np.random.default_rng(given.seed)
-            problems = [draw(rng) for _ in range(self.problems)]
-            limit = ideal_errors(problems, rng, sigma=noise, focal="known")
-            for method in _METHODS:
-                yield {"problems": name, **_accuracy_row(problems, noise, method, limit)}
+        return _accuracy_rows(sources, self.problems, given.seed)
 
     def _minimal(self, given: BenchmarkData) -> Row:
         """Rate of the truth among the solutions, and their number."""
@@ -124,6 +122,62 @@ class Solvers:
             found += bool((np.abs(poses - problem.alignment.packed) < 1e-4).all(axis=1).any())
         share, mean = 100 * found / self.problems, solutions / self.problems
         return {"truth found %": share, "solutions on average": mean}
+
+
+@dataclass
+class WideLenses:
+    """Accuracy of fits with wide lenses against the Cramer-Rao bound.
+
+    Objects lie anywhere in the field of view, which fills an image of 1000 x 1000 px.
+    """
+
+    problems: int = 1000
+    """Random problems per row."""
+    points: int = 20
+    """Keypoints of an object."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure accuracy at several fields of view."""
+        half = (_WIDE_SIDE - 1) / 2
+        sources: list[tuple[str, float, Draw]] = []
+        for field in _FIELDS:
+            reach = np.radians(field / 2)
+            omega = 0.9
+            bend = np.arctan2(2 * np.tan(omega / 2) * np.sin(reach), np.cos(reach)) / omega
+            for lens, focal, coefficients in (
+                ("fisheye", half / reach, ()),
+                ("fov", half / bend, (omega,)),
+            ):
+                size = (_WIDE_SIDE, _WIDE_SIDE)
+                camera = Camera(*size, focal, focal, half, half, coefficients, lens=lens)
+                draw = partial(_wide_problem, camera, reach, self.points)
+                sources.append((f"{lens}, {field} degrees", 1.0, draw))
+        title = "Errors over the Cramer-Rao limit's: median (90th percentile)"
+        yield RatioTable(title, list(_accuracy_rows(sources, self.problems, given.seed)))
+
+
+def _accuracy_rows(
+    sources: Iterable[tuple[str, float, Draw]], count: int, seed: int
+) -> Iterator[Row]:
+    """Errors of every method on so many problems of each source."""
+    for name, noise, draw in sources:
+        rng = np.random.default_rng(seed)
+        problems = [draw(rng) for _ in range(count)]
+        limit = ideal_errors(problems, rng, sigma=noise, focal="known")
+        for method in _METHODS:
+            yield {"problems": name, **_accuracy_row(problems, noise, method, limit)}
+
+
+def _wide_problem(camera: Camera, reach: float, points: int, rng: np.random.Generator) -> Problem:
+    """A problem as `simulate_problem` draws them, turned to anywhere in a field of view."""
+    while True:
+        drawn = simulate_problem(rng, points=points, noise_px=0.0, depth=(3.0, 6.0))
+        pose = turned_alignment(drawn.alignment, random_rotation(rng))
+        seen = pose.apply(drawn.points_3d)
+        if (np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]) < reach).all():
+            pixels = camera.project(seen)
+            pixels += rng.standard_normal(pixels.shape)
+            return Problem(drawn.points_3d, pixels, camera, pose, None)
 
 
 def _keypointnet_sources(root: Path) -> Iterator[tuple[str, float, Draw]]:
@@ -190,12 +244,17 @@ def _accuracy_row(
 
 def _is_missed(problem: Problem, noise: float, est: Alignment) -> bool:
     """True if a refinement from the truth ends at a better alignment."""
-    rays = problem.camera.normalize(problem.points_2d)
-    whitening = whitening_of(noise, rays, problem.camera)
+    camera = faced(problem.camera, problem.points_2d)
+    truth, found = (
+        turned_alignment(each, camera.lens_from_camera.T).packed
+        for each in (problem.alignment, est)
+    )
+    rays = camera.normalize(problem.points_2d)
+    whitening = whitening_of(noise, rays, camera)
     objective = keypoint_objective(problem.points_3d, rays, whitening)
     objective = objective._replace(scale_prior=BOUNDING_PRIOR)
-    cost, _, _ = refine(objective, 200, problem.alignment.packed)
-    return bool(cost < evaluate_cost(objective, est.packed) * (1 - 1e-6) - 1e-9)
+    cost, _, _ = refine(objective, 200, truth)
+    return bool(cost < evaluate_cost(objective, found) * (1 - 1e-6) - 1e-9)
 
 
 def _speed(problem: Problem, points: int, repetitions: int) -> Iterator[Row]:
@@ -254,6 +313,7 @@ class UnknownFocal:
             [problem.points_2d for problem in problems],
             _UNKNOWN,
             focal="estimate",
+            focal_prior=None,
             workers=-1,
         )
         errors = []
@@ -325,16 +385,19 @@ class Coverage:
         """Regions of rotation, translation and lengths, by what is estimated from how much."""
         for kind in _KINDS:
             for points in _REGION_SIZES:
-                squares: list[FloatArray] = []
+                reached: list[FloatArray] = []
                 for number in range(self.region_problems):
                     rng = np.random.default_rng([given.seed, points, number])
                     try:
                         result, truth = _estimated(rng, kind, points, self.noise_px)
                     except CadalignError:
                         continue
-                    squares.append(_squares(result, truth))
-                within = np.array(squares)
-                row: Row = {"estimate": kind, "keypoints": points, "results": len(squares)}
+                    reached.append(_regions_reached(result, truth))
+                row: Row = {"estimate": kind, "keypoints": points, "results": len(reached)}
+                if not reached:  # all were refused
+                    yield row
+                    continue
+                within = np.array(reached)
                 for column, name in enumerate(("R", "t", "lengths")):
                     shares = [
                         100 * float((within[:, column] <= share).mean()) for share in (0.68, 0.95)
@@ -431,18 +494,14 @@ def _estimated(
     return cadalign.fit(model, seen[0], camera, **options), truth
 
 
-def _squares(result: Result, truth: Alignment) -> FloatArray:
+def _regions_reached(result: Result, truth: Alignment) -> FloatArray:
     """Nominal probabilities (3,) of the regions of R, t and lengths that reach the truth."""
     covariance = result.covariance
     assert covariance is not None
-    est = result.alignment
-    vector = Rotation.from_matrix(truth.rotation @ est.rotation.T).as_rotvec()
-    errors = (vector, truth.translation - est.translation, np.log(truth.scale / est.scale))
-    found = []
-    for first, error in zip((0, 3, 6), errors, strict=True):
+    errors, found = _errors_of(result.alignment, truth), []
+    for first in (0, 3, 6):
         rows = [row for row in range(first, first + 3) if covariance[row, row] > 0]
-        kept = error[[row - first for row in rows]]
-        square = kept @ np.linalg.solve(covariance[np.ix_(rows, rows)], kept)
+        square = _square(errors, covariance, rows)
         found.append(probability_within(square, len(rows), result.degrees_of_freedom))
     return np.array(found)
 
@@ -493,10 +552,18 @@ def _is_large(result: Result, gt: Alignment) -> bool:
 def _holds(result: Result, gt: Alignment, covariance: np.ndarray | None) -> bool:
     """True if the truth lies within the 95 % ellipsoid."""
     assert covariance is not None
-    est = result.alignment
+    free = np.flatnonzero(covariance.diagonal()).tolist()
+    square = _square(_errors_of(result.alignment, gt), covariance, free)
+    return bool(square < chdtri(len(free), 1 - _COVERED))
+
+
+def _errors_of(est: Alignment, gt: Alignment) -> FloatArray:
+    """Errors (9,) of an alignment, in the order of a result's covariance."""
     vector = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
-    shift, log_ratio = gt.translation - est.translation, np.log(gt.scale / est.scale)
-    free = np.flatnonzero(covariance.diagonal())
-    error = np.concatenate([vector, shift, log_ratio])[free]
-    square = error @ np.linalg.solve(covariance[np.ix_(free, free)], error)
-    return bool(square < chdtri(len(error), 1 - _COVERED))
+    return np.concatenate([vector, gt.translation - est.translation, np.log(gt.scale / est.scale)])
+
+
+def _square(errors: FloatArray, covariance: FloatArray, rows: list[int]) -> float:
+    """Squared Mahalanobis distance of some of the errors."""
+    kept = errors[rows]
+    return float(kept @ np.linalg.solve(covariance[np.ix_(rows, rows)], kept))

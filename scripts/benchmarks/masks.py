@@ -15,7 +15,7 @@ from benchmarks.section import LIMIT_DRAWS, BenchmarkData, RatioTable, Row, cloc
 from cadalign import Camera, Model, View, align
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import CadalignError, RenderError
-from cadalign.estimation.contours.bound import contour_bound
+from cadalign.estimation.contours.view_contour import contour_bound
 from cadalign.evaluation.instances.scene import DAMAGES, damaged_mask
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import rotation_from_vector

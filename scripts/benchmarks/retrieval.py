@@ -6,10 +6,11 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from benchmarks.section import (
@@ -19,8 +20,9 @@ from benchmarks.section import (
     clocked,
     figure,
     reference_seconds,
+    used_by_command,
 )
-from cadalign import Box, Library, ShapeModel
+from cadalign import Box, Library, Observation, ShapeModel
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
@@ -52,6 +54,8 @@ class Retrieval:
     sizes: tuple[int, ...] = (50_000,)
     """Models of the libraries that are filled up with synthetic ones; a curve: 1000 10000 50000
     200000."""
+    run_queries: int = 1000
+    """Queries of a run of `cadalign retrieve` by two processes, for each of these sizes."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure all libraries."""
@@ -62,6 +66,8 @@ class Retrieval:
                 path = Path(folder, "library")
                 _jittered(mixed, size).save(path)
                 yield self._measure(path, mixed[:size])
+                if size in self.sizes:
+                    yield RatioTable("Queries as a run", [self._run(path, mixed[:size])])
 
     def _measure(self, path: Path, models: Sequence[LibraryModel]) -> RatioTable:
         """Opening, and queries of three levels of noise."""
@@ -77,6 +83,25 @@ class Retrieval:
         for noise_px in (1.0, 3.0, 5.0):
             rows += self._queries(library, shown, noise_px)
         return RatioTable(f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows)
+
+    def _run(self, path: Path, models: Sequence[LibraryModel]) -> Row:
+        """Queries a second of a whole run, start and table included."""
+        seeds = range(1 + self.run_queries)  # each model may show enough keypoints once only
+        found = chain.from_iterable(_observed(models, 1.0, seed=seed) for seed in seeds)
+        file = path.with_name("queries.jsonl")
+        with file.open("wb") as queries:
+            for _, seen in islice(found, self.run_queries):
+                points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.semantic_ids)
+                query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, semantic_ids=ids)
+                queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
+        out = path.with_name("run")
+        command = ["retrieve", str(file), f"--library={path}", f"--out={out}", "--no-picture"]
+        reference = reference_seconds()
+        used = used_by_command([*command, "--workers=2"])
+        reference = min(reference, reference_seconds())
+        name = f"run of {self.run_queries:,} queries, two processes"
+        row = figure(name, self.run_queries / used.wall, "1/s", used.processor / reference)
+        return row | {"MB": used.megabytes}
 
     def _queries(
         self, library: Library, models: Sequence[LibraryModel], noise_px: float

@@ -138,6 +138,31 @@ def used_by_command(call: list[str]) -> Used:
     return Used(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
 
 
+def rate_and_memory(
+    rate: str, memory: str, count: int, run: Callable[[int], Used]
+) -> Iterator[Row]:
+    """Rate of what a longer run does more than a shorter one, ``count`` items, and its memory.
+
+    ``run`` does the shorter run for 0, the longer one for 1. The rate's ratio is that of processor
+    time to `reference_seconds`, the memory's the longer run's over the shorter one's.
+    """
+    reference = reference_seconds()
+    short, long = run(0), run(1)
+    reference = min(reference, reference_seconds())
+    busy = (long.processor - short.processor) / count
+    yield figure(rate, count / (long.wall - short.wall), "1/s", 1e3 * busy / reference)
+    yield figure(memory, long.megabytes, "MB", long.megabytes / short.megabytes)
+
+
+def dask_over_processes(name: str, run: Callable[[str], Used]) -> Row:
+    """Time of a run by two Dask workers over two processes; ``run`` is given the option of each."""
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        on_dask = run(f"--dask={cluster.scheduler_address}")
+    return figure(name, on_dask.wall, "s", on_dask.wall / run("--workers=2").wall)
+
+
 def medians_in_turns(
     measures: Mapping[str, Callable[[], float]], count: int, *, per_turn: int = 1
 ) -> dict[str, float]:

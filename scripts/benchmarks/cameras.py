@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from cadalign.datasets.photos.kitti import KittiLabel, read_labels
 from cadalign.errors import CadalignError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
-from cadalign.evaluation.simulation.problems import simulate_standing_boxes
+from cadalign.evaluation.simulation.problems import Problem, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.render import look_at
@@ -41,6 +42,7 @@ _SIDE, _HEIGHT = 640, 480
 _UNKNOWN = Camera.without_focal(_SIDE, _HEIGHT)
 _WITHIN_95, _VIEWPOINT_DEG = 1.96, 30.0
 _SHORTEST_MM, _MEDIAN_MM, _SHAPE, _LONGEST_MM, _FILM_MM = 14.0, 17.0, 0.8, 200.0, 36.0
+_SCALE_SIGMA, _TILT_SIGMA = 0.3, math.radians(1.0)
 _WIDTHS = 0.06  # relative standard deviation of cars' widths
 _PRIORS = ("none", "usual", "EXIF", "known")
 
@@ -181,12 +183,17 @@ class Scenes:
             )
             objects = [
                 SceneObject(
-                    Model(points_3d=each.points_3d, bounds=boxes.BOUNDS, scale_prior_sigma=0.3),
+                    Model(
+                        points_3d=each.points_3d,
+                        bounds=boxes.BOUNDS,
+                        scale_prior_sigma=_SCALE_SIGMA,
+                    ),
                     View(_UNKNOWN, each.points_2d),
                 )
                 for each in boxes.problems
             ]
             scene = align_scene(objects, share=share)
+            found["bound"].append(_focal_bound(boxes.problems, share, self.noise_px))
             off = float(np.log(scene.camera.fx / focal))
             found["focal"].append(off)
             found["held"].append(abs(off) < _WITHIN_95 * scene.focal_std)
@@ -200,6 +207,7 @@ class Scenes:
             "objects": count,
             "share": ", ".join(share),
             "focal rms %": 100 * float(np.sqrt(np.mean(np.square(found["focal"])))),
+            "bound %": 100 * float(np.sqrt(np.mean(np.square(found["bound"])))),
             "in 95 % interval": 100 * float(np.mean(found["held"])),
             "R deg": float(np.median(found["R"])),
             "depth %": 100 * float(np.median(found["depth"])),
@@ -248,6 +256,37 @@ class Scenes:
                 SceneObject(model, View(camera, uv, sigma=sigma, **evidence), size) for uv in pixels
             ]
             yield name, align_scene(objects, share=share).results, truths
+
+
+def _focal_bound(problems: Sequence[Problem], share: Sequence[str], noise_px: float) -> float:
+    """Cramer-Rao bound of the log focal length with the priors, by differences about the truth.
+
+    Unknowns are the log focal length, the pose and two log scales of each object, and gravity where
+    it is shared.
+    """
+
+    def residuals(unknowns: FloatArray) -> FloatArray:
+        focal, gravity, *objects = np.split(unknowns, [1, 4, *range(12, len(unknowns), 8)])
+        rows = [focal / FocalPrior.of_usual_lenses(_SIDE, _HEIGHT).relative_sigma]
+        for each, moved in zip(problems, objects, strict=True):
+            camera, truth = each.camera, each.alignment
+            turn = rotation_from_vector(moved[:3]) @ truth.rotation
+            scale = truth.scale * np.exp([0.0, *moved[6:]])
+            pose = Alignment(turn, truth.translation + moved[3:6], scale)
+            seen = camera.with_focal(camera.fx * float(np.exp(focal[0])))
+            rows += [seen.project(pose.apply(each.points_3d)).ravel() / noise_px]
+            rows += [moved[6:] / _SCALE_SIGMA]
+            if "gravity" in share:
+                rows += [(turn[:, 1] - gravity) / _TILT_SIGMA]
+        return np.concatenate(rows)
+
+    middle, step = np.zeros(4 + 8 * len(problems)), 1e-5
+    used = [k for k in range(len(middle)) if "gravity" in share or not 1 <= k < 4]
+    columns = np.eye(len(middle))[used] * step
+    jacobian = np.stack(
+        [(residuals(middle + each) - residuals(middle - each)) / (2 * step) for each in columns]
+    )
+    return float(np.sqrt(np.linalg.inv(jacobian @ jacobian.T)[0, 0]))
 
 
 def _pose_of(label: KittiLabel, mean: FloatArray) -> Alignment:

@@ -19,6 +19,7 @@ _DECISIVE = 12.0  # the same where nothing is rejected
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 _MOST_INSIDE = 0.8  # of the keypoints lie in their image
+_SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
 
 
 class Explained(NamedTuple):
@@ -177,20 +178,46 @@ def _listed(clauses: Sequence[str]) -> str:
 def outside_image(
     points_2d: FloatArray, camera: Camera, *, agree: bool, where: str = ""
 ) -> tuple[str, ...]:
-    """Warn about keypoints (n, 2) that are none of the image's.
+    """Warn about keypoints (n, 2) and a principal point that are none of the image's.
 
-    All of them lie beyond one side, or, where they do not ``agree``, most outside: of an object
+    All keypoints lie beyond one side, or, where they do not ``agree``, most outside: of an object
     that is hidden or cropped, some may, and they may surround the image.
     """
+    doubts = _doubts_of_camera(camera, where)
     count = int((~camera.contains(points_2d)).sum())
     if 2 * count <= len(points_2d):
-        return ()
+        return doubts
     last = np.array([camera.width, camera.height]) - PIXEL_CENTRE
     beyond = (points_2d < -PIXEL_CENTRE).all(axis=0) | (points_2d > last).all(axis=0)
     if agree and not beyond.any():
-        return ()
+        return doubts
     return (
+        *doubts,
         f"{where}{count} of {len(points_2d)} keypoints lie outside of the image of {camera.width} "
         f"x {camera.height} px: are they of another resolution than the camera, or of another "
         "photo?",
+    )
+
+
+def _doubts_of_camera(camera: Camera, where: str) -> tuple[str, ...]:
+    """Warn about a principal point that is the middle of another image, or outside of its own."""
+    if camera.is_centred:
+        return ()
+    size, own = f"{camera.width} x {camera.height} px", f"({camera.cx:.4g}, {camera.cy:.4g})"
+    middle = 2 * (camera.cx + PIXEL_CENTRE), 2 * (camera.cy + PIXEL_CENTRE)
+    for factor in OTHER_SIZES:
+        other = camera.width * factor, camera.height * factor
+        apart = (abs(a - b) / b for a, b in zip(middle, other, strict=True))
+        if max(apart) < _SAME_MIDDLE:
+            return (
+                f"{where}the camera's principal point {own} is the middle of an image of "
+                f"{other[0]:.0f} x {other[1]:.0f} px, its own has {size}: if the photo was resized "
+                f"(not cut out), give Camera.resized({camera.width}, {camera.height}) of the "
+                "camera of that size",
+            )
+    if camera.contains(np.array([[camera.cx, camera.cy]])).all():
+        return ()
+    return (
+        f"{where}the camera's principal point {own} lies outside of its image of {size}, which is "
+        "right only for a photo cut out of a larger one: compare the camera with the photo's size",
     )

@@ -15,6 +15,7 @@ from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
 from cadalign.geometry.camera_form import CameraForm, read_form, read_matrix, write_form
 from cadalign.geometry.pixels import (
     FOCAL_FIX,
+    PIXEL_CENTRE,
     LensKind,
     PixelOrigin,
     checked_coefficients,
@@ -511,6 +512,12 @@ class Camera:
             slopes = self.projection_slopes(_homogeneous(normalized))[:, :, :2]
             return np.asarray(slopes / np.array([[self.fx], [self.fy]]))
         return distort(normalized, self.lens, self.distortion)[1]
+
+    @property
+    def is_centred(self) -> bool:
+        """True if the principal point is within an eighth of the image's size of its middle."""
+        x, y = (self.cx + PIXEL_CENTRE) / self.width, (self.cy + PIXEL_CENTRE) / self.height
+        return max(abs(x - 1 / 2), abs(y - 1 / 2)) < 1 / 8
 
     def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> BoolArray:
         """Say which pixels (n, 2) lie inside the image by at least ``margin`` [px]; (n,) bool."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign import Alignment, Camera, fit
+from cadalign import Alignment, Camera, Model, View, align, fit
 from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import rotation_from_vector
 
@@ -63,3 +63,35 @@ def test_named_camera_is_kept_in_json() -> None:
 
 def _of_double_size(seed: int) -> Result:
     return fitted(seed, factor=2.0)
+
+
+@pytest.mark.parametrize(
+    ("camera", "words"),
+    [
+        (Camera(640, 480, 1870, 1870, 639.5, 479.5), "the middle of an image of 1280 x 960 px"),
+        (Camera(640, 480, 467.5, 467.5, 159.5, 119.5), "the middle of an image of 320 x 240 px"),
+        (Camera(640, 480, 935, 935, 900, 239.5), "(900, 239.5) lies outside of its image"),
+    ],
+    ids=["larger image", "smaller image", "outside"],
+)
+def test_principal_points_of_other_images_are_named(camera: Camera, words: str) -> None:
+    points, pixels = _seen_by(CAMERA)
+    assert words in " ".join(fit(points, pixels, camera).warnings)
+    similar = Model(points_3d=points, shape_sigma=0.03)
+    views = [View(CAMERA, pixels), View(camera, pixels)]
+    (named,) = (text for text in align(similar, views).warnings if words in text)
+    assert named.startswith("views[1]: ")
+
+
+@pytest.mark.parametrize("corner", [(100, 50), (150, 100), (40, 0)])
+def test_principal_points_of_parts_of_photos_are_not(corner: tuple[int, int]) -> None:
+    camera = CAMERA.cropped(*corner, 480, 360)
+    points, pixels = _seen_by(camera)
+    assert "principal" not in " ".join(fit(points, pixels, camera).warnings)
+
+
+def _seen_by(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.3, 0.3, (20, 3))
+    pose = Alignment(rotation_from_vector(rng.normal(0, 1.5, 3)), [0, 0, 2.0], [1, 1.1, 0.9])
+    return points, camera.project(pose.apply(points)) + rng.normal(0, 1, (20, 2))

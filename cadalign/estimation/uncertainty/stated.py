@@ -116,9 +116,9 @@ class KeypointStatistics(FittedKeypoints):
         return np.asarray(self.camera.project_where_ahead(in_camera) - self.residuals[ahead])
 
     def _placed(self) -> tuple[str, ...]:
-        """Warnings about keypoints outside of the image."""
+        """Warnings about keypoints and a principal point outside of the image."""
         observed = self._observed
-        if self.camera.contains(observed).all():
+        if self.camera.is_centred and self.camera.contains(observed).all():
             return ()
         from cadalign.estimation.mistakes import outside_image  # rarely asked
 

@@ -235,7 +235,6 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
             with_evidence=tuple(dict.fromkeys((RIGID, protocol.best))),
             evidence=_evidence(dataset),
             has_shape=bool(shapes),
-            up_axis=protocol.up_axis,
         )
         options = replace(options, methods=methods)
     tasks = PhotoTasks(dataset, options.max_photos)

@@ -198,7 +198,6 @@ def _calibrated(sighting: Sighting) -> Sighting:
 
 
 _UP_SIGMA_DEG = 3.0  # of rigs and phones, and of objects that stand upright
-_UP_OF_MODELS = "y"  # what `Model` takes for up
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +244,7 @@ def estimate_object(method: str, instance: PhotoInstance) -> PhotoEstimate:
     if base == SHAPE:
         return _of_shape(sighting, instance.shapes, evidence)
     model = _model(base, sighting, instance.similar_sigma, with_mesh=MASK in evidence)
-    result = align(model, _view(sighting, evidence, up_axis=_up_axis(sighting)))
+    result = align(model, _view(sighting, evidence))
     return _of_model(result.alignment, sighting, result)
 
 
@@ -266,16 +265,16 @@ def given_of(instance: PhotoInstance) -> MethodInput:
 def _with_all_evidence(instance: PhotoInstance) -> tuple[Model, list[View]]:
     """The model to be stretched, and the view with all evidence that there is for it."""
     sighting = instance.sighting
-    target, up_axis = sighting.target, _up_axis(sighting)
+    target = sighting.target
     has_mesh = target.cad is not None and target.cad.has_mesh
     kinds = {
         MASK: has_mesh and target.found.mask_path is not None,
         DEPTH: target.photo.depth is not None,
-        GRAVITY: target.photo.up is not None and up_axis is not None,
+        GRAVITY: target.photo.up is not None,
     }
     evidence = [kind for kind, is_there in kinds.items() if is_there]
     model = _model(STRETCHED, sighting, instance.similar_sigma, with_mesh=has_mesh)
-    return model, [_view(sighting, evidence, up_axis=up_axis)]
+    return model, [_view(sighting, evidence)]
 
 
 def estimate_of_answer(answer: Alignment | Result, sighting: Sighting) -> PhotoEstimate:
@@ -284,10 +283,6 @@ def estimate_of_answer(answer: Alignment | Result, sighting: Sighting) -> PhotoE
         return _of_model(answer, sighting)
     is_of_model = tuple(answer.ids) == tuple(sighting.model.names)
     return _of_model(answer.alignment, sighting, answer if is_of_model else None)
-
-
-def _up_axis(sighting: Sighting) -> str | None:
-    return _UP_OF_MODELS if sighting.up_axis == _UP_OF_MODELS else None
 
 
 def _truth(sighting: Sighting) -> PhotoEstimate:
@@ -313,6 +308,7 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
         ids=sighting.model.names,
         bounds=bounds,
         mesh=_mesh(sighting) if with_mesh else None,
+        up_axis=sighting.up_axis,
         **kind,
     )
 
@@ -325,9 +321,7 @@ def _mesh(sighting: Sighting) -> Mesh:
     return Mesh(mesh.vertices * sighting.width, mesh.faces)
 
 
-def _view(
-    sighting: Sighting, evidence: Collection[str], *, up_axis: str | None, rows: Any = slice(None)
-) -> View:
+def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(None)) -> View:
     """The photo's view of the object, with some of the evidence it has."""
     photo, found = sighting.target.photo, sighting.target.found
     given: dict[str, Any] = {}
@@ -342,8 +336,6 @@ def _view(
     if GRAVITY in evidence:
         if photo.up is None:
             raise LeftOutError("the direction of gravity is not known")
-        if up_axis is None:
-            raise LeftOutError("gravity needs a model whose y axis points up, or a shape model")
         given |= {"up": photo.up, "up_sigma_deg": _UP_SIGMA_DEG}
     names = tuple(np.array(sighting.names)[rows].tolist())
     pixels = sighting.points_2d[rows]
@@ -368,10 +360,12 @@ def _of_shape(
         raise LeftOutError(f"there is no shape model of {category}")
     if MASK in evidence:
         raise LeftOutError("a shape model has no mesh for the mask")
+    if GRAVITY in evidence and shape.up_axis is None:
+        raise LeftOutError("the shape model has no up axis for gravity")
     known = np.isin(sighting.names, [str(name) for name in shape.ids])
     if not known.any():
         raise LeftOutError("the shape model has none of the keypoints")
-    view = _view(sighting, evidence, up_axis=shape.up_axis, rows=known)
+    view = _view(sighting, evidence, rows=known)
     result = align(shape, view)
     box = result.box
     factor = 1.0 if shape.unit == "m" else _width_factor(sighting, box)

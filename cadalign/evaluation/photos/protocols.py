@@ -71,11 +71,10 @@ def default_methods(
     with_evidence: Collection[str],
     evidence: Collection[str],
     has_shape: bool,
-    up_axis: str = "y",
 ) -> tuple[str, ...]:
     """The methods for data that have some evidence, which the given bases get, where they can.
 
-    A shape model has no mesh for a mask; other models must be upright along y for gravity.
+    A shape model has no mesh for a mask.
 
     Examples
     --------
@@ -85,7 +84,7 @@ def default_methods(
     bases = [base for base in BASES if has_shape or base != SHAPE]
     more = []
     for base in (each for each in with_evidence if each in bases):
-        useless = {MASK} if base == SHAPE else {GRAVITY} if up_axis != "y" else set()
+        useless = {MASK} if base == SHAPE else set()
         kinds = [kind for kind in EVIDENCE if kind in evidence and kind not in useless]
         sets = [[kind] for kind in kinds] + ([kinds] if len(kinds) > 1 else [])
         more += ["+".join((base, *each)) for each in sets]

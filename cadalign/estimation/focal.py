@@ -181,7 +181,7 @@ def check_prior(prior: object, *, focal: str) -> None:
     InputError
         If it is one of these.
     """
-    if prior is None or prior == USUAL:
+    if prior is None or (isinstance(prior, str) and prior == USUAL):
         return
     if not isinstance(prior, FocalPrior):
         what = f"expected a cadalign.FocalPrior, 'usual' or None, got {type(prior).__name__}"

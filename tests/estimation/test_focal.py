@@ -623,6 +623,10 @@ def test_structure_from_motion_through_lenses(real_data: Path) -> None:
             "focal_prior: expected a cadalign.FocalPrior, 'usual' or None, got float",
         ),
         (
+            {"focal": "estimate", "focal_prior": np.ones(3)},
+            "focal_prior: expected a cadalign.FocalPrior, 'usual' or None, got ndarray",
+        ),
+        (
             {},
             'camera: the focal length is unknown; estimate it with focal="estimate", '
             "or give it: camera.with_focal(...)",

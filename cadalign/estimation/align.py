@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from cadalign.arrays import worker_count
+from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
 from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.joint import result_of_minima
@@ -50,6 +51,7 @@ def align(
     ransac: RansacOptions | None = None,
     focal: str = "known",
     focal_prior: PriorOption = USUAL,
+    principal_sigma: float | None = None,
 ) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
 
@@ -78,6 +80,9 @@ def align(
         cameras share one. ``result.cameras`` have the estimates.
     focal_prior : FocalPrior, "usual" or None
         Prior on focal lengths to be estimated, as for `cadalign.fit`.
+    principal_sigma : float, optional
+        Standard deviation of the principal point about the camera's [px], as for `cadalign.fit`:
+        of views of one camera, with neither masks nor depth images.
 
     Returns
     -------
@@ -109,9 +114,17 @@ def align(
     given = _checked_views(views)
     _check_size(size)
     inits = _checked_inits(init, given)
-    options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
+    options = FitOptions(
+        loss=loss,
+        loss_scale=loss_scale,
+        focal=focal,
+        focal_prior=focal_prior,
+        principal_sigma=principal_sigma,
+    )
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
+    if principal_sigma is not None:
+        return _align_cropped(model, given, options, size=size, init=init, ransac=ransac)
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
@@ -122,6 +135,33 @@ def align(
         inits = facing_inits(inits, facing)
         return turned_back(_align_all(model, facing, inits, size, options, ransac, start), given)
     return _align_all(model, given, inits, size, options, ransac, start)
+
+
+def _align_cropped(
+    model: Model | ShapeModel, views: Sequence[View], options: FitOptions, **given: Any
+) -> Result:
+    """Estimate the principal point, too."""
+    from cadalign.estimation.principal import (
+        check_shiftable,
+        estimate_with_principal_point,
+        shifted,
+    )
+
+    check_shiftable(views)
+
+    def align_at(shift: FloatArray) -> Result:
+        return align(
+            model,
+            [replace(view, camera=shifted(view.camera, shift)) for view in views],
+            loss=options.loss,
+            loss_scale=options.loss_scale,
+            focal=options.focal,
+            focal_prior=options.focal_prior,
+            **given,
+        )
+
+    sigmas = [view.sigma for view in views]
+    return estimate_with_principal_point(align_at, options, sigmas)
 
 
 def _align_all(
@@ -179,13 +219,14 @@ def align_batch(
     ransac: RansacOptions | None = None,
     focal: str = "known",
     focal_prior: PriorOption = USUAL,
+    principal_sigma: float | None = None,
     workers: int = 1,
 ) -> Results:
     """Align many objects of one kind; each as `align` does, bit for bit.
 
     Parameters
     ----------
-    model, loss, loss_scale, ransac, focal, focal_prior
+    model, loss, loss_scale, ransac, focal, focal_prior, principal_sigma
         As for `align`; every object has focal lengths of its own.
     objects : sequence of View or of sequences of View
         The views of every object.
@@ -226,6 +267,7 @@ def align_batch(
         "ransac": ransac,
         "focal": focal,
         "focal_prior": focal_prior,
+        "principal_sigma": principal_sigma,
     }
 
     def one(

@@ -337,15 +337,15 @@ def _fit_one(
     camera = problems.camera(0)
     options = options.for_camera(camera)
     if options.principal_sigma is not None:
-        from cadalign.estimation.principal import fit_with_principal_point  # rarely asked
+        from cadalign.estimation.principal import estimate_with_principal_point, shifted
 
         known = replace(options, principal_sigma=None)
 
-        def fit_at(camera: Camera) -> Result:
-            moved = pack_one(problems.points_3d, problems.points_2d, camera)
+        def fit_at(shift: FloatArray) -> Result:
+            moved = pack_one(problems.points_3d, problems.points_2d, shifted(camera, shift))
             return _fit_one(moved, known, ransac, confidences, symmetry, start)
 
-        return fit_with_principal_point(fit_at, camera, options)
+        return estimate_with_principal_point(fit_at, options, [options.sigma])
     if ransac is None:
         solutions = solve_one(problems, options)
         result = result_of_solution(problems, solutions, options, time.perf_counter() - start)

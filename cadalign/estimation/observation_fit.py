@@ -216,7 +216,7 @@ class ObservationFit:
             "similar": is_shaped and self.similar,
             "no_scale_prior": is_shaped and not self.scale_prior,
         }
-        for name in ("method", "principal_sigma", *(_OF_THE_MODEL if learned is not None else ())):
+        for name in ("method", *(_OF_THE_MODEL if learned is not None else ())):
             is_changed = getattr(self.fitting, name) != getattr(FitOptions, name)
             refused[name] = is_changed
         for name, is_given in refused.items():
@@ -335,6 +335,7 @@ class ObservationFit:
                 ransac=self.ransac if self.robust else None,
                 focal=options.focal,
                 focal_prior=options.focal_prior,
+                principal_sigma=options.principal_sigma,
             )
         return result, views
 

@@ -87,7 +87,7 @@ class FitOptions(AlignmentOptions):
     for example, or None."""
     principal_sigma: float | None = None
     """Standard deviation of the principal point about the camera's [px], of a photo that may be
-    cropped: estimates it, for an exact model's keypoints in one view. By default it is known."""
+    cropped: estimates it, from keypoints of views of one camera. By default it is known."""
 
     def __post_init__(self) -> None:
         _check_known("method", self.method, METHODS)

@@ -1,67 +1,74 @@
 """The principal point as two further unknowns, with a prior: of photos that may be cropped.
 
-Gauss-Newton on the principal point alone, the alignment being searched anew for each: by the
-envelope theorem the gradient of the cost at the best alignment is that of the residuals, and its
-curvature is the Schur complement of the alignment's in the joint information.
+Newton's method on the principal point alone, everything else being estimated anew for each. By the
+envelope theorem the gradient of the cost at the best estimate is that of the residuals, since a
+principal point moves all projections alike. Its differences are the information about the principal
+point once all other unknowns follow; those of the estimates are what it adds to their uncertainty.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DegenerateError
-from cadalign.estimation.options import FitOptions
+from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.options import FitOptions, Sigma, pixel_information
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.posterior import Likelihood
-from cadalign.estimation.uncertainty.stated import KeypointStatistics, Stated
+from cadalign.estimation.uncertainty.stated import Stated
+from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.projection import projection_jacobian
+from cadalign.geometry.rotations import vector_from_rotation
 
 _MOST_STEPS = 20
 _SETTLED = 1e-3  # of a standard deviation
+_DIFFERENCE = 1e-3  # of the prior's standard deviation, between estimates that are compared
+_FROM_KEYPOINTS = ("mask", "depth")
 
 
-def fit_with_principal_point(
-    fit_at: Callable[[Camera], Result], camera: Camera, options: FitOptions
+def estimate_with_principal_point(
+    estimate_at: Callable[[FloatArray], Result], options: FitOptions, sigmas: Sequence[Sigma | None]
 ) -> Result:
-    """Fit alignment and principal point.
+    """Estimate everything and the principal point that the views have in common.
 
     Parameters
     ----------
-    fit_at : callable
-        The fit with a camera whose principal point is known.
-    camera : Camera
-        Its principal point is the prior's mean.
+    estimate_at : callable
+        The estimate with cameras whose principal points are `shifted` by (2,) float [px].
     options : FitOptions
         ``principal_sigma`` is the prior's standard deviation.
+    sigmas : sequence of float, (n,) float, (n, 2, 2) float or None
+        Standard deviations of each view's keypoints [px]; None for the result's estimate.
 
     Returns
     -------
     Result
-        With the estimated camera; ``principal_std`` has the standard deviations of its principal
-        point, and the covariance what they add.
+        With the estimated cameras; ``principal_std`` has the standard deviations of their principal
+        points, and the covariances what they add.
 
     Raises
     ------
     DegenerateError
         If the steps do not settle.
     """
-    sigma = cast(float, options.principal_sigma)
+    assert options.principal_sigma is not None
+    prior, difference = options.principal_sigma**-2, _DIFFERENCE * options.principal_sigma
     shift = np.zeros(2)
     for _ in range(_MOST_STEPS):
-        result = fit_at(replace(camera, cx=camera.cx + shift[0], cy=camera.cy + shift[1]))
-        gradient, information, by_unknowns = _linearised(result, options)
-        precision = information + np.eye(2) / sigma**2
-        covariance: FloatArray = np.asarray(np.linalg.inv(precision))
-        step = -covariance @ (gradient + shift / sigma**2)
-        deviations = np.sqrt(covariance.diagonal())
-        if (np.abs(step) <= _SETTLED * deviations).all():
-            return _with_principal_point(result, options, covariance, by_unknowns)
+        result = estimate_at(shift)
+        gradient = _gradient(result, options, sigmas)
+        beside = [estimate_at(shift + step) for step in difference * np.eye(2)]
+        slopes = np.stack([_gradient(each, options, sigmas) - gradient for each in beside])
+        information = (slopes + slopes.T) / (2 * difference)
+        values, axes = np.linalg.eigh(information)  # far from the optimum some may be negative
+        covariance = (axes / (np.abs(values) + prior)) @ axes.T
+        step = -covariance @ (gradient + shift * prior)
+        step *= min(1.0, options.principal_sigma / float(np.linalg.norm(step) or 1.0))
+        if (np.abs(step) <= _SETTLED * np.sqrt(covariance.diagonal())).all():
+            return _with_principal_point(result, beside, difference, covariance, options)
         shift = shift + step
     raise DegenerateError(
         "the estimate of the principal point does not settle",
@@ -70,45 +77,90 @@ def fit_with_principal_point(
     )
 
 
-def _linearised(result: Result, options: FitOptions) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gradient (2,) and information (2, 2) of the principal point, and the unknowns (k, 2) by it.
+def shifted(camera: Camera, shift: FloatArray) -> Camera:
+    """The camera with its principal point moved by (2,) float [px]."""
+    return replace(camera, cx=camera.cx + float(shift[0]), cy=camera.cy + float(shift[1]))
 
-    The information is what the keypoints leave of it once the unknowns follow.
+
+def check_shiftable(views: Sequence[View]) -> None:
+    """Refuse views of several cameras, and evidence beside keypoints that a camera measures.
+
+    Raises
+    ------
+    InputError
+        If there are such.
     """
-    statistics = cast(KeypointStatistics, result.statistics)
-    assert result.fisher_covariance is not None
-    inliers = result.inliers
-    residuals = result.residuals[inliers]
-    likelihood = Likelihood.of(statistics)
-    weights = likelihood.weights(residuals)[:, None, None] * likelihood.information
-    free = options.estimated_unknowns
-    points = result.points_3d[inliers]
-    rows = projection_jacobian(points, result.camera, result.alignment)[:, :, free]
-    mixed = np.einsum("nik,nij->kj", rows, weights)
-    by_unknowns = -result.fisher_covariance[np.ix_(free, free)] @ mixed
-    information = weights.sum(axis=0) + mixed.T @ by_unknowns
-    gradient = np.einsum("nij,nj->i", weights, residuals)
-    return gradient, information, by_unknowns
+    for number, view in enumerate(views):
+        if view.camera != views[0].camera:
+            raise InputError(
+                f"the camera of views[{number}] differs from that of views[0]",
+                where="principal_sigma",
+                fix="give views of one camera",
+            )
+        for name in _FROM_KEYPOINTS:
+            given = getattr(view, name)
+            if given is not None and np.ndim(given) != 1:
+                raise InputError(
+                    f"the principal point is estimated from keypoints, not from a {name}",
+                    where=f"views[{number}].{name}",
+                    fix="leave out one of the two",
+                )
+
+
+def _gradient(result: Result, options: FitOptions, sigmas: Sequence[Sigma | None]) -> FloatArray:
+    """Half the derivative (2,) of the cost of a result by the principal point of its views."""
+    total = np.zeros(2)
+    for view, given in zip(result.views, sigmas, strict=True):
+        sigma = result.sigma if given is None else given
+        residuals = view.residuals[view.inliers]
+        information = pixel_information(sigma, len(view.inliers))[view.inliers]
+        weights = Likelihood(information, options).weights(residuals)
+        total += np.einsum("n,nij,nj->i", weights, information, residuals)
+    return total
 
 
 def _with_principal_point(
-    result: Result, options: FitOptions, covariance: FloatArray, by_unknowns: FloatArray
+    result: Result,
+    beside: Sequence[Result],
+    difference: float,
+    covariance: FloatArray,
+    options: FitOptions,
 ) -> Result:
     """The result with the uncertainty that the principal point adds."""
-    assert result.covariance is not None
-    assert result.fisher_covariance is not None
-    added = np.zeros_like(result.covariance)
-    free = options.estimated_unknowns
-    added[np.ix_(free, free)] = by_unknowns @ covariance @ by_unknowns.T
-    statistics = Stated(
-        result.covariance + added,
-        fisher_covariance=result.fisher_covariance + added,
-        warnings=result.warnings,
-        misfit=result.misfit,
-        evidence=result.evidence,
-    )
-    first = replace(result.views[0], statistics=statistics)
+    views = []
+    for number, view in enumerate(result.views):
+        stated = Stated.of(view.statistics)
+        if stated.covariance is not None:
+            steps = [_step(result, each, number) for each in beside]
+            slopes = np.stack(steps, axis=-1)[: len(stated.covariance)] / difference
+            added = slopes @ covariance @ slopes.T
+            fisher = stated.fisher_covariance
+            stated = replace(
+                stated,
+                covariance=stated.covariance + added,
+                fisher_covariance=None if fisher is None else fisher + added,
+            )
+        if stated.points_cam_covariance is not None:
+            points = result.alignment.apply(result.points_3d)
+            moved = [each.alignment.apply(each.points_3d) - points for each in beside]
+            slopes = np.stack(moved, axis=-1) / difference
+            added = slopes @ covariance @ slopes.swapaxes(1, 2)
+            stated = replace(stated, points_cam_covariance=stated.points_cam_covariance + added)
+        views.append(replace(view, statistics=stated))
     x, y = np.sqrt(covariance.diagonal()).tolist()
     return replace(
-        result, views=(first,), statistics=statistics, principal_std=(x, y), options=options
+        result,
+        views=tuple(views),
+        statistics=views[0].statistics,
+        principal_std=(x, y),
+        options=None if result.options is None else options,
     )
+
+
+def _step(one: Result, other: Result, number: int) -> FloatArray:
+    """Rotation vector, translation, log lengths and log focal length (10,) between two results."""
+    first, second = one.views[number], other.views[number]
+    turn = vector_from_rotation(second.alignment.rotation @ first.alignment.rotation.T)
+    shift = second.alignment.translation - first.alignment.translation
+    lengths = np.log(other.stretch / one.stretch)
+    return np.concatenate([turn, shift, lengths, [np.log(second.camera.fx / first.camera.fx)]])

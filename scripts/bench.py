@@ -23,6 +23,7 @@ from benchmarks.accuracy import Coverage, Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
 from benchmarks.cameras import PhotoLenses, Scenes
 from benchmarks.masks import Masks
+from benchmarks.photo import Photos
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
 from benchmarks.runs import Evaluation, Fits, Ransac, RealDetections
 from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Section
@@ -46,6 +47,7 @@ SECTIONS: dict[str, type[Section]] = {
     "render": Rendering,
     "annotator": Annotator,
     "masks": Masks,
+    "photo": Photos,
     "align": Align,
     "retrieval": Retrieval,
     "evaluation": Evaluation,
@@ -55,7 +57,7 @@ SECTIONS: dict[str, type[Section]] = {
     "unseen_retrieval": UnseenRetrieval,
     "similar": Similar,
 }
-ON_REQUEST = ("detections", "unseen_retrieval", "similar")
+ON_REQUEST = ("photo", "detections", "unseen_retrieval", "similar")
 STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2
 

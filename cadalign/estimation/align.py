@@ -202,10 +202,18 @@ def _align_all(
 
         masks = fit_masks(model, prior, views, fit_depths(model, prior, views, minima))
         minima = masks.minima
+    photos = None
+    if any(view.image is not None for view in views):
+        from cadalign.estimation.contours.photo import fit_photos  # with OpenCV and embree
+
+        photos = fit_photos(model, prior, views, minima)
+        minima = photos.minima
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
     result = result_of_minima(model, problem, likely, stats, mistake=mistake)
-    return result if masks is None else masks.noted_in(result)
+    if masks is not None:
+        result = masks.noted_in(result)
+    return result if photos is None else photos.noted_in(result)
 
 
 def align_batch(

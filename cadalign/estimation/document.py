@@ -95,6 +95,7 @@ class _Summary(ForeignDocument):
     rms_sigmas: NotNegative
     rms: NotNegative
     unit: str
+    share: NotNegative | None = None  # of a photo
 
 
 class _Outlier(ForeignDocument):
@@ -207,7 +208,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
             }
             for other in result.alternatives
         ],
-        "evidence": [{**vars(summary)} for summary in result.evidence],
+        "evidence": [_written_summary(each) for each in result.evidence],
         "misfit": None if misfit is None else misfit.to_dict(),
         "options": None if result.options is None else _plain_options(result.options),
         "symmetry": None if result.symmetry is None else result.symmetry.to_dict(),
@@ -227,6 +228,13 @@ def _written_view(view: ViewResult) -> dict[str, Any]:
         "residuals": _finite_rows(view.residuals),
         "inliers": view.inliers.tolist(),
         "covariance": _plain(view.covariance),
+    }
+
+
+def _written_summary(summary: EvidenceSummary) -> dict[str, Any]:
+    """A piece of evidence; only a photo's outline has a share."""
+    return {
+        key: value for key, value in vars(summary).items() if key != "share" or value is not None
     }
 
 

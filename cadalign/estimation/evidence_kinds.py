@@ -149,8 +149,8 @@ def register_evidence(kind: EvidenceKind) -> None:
     Raises
     ------
     InputError
-        If the name is taken by keypoints, masks, depth, size or rig, or the kind does not declare
-        the field that gives it.
+        If the name is taken by keypoints, masks, photos, depth, size or rig, or the kind does not
+        declare the field that gives it.
 
     Examples
     --------
@@ -183,7 +183,13 @@ def remove_evidence(name: str) -> None:
         remove_fields(*(each.name for each in kind.fields))
 
 
-_STRUCTURAL = {"keypoints": "points_2d", "mask": "mask", "depth": "depth", "rig": "cam_from_rig"}
+_STRUCTURAL = {
+    "keypoints": "points_2d",
+    "mask": "mask",
+    "photo": "image",
+    "depth": "depth",
+    "rig": "cam_from_rig",
+}
 
 
 def kind_names() -> tuple[str, ...]:

@@ -100,7 +100,12 @@ def _is_metric(offsets: Offsets, views: Sequence[View]) -> bool:
 
 
 def _check_view(view: View, number: int) -> None:
-    if not len(view.keypoint_ids) and view.mask is None and not is_told(view.given):
+    if (
+        not len(view.keypoint_ids)
+        and view.mask is None
+        and view.image is None
+        and not is_told(view.given)
+    ):
         fix = "give keypoints, a mask or a direction, or leave the view away"
         raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
 
@@ -234,6 +239,7 @@ class SingleBasis:
     force: FloatArray
     numbers: tuple[int, ...] | None = None
     turn: FloatArray | None = None
+    photos: frozenset[int] = frozenset()
 
     @cached_property
     def evidence(self) -> Evidence:

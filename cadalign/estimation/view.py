@@ -27,7 +27,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import DeclaredEvidence
-from cadalign.io.images import read_grey
+from cadalign.io.images import ByteImage, read_grey, read_photo
 
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
@@ -81,6 +81,9 @@ class View(DeclaredEvidence):
         [0, 1], or an 8-bit grey PNG that is not zero there.
     mask_sigma : float, optional
         Standard deviation of the mask's contour along its normal [px]; None estimates it.
+    image : (h, w, 3) uint8, or path, optional
+        The photo in RGB, as evidence: the model's outline is sought in it, from the estimate by
+        everything else; the model needs a mesh. It does not count beside a mask of the same view.
     more : mapping of str to values
         Evidence of registered kinds; see
         `cadalign.estimation.evidence_kinds.register_evidence`.
@@ -105,6 +108,7 @@ class View(DeclaredEvidence):
     ids: Sequence[Hashable] | None = None
     sigma: Sigma | None = 1.0
     confidences: npt.ArrayLike | None = None
+    image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
     is_numbered: bool = field(init=False, repr=False)
     """True where no ids are given."""
 
@@ -134,11 +138,18 @@ class View(DeclaredEvidence):
             object.__setattr__(self, "cam_from_rig", read_only(motion))
         if self.mask is not None:
             object.__setattr__(self, "mask", read_only(checked_mask(self.mask, self.camera)))
+        if self.image is not None:
+            object.__setattr__(self, "image", read_only(checked_image(self.image, self.camera)))
         if self.mask_sigma is not None:
             as_positive(self.mask_sigma, name="mask_sigma")
 
     def __repr__(self) -> str:
         return f"View({', '.join([f'{np.shape(self.points_2d)[0]} keypoints', *self.sources])})"
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the fields beside keypoints that tell something by themselves."""
+        return super().sources if self.image is None else (*super().sources, "image")
 
     @property
     def keypoint_ids(self) -> tuple[Hashable, ...]:
@@ -234,6 +245,24 @@ def checked_mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
         fix = "give a bool array, or probabilities; of an image of bytes give `image > 0`"
         raise InputError("has values outside of [0, 1]", where="mask", fix=fix)
     return probabilities
+
+
+def checked_image(given: Any, camera: Camera) -> ByteImage:
+    """A photo (h, w, 3) uint8 in RGB.
+
+    Raises InputError if it has another size than the camera, or other values than bytes.
+    """
+    if isinstance(given, str | os.PathLike):
+        given = read_photo(given)
+    pixels = np.asarray(given)
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+        what = f"{pixels.dtype} of shape {pixels.shape}, expected an RGB image (h, w, 3) of uint8"
+        raise InputError(what, where="image")
+    if pixels.shape[:2] != (camera.height, camera.width):
+        size = f"{pixels.shape[1]} x {pixels.shape[0]}"
+        what = f"the photo is {size}, the camera {camera.width} x {camera.height}"
+        raise InputError(what, where="image", fix="give the photo that the camera is of")
+    return pixels
 
 
 def checked_up_sigma(sigma: Any) -> None:

@@ -46,7 +46,12 @@ def views_without_pose(
         number
         for number, view in enumerate(views)
         if inits[number] is None
-        and (len(view.keypoint_ids) or view.mask is not None or is_told(view.given))
+        and (
+            len(view.keypoint_ids)
+            or view.mask is not None
+            or view.image is not None
+            or is_told(view.given)
+        )
         and _is_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
     ]
 

@@ -24,6 +24,7 @@ from cadalign.geometry.camera import needs_facing
 
 _REFUSED = {
     "mask": "the outline of a mask is not measured through a wide lens",
+    "image": "the outline in a photo is not measured through a wide lens",
     "depth": "depths are not measured along the rays of a wide lens",
 }
 

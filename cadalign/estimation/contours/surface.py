@@ -169,6 +169,7 @@ class RigidSurface:
 
     def __init__(self, mesh: Mesh) -> None:
         self.caster = caster_of(mesh)
+        self.corners = corners_of(mesh)
 
     def at(self, shape: Shape, state: State) -> PosedSurface:
         """The mesh at a state."""
@@ -219,6 +220,11 @@ class Warped:
         """The ray hierarchy."""
         return caster_of(self.mesh)
 
+    @property
+    def corners(self) -> FloatArray:
+        """Corners (8, 3) of the box."""
+        return corners_of(self.mesh)
+
     def rows(self, points: FloatArray, face: IntArray) -> PointRows:
         """See `RigidSurface`."""
         corners = self.mesh.faces[face]
@@ -235,6 +241,12 @@ PosedSurface = RigidSurface | Warped
 """A surface at one state of the shape, before its stretch."""
 Surface = RigidSurface | WarpedSurface
 """A mesh that follows the shape."""
+
+
+def corners_of(mesh: Mesh) -> FloatArray:
+    """Corners (8, 3) of the box of a mesh."""
+    choices = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
+    return np.asarray(mesh.bounds[choices, np.arange(3)])
 
 
 def caster_of(mesh: Mesh) -> RayCaster:
@@ -272,18 +284,19 @@ class Choice(NamedTuple):
 def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> Choice:
     """Surfaces for a shape whose keypoints are about ``points_3d`` (m, 3), the nearest first.
 
-    Raises InputError where there is no mesh, which the mask ``where`` wants; DataError if one
-    cannot be read.
+    Raises InputError where there is no mesh, which the mask or photo ``where`` wants; DataError if
+    one cannot be read.
     """
+    wanting = "a photo" if where.endswith("image") else "a mask"
     if isinstance(model, Model):
         if model.mesh is None:
             fix = "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))"
-            raise InputError("the model has no mesh, which a mask wants", where=where, fix=fix)
+            raise InputError(f"the model has no mesh, which {wanting} wants", where=where, fix=fix)
         if model.shape_sigma is None:
             return Choice([RigidSurface(model.mesh)], [])
         points = cast(FloatArray, model.points_3d)
         return _warped([(model.mesh, points, np.arange(len(points)))])
-    return _warped(_nearest_with_mesh(model, points_3d, where))
+    return _warped(_nearest_with_mesh(model, points_3d, where, wanting))
 
 
 def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> Choice:
@@ -294,7 +307,7 @@ def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> Choice:
 
 
 def _nearest_with_mesh(
-    model: ShapeModel, points_3d: FloatArray, where: str
+    model: ShapeModel, points_3d: FloatArray, where: str, wanting: str
 ) -> list[tuple[Mesh, FloatArray, IntArray]]:
     """Meshes of training models whose keypoints are nearest; these, and their numbers."""
     training = model.training
@@ -303,7 +316,8 @@ def _nearest_with_mesh(
         rows = [row for row, path in enumerate(training.mesh_paths) if path is not None]
     if training is None or not rows:
         fix = "learn it from a data set with meshes, such as KeypointNet beside ShapeNet's models"
-        raise InputError("no training model has a mesh, which a mask wants", where=where, fix=fix)
+        what = f"no training model has a mesh, which {wanting} wants"
+        raise InputError(what, where=where, fix=fix)
     gaps = training.points_3d[rows].astype(np.float64) - points_3d
     squares = (gaps**2).sum(axis=2)
     known = np.isfinite(squares)

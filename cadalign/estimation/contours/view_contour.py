@@ -11,7 +11,7 @@ from typing import cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import Contour, mask_contour
 from cadalign.estimation.contours.noise import OWN_MODES, REGISTRATION, Noise, noise_of
@@ -91,38 +91,71 @@ class ViewContour:
         the right and down, by one standard deviation.
         """
         kept = np.flatnonzero(rims.found)
-        points, count = rims.points[kept], len(kept)
         across = np.einsum("ni,nij->nj", across_rims(self.contour, rims)[kept], self.slopes[kept])
-        # A step along this direction of the ray moves the image by one pixel along the normal.
-        step = across / (across**2).sum(axis=1, keepdims=True)
-        seen, ratio = pose.apply(points), camera.fx / self.camera.fx
-        # At this state the residual is the distance that was found, whatever the normals are.
-        rays = ratio * seen[:, :2] / seen[:, 2:]
-        rays += np.subtract((camera.cx, camera.cy), (self.camera.cx, self.camera.cy)) / self._focal
-        rays -= (rims.offset[kept] - bias[kept])[:, None] * step
-        own = np.zeros((OWN_MODES, count, 3))
-        own[0, :, :2] = noise.offset * step
-        own[1, :, 0], own[2, :, 1] = REGISTRATION / self._focal
-        own *= seen[:, 2:] / ratio
         weight = 1 / (noise.sigma * np.sqrt(noise.correlation))
-        return Measured(
-            surface.rows(points, rims.face[kept]),
-            Sightings(
-                kept,
-                np.full(count, self.image),
-                rays,
-                np.column_stack([across * weight, np.zeros(count)]),
-                np.zeros((count, 2)),
-                np.full(count, CAUCHY),
-                np.full(count, noise.loss_scale / np.sqrt(noise.correlation)),
-                np.zeros((count, 2)),
-            ),
-            own @ pose.rotation / pose.scale,
+        return contour_rows(
+            self.image,
+            surface,
+            pose,
+            rims.points[kept],
+            rims.face[kept],
+            across=across,
+            places=bias[kept] - rims.offset[kept],
+            weights=np.full(len(kept), weight),
+            loss_scale=noise.loss_scale / np.sqrt(noise.correlation),
+            own=(noise.offset, REGISTRATION, REGISTRATION),
+            cameras=(self.camera, camera),
         )
 
-    @property
-    def _focal(self) -> FloatArray:
-        return np.array([self.camera.fx, self.camera.fy])
+
+def contour_rows(
+    image: int,
+    surface: PosedSurface,
+    pose: Alignment,
+    points: FloatArray,
+    face: IntArray,
+    *,
+    across: FloatArray,
+    places: FloatArray,
+    weights: FloatArray,
+    loss_scale: float,
+    own: tuple[float, ...],
+    cameras: tuple[Camera, Camera],
+) -> Measured:
+    """Distances of a surface's rim ``points`` (n, 3), on triangles ``face`` (n,), from a contour.
+
+    A step of the ray by ``across`` (n, 2), over its square, moves the image by one pixel outwards,
+    where the contour is by ``places`` (n,) [px]; ``weights`` (n,) [1/px] are of these. ``own`` are
+    standard deviations [px] of what all have in common: an offset outwards, shifts to the right and
+    down. The ``cameras`` are the one of the evidence's rays, and the one of the state.
+    """
+    given, camera = cameras
+    focal = np.array([given.fx, given.fy])
+    step = across / (across**2).sum(axis=1, keepdims=True)
+    seen, ratio, count = pose.apply(points), camera.fx / given.fx, len(points)
+    # At this state the residual is the distance that was found, whatever the normals are.
+    rays = ratio * seen[:, :2] / seen[:, 2:]
+    rays += np.subtract((camera.cx, camera.cy), (given.cx, given.cy)) / focal
+    rays += places[:, None] * step
+    moved = np.zeros((len(own), count, 3))
+    moved[0, :, :2] = own[0] * step
+    for axis, shift in enumerate(own[1:]):
+        moved[1 + axis, :, axis] = shift / focal[axis]
+    moved *= seen[:, 2:] / ratio
+    return Measured(
+        surface.rows(points, face),
+        Sightings(
+            np.arange(count),
+            np.full(count, image),
+            rays,
+            np.column_stack([across * weights[:, None], np.zeros(count)]),
+            np.zeros((count, 2)),
+            np.full(count, CAUCHY),
+            np.full(count, loss_scale),
+            np.zeros((count, 2)),
+        ),
+        moved @ pose.rotation / pose.scale,
+    )
 
 
 def contour_view(image: int, view: View, where: str, camera: Camera | None = None) -> ViewContour:

@@ -312,12 +312,14 @@ class Basis:
 
     ``numbers`` are those of its views among all that were given; None where all are used.
     ``turn`` (3, 3) leads from the first view's frame to that of the result, where it is another.
+    ``photos`` numbers the views whose contour is that of a photo.
     """
 
     evidence: Evidence
     state: State
     numbers: tuple[int, ...] | None = None
     turn: FloatArray | None = None
+    photos: frozenset[int] = frozenset()
 
 
 AnyBasis = Basis | SingleBasis
@@ -329,10 +331,12 @@ def contributions_of(basis: AnyBasis) -> tuple[Contribution, ...]:
     found = []
     for piece in pieces_of(basis.evidence):
         rest, state = without(basis.evidence, basis.state, piece)
-        view = piece.view
+        view, kind = piece.view, piece.kind
+        if kind == "mask" and view in basis.photos:
+            kind = "photo"
         if view is not None and basis.numbers is not None:
             view = basis.numbers[view]
-        found.append(Contribution(piece.kind, view, _deviations(rest, state, basis.turn)))
+        found.append(Contribution(kind, view, _deviations(rest, state, basis.turn)))
     return tuple(found)
 
 

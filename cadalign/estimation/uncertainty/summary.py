@@ -187,8 +187,8 @@ class EvidenceSummary:
     Parameters
     ----------
     kind : str
-        "keypoints", "mask", "depth", "gravity", "size", "camera height", "rig", or the name of a
-        registered kind.
+        "keypoints", "mask", "photo", "depth", "gravity", "size", "camera height", "rig", or the
+        name of a registered kind.
     view : int, optional
         Number of the view; None for the object's size.
     count : int
@@ -199,6 +199,8 @@ class EvidenceSummary:
         Root mean square residual in ``unit``.
     unit : str
         "px", "deg" or "" (the unit of lengths). A camera's motion has no residual of its own.
+    share : float, optional
+        Share of the model's outline that was found in a photo, 0 where the photo was left out.
     """
 
     kind: str
@@ -207,6 +209,7 @@ class EvidenceSummary:
     rms_sigmas: float
     rms: float
     unit: str
+    share: float | None = None
 
     @property
     def name(self) -> str:

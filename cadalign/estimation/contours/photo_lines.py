@@ -1,0 +1,224 @@
+"""Lines across a model's outline in a photo, and where the photo's contour crosses them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.estimation.contours.contour import Contour, Image, contour_of
+from cadalign.estimation.contours.regions import bins_of, crossings_of, edges_of, regions_of
+from cadalign.estimation.contours.rims import across_rims, find_rims
+from cadalign.estimation.contours.surface import PosedSurface
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.projection import model_rays
+from cadalign.io.images import ByteImage
+
+STEPS = 10
+"""Steps of a line to either side."""
+_CELLS = 160  # along the longer side of the silhouette's box
+_BAND = 2.5  # width of the background that colours are learned from, in reaches
+_LEAST_PIXELS = 30
+_RIM_REACH = 2.0  # cells
+_BORDER = 2.0  # [px]
+_EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other things
+_MOST_PIXELS = 30_000  # OpenCV takes 32,767
+_SMALLEST = 64  # [px], of a side of the smallest copy of a photo
+
+
+class Photo(NamedTuple):
+    """A photo in view number ``image``, and copies of it, each half as wide as the last."""
+
+    image: int
+    camera: Camera
+    levels: tuple[Image, ...]
+
+    def holds(self, points: FloatArray) -> BoolArray:
+        """Tell which pixels (..., 2) lie in the photo."""
+        last = np.array([self.camera.width, self.camera.height]) - 1
+        return np.asarray(((points >= 0) & (points <= last)).all(axis=-1))
+
+    def colors(self, points: FloatArray, step: float) -> Image:
+        """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
+        level = min(max(int(np.log2(max(step, 1.0))), 0), len(self.levels) - 1)
+        image = self.levels[level]
+        places = ((points + 0.5) / 2**level - 0.5).astype(np.float32)
+        found = [
+            cv2.remap(
+                image,
+                np.ascontiguousarray(part[:, :1]),
+                np.ascontiguousarray(part[:, 1:]),
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
+            )[:, 0]
+            for part in np.array_split(places, -(-len(places) // _MOST_PIXELS))
+        ]
+        return np.concatenate(found).astype(np.float32, copy=False)
+
+
+def photo_of(image: int, camera: Camera, pixels: ByteImage) -> Photo:
+    """A photo (h, w, 3) with its smaller copies."""
+    levels = [np.ascontiguousarray(pixels, dtype=np.float32)]
+    while min(levels[-1].shape[:2]) > _SMALLEST:
+        height, width = levels[-1].shape[:2]
+        size = (width // 2, height // 2)
+        even = levels[-1][: 2 * size[1], : 2 * size[0]]
+        smaller = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(smaller, dtype=np.float32))
+    return Photo(image, camera, tuple(levels))
+
+
+class Silhouette(NamedTuple):
+    """The silhouette of a posed surface in cells of the image, and its rims.
+
+    The cell (0, 0) of ``inside`` (h, w) lies at the pixel ``corner``, neighbours ``cell`` [px]
+    apart. The ``contour`` has samples on the rims, whose ``points`` (S, 3) lie on the triangles
+    ``face`` (S,).
+    """
+
+    inside: BoolArray
+    corner: FloatArray
+    cell: float
+    contour: Contour
+    across: FloatArray
+    points: FloatArray
+    face: IntArray
+
+    @property
+    def size(self) -> float:
+        """Square root of the area [px]."""
+        return float(np.sqrt(self.inside.sum()) * self.cell)
+
+    def at(self, points: FloatArray) -> BoolArray:
+        """Tell if pixels (..., 2) lie inside."""
+        cells = np.rint((points - self.corner) / self.cell).astype(int)
+        height, width = self.inside.shape
+        columns, rows = cells[..., 0], cells[..., 1]
+        held = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        return np.asarray(
+            held & self.inside[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+        )
+
+
+def silhouette_of(surface: PosedSurface, camera: Camera, pose: Alignment) -> Silhouette | None:
+    """The silhouette and its rims; None where no rim is seen."""
+    box = _box_in_image(surface.corners, camera, pose)
+    if box is None:
+        return None
+    low, high = box
+    cell = max(1.0, float((high - low).max()) / _CELLS)
+    # Room for the contour's smoothing, and for colours of the background.
+    corner = low - 4 * cell
+    width, height = (np.ceil((high - low) / cell).astype(int) + 9).tolist()
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
+    rays, valid = camera.normalize_where_valid(corner + cell * grid)
+    origin, model_from_ray = model_rays(pose)
+    directions = rays @ model_from_ray[:, :2].T + model_from_ray[:, 2]
+    inside = (surface.caster.covered(origin, directions) & valid).reshape(height, width)
+    rough = contour_of(inside)
+    if not len(rough.points):
+        return None
+    contour = rough._replace(points=corner + cell * rough.points)
+    rims = find_rims(surface.caster, camera, pose, contour, _RIM_REACH * cell)
+    on_rim = contour._replace(points=contour.points + rims.offset[:, None] * contour.normals)
+    across = across_rims(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
+    within = (on_rim.points > _BORDER) & (on_rim.points < [camera.width - 3, camera.height - 3])
+    kept = rims.found & within.all(axis=1)
+    if not kept.any():
+        return None
+    return Silhouette(
+        inside, corner, cell, on_rim.taken(kept), across[kept], rims.points[kept], rims.face[kept]
+    )
+
+
+def _box_in_image(
+    corners: FloatArray, camera: Camera, pose: Alignment
+) -> tuple[FloatArray, FloatArray] | None:
+    """Corners of the box in the image of the object's box; None where it is not in the image."""
+    seen = pose.apply(corners)
+    size = np.array([camera.width, camera.height]) - 1.0
+    if (seen[:, 2] <= 0).any():
+        return np.zeros(2), size
+    pixels = camera.project(seen)
+    low, high = np.clip([pixels.min(axis=0), pixels.max(axis=0)], 0, size)
+    return None if (high - low < 2).any() else (low, high)
+
+
+class Outline(NamedTuple):
+    """What a photo tells about a predicted outline.
+
+    ``places`` (S,) [px] are outwards from the silhouette's contour, with their standard deviations
+    ``sigmas`` (S,), infinite where nothing is told; ``contrast`` is that of `Regions`.
+    """
+
+    silhouette: Silhouette
+    places: FloatArray
+    sigmas: FloatArray
+    contrast: float
+
+    def in_sigmas(self, offset: float) -> FloatArray:
+        """Places (S,) beside an offset [px], in standard deviations; 0 where nothing is told."""
+        safe = np.where(self.is_told, self.sigmas, 1.0)
+        return np.where(self.is_told, (self.places - offset) / safe, 0.0)
+
+    @property
+    def is_told(self) -> BoolArray:
+        """Lines (S,) that tell a place."""
+        return np.isfinite(self.sigmas)
+
+
+def outline_of(photo: Photo, silhouette: Silhouette, reach: float) -> Outline | None:
+    """Find the photo's contour on lines that reach so far [px]; None where there are no colours."""
+    step = reach / STEPS
+    inside, outside = _colors_beside(photo, silhouette, reach, step)
+    if min(len(inside), len(outside)) < _LEAST_PIXELS:
+        return None
+    regions = regions_of(inside, outside)
+    contour = silhouette.contour
+    steps = step * np.arange(-STEPS, STEPS + 1)
+    pixels = contour.points[:, None] + steps[:, None] * contour.normals[:, None]
+    colors = photo.colors(pixels.reshape(-1, 2), step).reshape(*pixels.shape[:2], 3)
+    valid = _on_own_side(photo, silhouette, pixels)
+    edges = np.zeros(valid.shape)
+    if step <= _EDGE_STEP:
+        edges = edges_of(colors.astype(np.float64), valid, step)
+    found = crossings_of(regions.odds[bins_of(colors)], valid, edges)
+    sigmas = step * np.sqrt(found.variances)
+    return Outline(silhouette, step * found.places, sigmas, regions.contrast)
+
+
+def _colors_beside(
+    photo: Photo, silhouette: Silhouette, reach: float, step: float
+) -> tuple[IntArray, IntArray]:
+    """Bins of the colours well inside, and outside near the outline."""
+    cell = silhouette.cell
+    room = int(np.ceil(_BAND * reach / cell))
+    labels = np.pad(silhouette.inside, room).astype(np.uint8)
+    depth = cell * np.asarray(cv2.distanceTransform(labels, cv2.DIST_L2, 3), dtype=np.float64)
+    height = cell * np.asarray(cv2.distanceTransform(1 - labels, cv2.DIST_L2, 3), dtype=np.float64)
+    margin = min(reach / 4, float(depth.max()) / 2)
+
+    def seen(chosen: BoolArray) -> IntArray:
+        rows, columns = np.nonzero(chosen)
+        pixels = silhouette.corner + cell * (np.column_stack([columns, rows]) - room)
+        pixels = pixels[photo.holds(pixels)]
+        return bins_of(photo.colors(pixels, step)) if len(pixels) else np.empty(0, dtype=np.int64)
+
+    return seen(depth > margin), seen((height > margin) & (height < _BAND * reach))
+
+
+def _on_own_side(photo: Photo, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
+    """Pixels (S, 2 K + 1, 2) of lines, up to where a line leaves the image or enters again."""
+    inside = silhouette.at(pixels)
+    seen = photo.holds(pixels)
+    middle = STEPS
+    inner = (inside & seen)[:, :middle][:, ::-1]
+    outer = (~inside & seen)[:, middle + 1 :]
+    inner[:, 0] = outer[:, 0] = True  # cells are coarser than the rim
+    kept = np.ones(inside.shape, dtype=bool)
+    kept[:, :middle] = np.logical_and.accumulate(inner, axis=1)[:, ::-1]
+    kept[:, middle + 1 :] = np.logical_and.accumulate(outer, axis=1)
+    return kept

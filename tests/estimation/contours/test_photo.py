@@ -1,0 +1,231 @@
+"""`align` with the photo itself: accuracy, honesty, the statistics of its lines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+
+from cadalign import Alignment, Camera, Mesh, Model, View, align
+from cadalign.errors import DataError, InputError
+from cadalign.estimation.contours.regions import bins_of, crossings_of, edges_of, regions_of
+from cadalign.estimation.result import Result
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.io.images import write_image
+from cadalign.metrics import rotation_error
+from cadalign.render import Scene, cast_geometry
+
+CAMERA = Camera(400, 300, 480, 480, 199.5, 149.5)
+CLICK_PX = 3.0
+
+
+class PhotoScene(NamedTuple):
+    mesh: Mesh
+    truth: Alignment
+    pixels: np.ndarray
+    clicks: np.ndarray
+
+    def model(self, **options: Any) -> Model:
+        return Model(points_3d=self.mesh.vertices, mesh=self.mesh, **options)
+
+    def aligned(self, model: Model | None = None, **options: Any) -> Result:
+        view = View(CAMERA, self.clicks, sigma=CLICK_PX, **options)
+        return align(self.model(stretch="none") if model is None else model, view)
+
+    def error(self, result: Result) -> float:
+        return rotation_error(est=result.alignment, gt=self.truth)
+
+
+def wedge() -> Mesh:
+    """A body without symmetry."""
+    low = [[-0.5, -0.3, -0.2], [0.5, -0.3, -0.2], [0.5, -0.3, 0.3], [-0.5, -0.3, 0.3]]
+    high = [[-0.5, 0.35, -0.2], [0.1, 0.2, -0.1], [0.15, 0.1, 0.3], [-0.45, 0.5, 0.2]]
+    faces = [[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6]]
+    for k in range(4):
+        after = (k + 1) % 4
+        faces += [[k, 4 + after, after], [k, 4 + k, 4 + after]]
+    return Mesh(np.array(low + high), np.array(faces))
+
+
+@cache
+def scene(seed: int, scale: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> PhotoScene:
+    """A red body before a patterned background, blurred and noisy, with rough clicks."""
+    rng = np.random.default_rng(seed)
+    mesh = wedge()
+    turn = rotation_from_vector(rng.normal(0, 0.7, 3))
+    truth = Alignment(turn, [0.1, -0.05, 3.0], np.array(scale))
+    shape = (CAMERA.height, CAMERA.width)
+    inside = cv2.GaussianBlur(
+        cast_geometry(Scene(mesh), CAMERA, truth).mask.astype(np.float32), (0, 0), 0.8
+    )[:, :, None]
+    pattern = cv2.GaussianBlur(rng.uniform(0, 255, (*shape, 3)), (0, 0), 6)
+    pattern = 128 + 6 * (pattern - pattern.mean())
+    pattern[:, :, 0] *= 0.6
+    drawn = inside * [190, 60, 50] + (1 - inside) * pattern + rng.normal(0, 6, (*shape, 3))
+    pixels = np.clip(drawn, 0, 255).astype(np.uint8)
+    clicks = CAMERA.project(truth.apply(mesh.vertices))
+    return PhotoScene(mesh, truth, pixels, clicks + rng.normal(0, CLICK_PX, clicks.shape))
+
+
+class TestPhoto:
+    def test_is_several_times_as_accurate_as_rough_clicks(self) -> None:
+        errors = []
+        for seed in range(4):
+            shown = scene(seed)
+            alone, joint = shown.aligned(), shown.aligned(image=shown.pixels)
+            errors.append((shown.error(alone), shown.error(joint)))
+            assert not any("image" in text for text in joint.warnings)
+        alone_deg, joint_deg = np.median(errors, axis=0)
+        assert joint_deg < alone_deg / 2
+        assert joint_deg < 0.6
+
+    def test_stretch_is_estimated(self) -> None:
+        shown = scene(2, (1.0, 1.2, 0.85))
+        joint = shown.aligned(shown.model(), image=shown.pixels)
+        assert np.abs(joint.alignment.scale / shown.truth.scale - 1).max() < 0.03
+        assert shown.error(joint) < shown.error(shown.aligned(shown.model()))
+
+    def test_error_lies_within_the_stated_uncertainty(self) -> None:
+        for seed in range(4):
+            shown = scene(seed)
+            joint = shown.aligned(image=shown.pixels)
+            assert joint.covariance is not None
+            shift = joint.alignment.translation - shown.truth.translation
+            assert shift @ np.linalg.solve(joint.covariance[3:6, 3:6], shift) < 21.1  # 99.99 %
+
+    def test_summary_tells_the_share_of_the_outline(self) -> None:
+        shown = scene(0)
+        joint = shown.aligned(image=shown.pixels)
+        (summary,) = [each for each in joint.evidence if each.kind == "photo"]
+        assert summary.name == "views[0].image"
+        assert summary.share is not None
+        assert summary.share > 0.9
+        assert summary.rms < 1.0
+        assert {each.name for each in joint.contributions()} >= {"views[0].image"}
+        again = Result.from_dict(joint.to_dict())
+        assert again.evidence == joint.evidence
+
+    def test_is_read_from_a_file(self, tmp_path: Path) -> None:
+        shown = scene(1)
+        write_image(tmp_path / "photo.png", shown.pixels)
+        joint = shown.aligned(image=tmp_path / "photo.png")
+        expected = shown.aligned(image=shown.pixels)
+        assert joint.alignment.rotation == pytest.approx(expected.alignment.rotation)
+
+    def test_from_a_start_without_keypoints(self) -> None:
+        shown = scene(0)
+        turn = rotation_from_vector(np.radians([3.0, -3.0, 3.0]))
+        start = Alignment(turn @ shown.truth.rotation, shown.truth.translation, np.ones(3))
+        found = align(shown.model(stretch="none"), View(CAMERA, image=shown.pixels), init=start)
+        assert shown.error(found) < 0.6
+
+    def test_with_gravity_and_an_unknown_focal_length(self) -> None:
+        shown = scene(3)
+        camera = Camera.without_focal(CAMERA.width, CAMERA.height)
+        up = shown.truth.rotation[:, 1]
+        view = View(camera, shown.clicks, sigma=CLICK_PX, image=shown.pixels, up=up)
+        found = align(shown.model(stretch="none"), view, focal="estimate")
+        assert shown.error(found) < 3.0
+
+    def test_of_two_views_counts_in_both(self) -> None:
+        shown, other = scene(0), scene(1)
+        views = [
+            View(CAMERA, each.clicks, sigma=CLICK_PX, image=each.pixels) for each in (shown, other)
+        ]
+        found = align(shown.model(stretch="none"), views)
+        assert [each.view for each in found.evidence if each.kind == "photo"] == [0, 1]
+        for each, pose in zip((shown, other), found.poses, strict=True):
+            assert rotation_error(est=pose, gt=each.truth) < 0.8
+
+    def test_of_a_similar_model(self) -> None:
+        shown = scene(2)
+        wide = Mesh(shown.mesh.vertices * [1.0, 1.06, 0.95], shown.mesh.faces)
+        model = Model(points_3d=wide.vertices, mesh=wide, shape_sigma=0.04)
+        joint = shown.aligned(model, image=shown.pixels)
+        assert shown.error(joint) < shown.error(shown.aligned(model)) + 1.0
+
+
+class TestHonesty:
+    def test_a_photo_of_something_else_is_left_out(self) -> None:
+        shown = scene(0)
+        rng = np.random.default_rng(5)
+        noise = rng.uniform(0, 255, shown.pixels.shape).astype(np.uint8)
+        alone, joint = shown.aligned(), shown.aligned(image=noise)
+        assert joint.alignment.rotation == pytest.approx(alone.alignment.rotation, abs=1e-3)
+        (warning,) = [text for text in joint.warnings if "views[0].image" in text]
+        assert "left out" in warning
+        (summary,) = [each for each in joint.evidence if each.kind == "photo"]
+        assert (summary.share, summary.count) == (0.0, 0)
+
+    def test_a_uniform_photo_is_left_out(self) -> None:
+        shown = scene(0)
+        joint = shown.aligned(image=np.full_like(shown.pixels, 90))
+        assert any("left out" in text for text in joint.warnings)
+
+    def test_a_mask_takes_the_place_of_the_photo(self) -> None:
+        shown = scene(1)
+        mask = cast_geometry(Scene(shown.mesh), CAMERA, shown.truth).mask
+        found = shown.aligned(image=shown.pixels, mask=mask)
+        expected = shown.aligned(mask=mask)
+        assert [each.kind for each in found.evidence] == [each.kind for each in expected.evidence]
+
+
+class TestRefusals:
+    def test_of_another_size(self) -> None:
+        with pytest.raises(InputError, match="the photo is 20 x 10, the camera 400 x 300"):
+            View(CAMERA, image=np.zeros((10, 20, 3), np.uint8))
+
+    def test_of_floats(self) -> None:
+        with pytest.raises(InputError, match="expected an RGB image"):
+            View(CAMERA, image=np.zeros((300, 400)))
+
+    def test_of_a_file_that_is_not_there(self, tmp_path: Path) -> None:
+        with pytest.raises(DataError):
+            View(CAMERA, image=tmp_path / "none.png")
+
+    def test_of_a_model_without_a_mesh(self) -> None:
+        shown = scene(0)
+        with pytest.raises(InputError, match="no mesh, which a photo wants"):
+            shown.aligned(Model(points_3d=shown.mesh.vertices), image=shown.pixels)
+
+    def test_of_a_wide_lens(self) -> None:
+        shown = scene(0)
+        wide = replace(CAMERA, distortion=(0.0,) * 4, lens="fisheye")
+        view = View(wide, shown.clicks, image=shown.pixels)
+        with pytest.raises(InputError, match="not measured through a wide lens"):
+            align(shown.model(), view)
+
+
+class TestLines:
+    colors = np.where(np.arange(21)[:, None] < 12, [200.0, 40.0, 40.0], [40.0, 60.0, 200.0])[None]
+    valid = np.ones((1, 21), dtype=bool)
+
+    def regions(self) -> Any:
+        return regions_of(bins_of(self.colors[0, :12]), bins_of(self.colors[0, 12:]))
+
+    def test_a_clean_edge_is_found_in_its_place(self) -> None:
+        odds = self.regions().odds[bins_of(self.colors)]
+        found = crossings_of(odds, self.valid, edges_of(self.colors, self.valid, 0.5))
+        assert found.places[0] == pytest.approx(1.5, abs=0.3)
+        assert found.variances[0] < 1.0
+
+    def test_without_contrast_nothing_is_told(self) -> None:
+        found = crossings_of(np.zeros((1, 21)), self.valid, np.zeros((1, 21)))
+        assert np.isinf(found.variances[0])
+
+    def test_several_crossings_count_less(self) -> None:
+        stripes = np.where(np.arange(21)[None] // 4 % 2 == 0, 0.9, -0.9)
+        single = np.where(np.arange(21)[None] < 10, 0.9, -0.9)
+        none = np.zeros((1, 21))
+        several = crossings_of(stripes, self.valid, none).variances[0]
+        assert several > 4 * crossings_of(single, self.valid, none).variances[0]
+
+    def test_contrast_is_that_of_the_colours(self) -> None:
+        bins = bins_of(self.colors[0])
+        assert regions_of(bins, bins).contrast == pytest.approx(0.0, abs=1e-9)
+        assert 0.4 < self.regions().contrast < np.log(2)

@@ -84,7 +84,8 @@ def _alternatives(
     costs = solutions.costs[0, :minima]
     if options.sigma is None:  # the likelihood at the sigma that is best for each minimum
         # Costs are in units of sigma^2; below 1 they are those of exact fits.
-        ratios = (max(costs[0], 1.0) / np.maximum(costs, 1.0)) ** len(problems.points_3d)
+        least = max(costs[0], 1.0)
+        ratios = (least / np.maximum(costs, least)) ** len(problems.points_3d)
     else:
         ratios = np.exp(np.minimum(0.0, costs[0] - costs) / 2)
     points = problems.points_3d.copy()

@@ -153,7 +153,8 @@ class KeypointStatistics(FittedKeypoints):
         squares = (residuals * residuals).sum()
         sigma = self.chosen_sigma
         if np.ndim(sigma) == 0:
-            whitened = squares / (1.0 if sigma is None else float(sigma)) ** 2
+            unit = 1.0 if sigma is None else float(sigma)
+            whitened = squares / unit / unit  # the square of a huge sigma overflows
         else:
             information = pixel_information(sigma, len(self.residuals))[self.inliers]
             whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)

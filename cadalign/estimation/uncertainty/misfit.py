@@ -288,8 +288,8 @@ class Tested:
         errors = (whitening @ (projected - self.points_2d)[:, :, None]).ravel()
         others, _ = np.linalg.qr(rows[:, :-1])
         alone = rows[:, -1] - others @ (others.T @ rows[:, -1])
-        length = float(alone @ alone)
-        return float(alone @ errors) ** 2 / length if length > 0 else 0.0
+        length, along = float(alone @ alone), float(alone @ errors)
+        return along * (along / length) if length > 0 else 0.0  # a power raises where it overflows
 
     def fit(
         self,

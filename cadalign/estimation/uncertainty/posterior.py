@@ -81,7 +81,7 @@ class Likelihood:
         """The likelihood of the inliers that the result maximises, at its estimated sigma."""
         options, sigma = result.options, result.chosen_sigma
         if np.ndim(sigma) == 0:
-            return cls(np.eye(2) / float(sigma) ** 2, options)
+            return cls(np.eye(2) / float(sigma) / float(sigma), options)
         information = pixel_information(sigma, len(result.inliers))
         return cls(information[result.inliers], options)
 

@@ -26,7 +26,7 @@ from cadalign.geometry.rotations import vector_from_rotation
 _MOST_STEPS = 20
 _SETTLED = 1e-3  # of a standard deviation
 _DIFFERENCE = 1e-3  # of the prior's standard deviation, between estimates that are compared
-_FROM_KEYPOINTS = ("mask", "depth")
+_FROM_KEYPOINTS = ("mask", "image", "depth")
 
 
 def estimate_with_principal_point(

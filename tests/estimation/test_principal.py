@@ -189,9 +189,12 @@ def test_align_refuses_what_a_camera_measures_otherwise() -> None:
     other = [seen[0], replace(seen[1], camera=camera)]
     with pytest.raises(InputError, match=r"principal_sigma: the camera of views\[1\] differs"):
         align(model, other, principal_sigma=SIGMA)
-    masked = replace(seen[0], mask=np.ones((480, 640), dtype=bool))
-    with pytest.raises(InputError, match=r"views\[0\].mask: the principal point is estimated from"):
-        align(model, masked, principal_sigma=SIGMA)
+    for name, kind in (("mask", bool), ("image", np.uint8)):
+        pictured = replace(
+            seen[0], **{name: np.ones((480, 640, 3)[: 3 if name == "image" else 2], dtype=kind)}
+        )
+        with pytest.raises(InputError, match=rf"views\[0\].{name}: the principal point is"):
+            align(model, pictured, principal_sigma=SIGMA)
 
 
 @pytest.mark.parametrize(

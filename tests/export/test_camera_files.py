@@ -226,6 +226,8 @@ def test_opengl_matrices_project_as_the_camera_does():
         clip = homogeneous @ (projection @ opengl_from_model(pose)).T
         device = clip[:, :3] / clip[:, 3:]
         assert (np.abs(device[:, 2]) < 1).all()
+        ends = projection @ np.array([[0, 0, -0.5, 1], [0, 0, -9, 1]]).T
+        np.testing.assert_allclose(ends[2] / ends[3], [-1, 1], atol=1e-12)
         left, top, width, height = window or (0, 0, PLAIN.width, PLAIN.height)
         # In the window's pixels from its borders, y up.
         x = left + (device[:, 0] + 1) / 2 * width - 0.5

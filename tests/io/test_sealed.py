@@ -1,0 +1,42 @@
+"""Sealed files are given back whole, or refused with what is wrong with them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cadalign.errors import DataError
+from cadalign.io.sealed import Seal
+
+SEAL = Seal(b"cadalign tests\0\0", 3, "test file", "write it again")
+
+
+def written(folder: Path, payload: bytes = b"some payload") -> bytes:
+    SEAL.write(folder / "sealed", payload)
+    return (folder / "sealed").read_bytes()
+
+
+@pytest.mark.parametrize("payload", [b"", b"some payload", bytes(range(256))])
+def test_payloads_come_back(tmp_path: Path, payload: bytes) -> None:
+    assert bytes(SEAL.unwrap(written(tmp_path, payload), "sealed")) == payload
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [(-1, "is damaged: its checksum is wrong"), (40, "is damaged"), (0, "not a test file")],
+    ids=["payload", "checksum", "magic"],
+)
+def test_a_changed_byte_is_noticed(tmp_path: Path, place: int, message: str) -> None:
+    content = bytearray(written(tmp_path))
+    content[place] ^= 1
+    with pytest.raises(DataError, match=message):
+        SEAL.unwrap(bytes(content), "sealed")
+
+
+def test_lengths_are_checked(tmp_path: Path) -> None:
+    content = written(tmp_path)
+    with pytest.raises(DataError, match="is truncated: 11 bytes, 12 expected"):
+        SEAL.unwrap(content[:-1], "sealed")
+    with pytest.raises(DataError, match="is too long: 13 bytes, 12 expected"):
+        SEAL.unwrap(content + b"x", "sealed")

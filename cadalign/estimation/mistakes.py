@@ -92,10 +92,9 @@ def other_sizes(points_2d: FloatArray, camera: Camera) -> list[Mistake]:
     own = f"{camera.width} x {camera.height} px"
     found = []
     for factor in OTHER_SIZES:
-        width, height = round(camera.width * factor), round(camera.height * factor)
-        image = camera.resized(max(width, 1), max(height, 1))
-        if image.contains(points_2d).sum() > _MOST_INSIDE * len(points_2d):
-            size = f"{image.width} x {image.height} px"
+        inside = camera.contains(rescaled_pixels(points_2d, 1 / factor))
+        if inside.sum() > _MOST_INSIDE * len(points_2d):
+            size = f"{camera.width * factor:.0f} x {camera.height * factor:.0f} px"
             clause = f"the keypoints are of images of {size}, the camera of {own}"
             found.append(Mistake(clause, factor=factor))
     return found

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
     from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+    from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import (
         Contribution,
         EvidenceSummary,
@@ -57,6 +58,7 @@ __all__ = [
     "Result",
     "Results",
     "SceneObject",
+    "Sensitivity",
     "Size",
     "Uncertainty",
     "View",

@@ -18,6 +18,7 @@ from cadalign.estimation.result_data import ResultData
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import Contribution
     from cadalign.export import ExportOptions
     from cadalign.geometry.mesh import Mesh
@@ -62,6 +63,45 @@ class Result(ResultData):
         from cadalign.estimation.uncertainty.evidence import contributions_of
 
         return contributions_of(self.statistics.basis)
+
+    def sensitivity(self, *, exact: bool = True) -> Sensitivity:
+        """Derivatives of pose, stretch, shape and focal length by the data, at the optimum.
+
+        By every keypoint, its standard deviation and the model's points, by the implicit function
+        theorem; what the noise level was estimated to be is held. Of the keypoints of one view, of
+        an exact or stretched model or of a learned shape.
+
+        Parameters
+        ----------
+        exact : bool
+            Take the Hessian of the cost. Otherwise its Gauss-Newton matrix, which leaves out what
+            vanishes with the residuals; a learned shape has none.
+
+        Returns
+        -------
+        Sensitivity
+            Outliers that the estimate does not rest on have no influence, nor has any keypoint on
+            what the keypoints do not determine.
+
+        Raises
+        ------
+        InputError
+            If the result was read from a file, or rests on other evidence.
+
+        Examples
+        --------
+        >>> from cadalign import Camera, fit
+        >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+        >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+        >>> result = fit(corners, camera.project(corners + [0.1, 0.2, 5.0]), camera)
+        >>> result.sensitivity().by_points_2d.shape
+        (9, 8, 2)
+        >>> result.sensitivity().strongest
+        0
+        """
+        from cadalign.estimation.uncertainty.sensitivity import sensitivity_of  # rarely asked
+
+        return sensitivity_of(self, exact=exact)
 
     def __str__(self) -> str:
         return _text_of(self)

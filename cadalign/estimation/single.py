@@ -104,7 +104,7 @@ def align_single(
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
     means, covariances, weights = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
-    seen = _seen(view, cast(FloatArray, view.points_2d), rows, options)
+    seen = seen_keypoints(view, cast(FloatArray, view.points_2d), rows, options)
     minima, hypotheses = search_view(mixture, seen, _given(init))
     count, iterations = minima.counts.tolist()
     if not count:
@@ -192,7 +192,7 @@ def _mistake_in(
     def explain(mistake: Mistake) -> Explained | None:
         if mistake.mirrored:  # not a learned shape: its models share one frame
             return None
-        seen = _seen(view, mistake.undo_2d(given, view.camera), rows, options)
+        seen = seen_keypoints(view, mistake.undo_2d(given, view.camera), rows, options)
         minima, _ = search_view(mixture, seen, _given(None))
         if not minima.counts[0] or minima.costs[0] > _SUSPICIOUS * (2 * len(rows) - POSE):
             return None
@@ -203,7 +203,8 @@ def _mistake_in(
     return None if found is None else f"{found[0]}: corrected, the keypoints fit the learned shapes"
 
 
-def _seen(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:
+def seen_keypoints(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:
+    """Keypoints of a view at pixels (n, 2), as the kernels of one view take them."""
     rays = rays_of(np.require(pixels, requirements="W"), view.camera)
     whitening = np.empty((len(rows), 3))
     whitening[:] = whitening_of(view.sigma, rays, view.camera)

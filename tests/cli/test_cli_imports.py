@@ -22,7 +22,7 @@ HEAVY = {
     *("IPython", "OpenGL", "PIL", "cv2", "dask", "embreex", "joblib", "markdown_it", "matplotlib"),
     *("numba", "numpy", "open3d", "pandas", "pyarrow", "pycocotools", "pyrender", "rich"),
     *("scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
-    *("starlette", "trimesh", "uvicorn"),
+    *("starlette", "torch", "trimesh", "uvicorn"),
 }
 MODULES_OF_A_FIT = 60  # of cadalign
 IN_EVERY_FIT = {"numba", "numpy"}

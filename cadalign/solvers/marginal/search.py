@@ -21,7 +21,7 @@ from cadalign.solvers.starts import rotation_starts, widen_by_shape
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _PROBE_ITERATIONS = 2
-_MAX_ITERATIONS = 30
+_MAX_ITERATIONS = 120
 _SAME_START = 0.45  # chord of rotations of starts that lead to one minimum
 _UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
 _LESS_LIKELY = 20.0  # excess score at which a start is given up, refined no further

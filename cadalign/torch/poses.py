@@ -1,0 +1,110 @@
+"""Batches of alignments as tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cadalign.errors import InputError
+from cadalign.geometry.camera import Camera
+from cadalign.torch.library import torch
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_LEAST_DEPTH = 1e-3  # over the distance; what lies nearer or behind is projected from there
+
+
+@dataclass(frozen=True, eq=False)
+class PoseBatch:
+    """Alignments of B objects: estimates with gradients, or truths.
+
+    ``depth (u, v, 1) = rotation diag(scale) x + translation`` in OpenCV's camera axes.
+
+    Parameters
+    ----------
+    rotation : (B, 3, 3) tensor
+    translation : (B, 3) tensor
+        [model units].
+    scale : (B, 3) tensor
+        Stretch along x, y and z.
+    valid : (B,) bool tensor, optional
+        Marks the estimates that exist and that the keypoints determine; the others are an identity
+        without gradients. None for truths: all are.
+    focal : (B,) tensor, optional
+        Focal lengths along the image's x [px], where they were estimated.
+    points_3d : (B, m, 3) tensor, optional
+        All keypoints of a learned shape, in the model's frame.
+    covariance : (B, 10, 10) tensor, optional
+        Inverse of the cost's Hessian, without gradients, in the order of
+        `cadalign.Result.covariance`; 0 for what is held or not determined.
+
+    Examples
+    --------
+    >>> import torch
+    >>> one = PoseBatch(torch.eye(3)[None], torch.tensor([[0.0, 0, 4]]), torch.ones(1, 3))
+    >>> one.project(torch.zeros(2, 3), Camera(640, 480, 900, 900, 319.5, 239.5))[0, 0].tolist()
+    [319.5, 239.5]
+    """
+
+    rotation: Tensor
+    translation: Tensor
+    scale: Tensor
+    valid: Tensor | None = None
+    focal: Tensor | None = None
+    points_3d: Tensor | None = None
+    covariance: Tensor | None = None
+
+    def apply(self, points_3d: Tensor) -> Tensor:
+        """Model points (n, 3) or (B, n, 3) in the cameras; (B, n, 3) tensor."""
+        stretched = points_3d * self.scale[:, None]
+        return stretched @ self.rotation.transpose(1, 2) + self.translation[:, None]
+
+    def project(self, points_3d: Tensor, camera: Camera | Sequence[Camera]) -> Tensor:
+        """Project model points (n, 3) or (B, n, 3); (B, n, 2) tensor [px].
+
+        What lies behind a camera is projected from just before it, which keeps gradients finite.
+
+        Raises
+        ------
+        InputError
+            If a camera has distortion.
+        """
+        in_camera = self.apply(points_3d)
+        calibration = calibrations(camera, len(self.scale)).to(in_camera)[:, None]
+        if self.focal is not None:
+            ratio = (self.focal / calibration[:, 0, 0])[:, None, None]
+        else:
+            ratio = 1.0
+        least = _LEAST_DEPTH * self.translation.detach().norm(dim=1)[:, None]
+        depths = torch.maximum(in_camera[..., 2], least)[..., None]
+        return in_camera[..., :2] / depths * calibration[..., :2] * ratio + calibration[..., 2:]
+
+
+def calibrations(camera: Camera | Sequence[Camera], count: int) -> Tensor:
+    """Focal lengths and principal points of ``count`` cameras, (B, 4) or (1, 4) tensor.
+
+    Raises InputError if one has distortion.
+    """
+    cameras = cameras_of(camera, count)
+    if any(each.distortion or each.is_wide for each in cameras):
+        what = "projections in PyTorch know no lens distortion"
+        raise InputError(what, where="camera", fix="undistort keypoints and camera first")
+    rows = [[each.fx, each.fy, each.cx, each.cy] for each in cameras]
+    return torch.as_tensor(np.array(rows))
+
+
+def cameras_of(camera: Camera | Sequence[Camera], count: int) -> tuple[Camera, ...]:
+    """The camera of all, or those of ``count`` problems.
+
+    Raises InputError if it is neither one nor as many.
+    """
+    if isinstance(camera, Camera):
+        return (camera,)
+    cameras = tuple(camera)
+    if len(cameras) != count:
+        raise InputError(f"{len(cameras)} cameras for {count} problems", where="camera")
+    return cameras

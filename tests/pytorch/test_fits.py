@@ -1,0 +1,232 @@
+"""`cadalign.torch.fit` and `align`: results of the estimates, gradients, masks, failures."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.problems import LENS, problem_of
+
+import cadalign
+from cadalign import Camera, ShapeModel
+from cadalign.errors import InputError
+from cadalign.shapes.examples import Example
+
+torch = pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
+from cadalign.torch import PoseBatch, align, fit  # noqa: E402
+
+pytestmark = pytest.mark.slow
+COUNT, POINTS = 40, 10
+
+
+def tensors(count: int = COUNT, **options: Any) -> tuple[Any, Any, Camera]:
+    """Model points (B, n, 3) and pixels (B, n, 2) of synthetic problems, and their camera."""
+    problems = [problem_of(seed, points=POINTS, **options) for seed in range(count)]
+    return (
+        torch.tensor(np.array([each.points_3d for each in problems])),
+        torch.tensor(np.array([each.points_2d for each in problems])),
+        problems[0].camera,
+    )
+
+
+@pytest.mark.parametrize("focal", ["known", "estimate"])
+def test_results_are_those_of_fit_batch(focal: str) -> None:
+    points, pixels, camera = tensors(12)
+    found = fit(points, pixels, camera, focal=focal, sigma=0.5)
+    expected = cadalign.fit_batch(points.numpy(), pixels.numpy(), camera, focal=focal, sigma=0.5)
+    assert found.valid.all()
+    np.testing.assert_allclose(found.rotation, expected.rotation, atol=1e-4)
+    np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-4)
+    deviations = found.covariance.diagonal(dim1=1, dim2=2).sqrt()
+    assert (deviations[:, :6] > 0).all()
+    assert (found.focal is None) == (focal == "known")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"loss": "cauchy"},
+        {"loss": "huber"},
+        {"focal": "estimate"},
+        {"stretch": "none"},
+        {"known_axis": "z", "scale_prior_sigma": 0.2},
+    ],
+    ids=str,
+)
+def test_gradcheck(options: dict[str, Any]) -> None:
+    points, pixels, camera = tensors(3)
+    sigma = torch.linspace(0.6, 1.4, POINTS, dtype=torch.float64).expand(3, POINTS).clone()
+
+    def layer(*given: Any) -> tuple[Any, ...]:
+        found = fit(given[0], given[1], camera, sigma=given[2], **options)
+        parts = (found.rotation, found.translation, found.scale)
+        return parts if found.focal is None else (*parts, found.focal)
+
+    inputs = [each.clone().requires_grad_() for each in (points, pixels, sigma)]
+    assert torch.autograd.gradcheck(layer, inputs, eps=1e-5, atol=1e-4, rtol=1e-3)
+
+
+def test_gradients_of_a_lens_and_of_cameras_of_their_own() -> None:
+    points, pixels, camera = tensors(4)
+    wider = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
+    found = fit(points, pixels, camera)
+    seen = [wider.project(found_one.numpy()) for found_one in found.apply(points).detach()]
+    lens = [LENS.project(each.numpy() * [1, 1, 3.0]) for each in found.apply(points).detach()]
+    mixed = torch.tensor(np.array([seen[0], pixels[1].numpy(), lens[2], pixels[3].numpy()]))
+    cameras = [wider, camera, LENS, camera]
+    mixed += torch.randn(mixed.shape, generator=torch.Generator().manual_seed(0)) * 0.2
+    one = fit(points, mixed, cameras)
+    alone = fit(points[1:2], mixed[1:2], camera)
+    np.testing.assert_allclose(one.rotation[1], alone.rotation[0], atol=1e-8)
+    kept = [0, 1, 3]  # with distortion, derivatives leave a small term out
+
+    def layer(given: Any) -> tuple[Any, ...]:
+        found = fit(points[kept], given, [cameras[k] for k in kept])
+        return found.rotation, found.translation
+
+    given = mixed[kept].clone().requires_grad_()
+    assert torch.autograd.gradcheck(layer, given, eps=1e-5, atol=1e-4, rtol=1e-3)
+
+
+def test_gradients_agree_with_the_sensitivity_of_one_fit() -> None:
+    points, pixels, camera = tensors(1)
+    given = pixels.clone().requires_grad_()
+    fit(points, given, camera).translation[0, 2].backward()
+    result = cadalign.fit(points[0].numpy(), pixels[0].numpy(), camera)
+    expected = result.sensitivity().by_points_2d[5]
+    np.testing.assert_allclose(given.grad[0], expected, rtol=1e-4, atol=1e-8)
+
+
+def test_absent_keypoints_count_nothing() -> None:
+    points, pixels, camera = tensors(6)
+    mask = torch.ones(6, POINTS, dtype=torch.bool)
+    mask[2, :3] = False
+    spoiled = pixels.clone()
+    spoiled[2, :3] = torch.nan
+    spoiled.requires_grad_()
+    found = fit(points, spoiled, camera, mask=mask)
+    fewer = fit(points[2:3, 3:], pixels[2:3, 3:], camera)
+    np.testing.assert_allclose(found.rotation[2].detach(), fewer.rotation[0], atol=1e-9)
+    found.scale.sum().backward()
+    assert torch.isfinite(spoiled.grad).all()
+    assert not spoiled.grad[2, :3].any()
+    by_nan = fit(points, spoiled, camera)  # what is not finite is absent
+    np.testing.assert_allclose(by_nan.rotation.detach(), found.rotation.detach(), atol=1e-12)
+
+
+def test_failed_and_degenerate_problems_are_marked_and_do_not_raise() -> None:
+    points, pixels, camera = tensors(5)
+    points, pixels = points.clone(), pixels.clone()
+    points[0] = points[0, 0].clone()  # one point, ten times
+    points[1, :, 2] = points[1, :, 0]  # a plane
+    pixels[2, 3:] = torch.nan  # too few
+    pixels[3] = 100.0  # all at one pixel
+    points.requires_grad_()
+    pixels.requires_grad_()
+    found = fit(points, pixels, camera)
+    assert found.valid.tolist()[4]
+    assert not found.valid[[0, 2]].any()
+    total = found.rotation.sum() + found.translation.sum() + found.scale.sum()
+    total.backward()
+    for gradient in (points.grad, pixels.grad):
+        assert torch.isfinite(gradient).all()
+        assert not gradient[[0, 2]].any()
+        assert gradient[4].any()
+
+
+def test_single_precision_is_kept() -> None:
+    points, pixels, camera = tensors(3)
+    given = pixels.float().requires_grad_()
+    found = fit(points.float(), given, camera)
+    assert found.rotation.dtype == torch.float32
+    found.rotation[:, 0].sum().backward()
+    exact = pixels.clone().requires_grad_()
+    fit(points, exact, camera).rotation[:, 0].sum().backward()
+    assert given.grad.dtype == torch.float32
+    np.testing.assert_allclose(given.grad, exact.grad, rtol=2e-2, atol=1e-4)
+
+
+def test_gauss_newton_gradients_are_near_those_of_the_hessian() -> None:
+    points, pixels, camera = tensors(5, noise_px=0.01)
+    both = []
+    for exact in (True, False):
+        given = pixels.clone().requires_grad_()
+        fit(points, given, camera, exact=exact).translation.sum().backward()
+        both.append(given.grad)
+    np.testing.assert_allclose(both[0], both[1], rtol=0.05, atol=1e-2)
+
+
+def shapes(n: int = 9) -> tuple[ShapeModel, Any, Camera]:
+    """A learned shape, images (B, n, 2) of objects, and the camera."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (n, 3))
+    examples = [
+        Example(f"m{k}", range(n), points * rng.uniform(0.75, 1.3, 3) + rng.normal(0, 0.02, (n, 3)))
+        for k in range(60)
+    ]
+    camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    seen = []
+    for seed in range(6):
+        turn = Rotation.random(random_state=seed).as_matrix()
+        own = points * rng.uniform(0.8, 1.25, 3)
+        image = camera.project(own @ turn.T + [0.1, 0.1, 3])
+        seen.append(image + rng.normal(0, 0.5, (n, 2)))
+    return ShapeModel.learn(examples), torch.tensor(np.array(seen)), camera
+
+
+def test_align_gives_the_estimates_of_a_learned_shape_with_gradients() -> None:
+    model, pixels, camera = shapes()
+    found = align(model, pixels, camera, sigma=0.7)
+    assert found.valid.all()
+    for b in range(len(pixels)):
+        one = cadalign.align(model, cadalign.View(camera, pixels[b].numpy(), sigma=0.7))
+        np.testing.assert_allclose(found.rotation[b], one.alignment.rotation, atol=1e-6)
+        np.testing.assert_allclose(found.points_3d[b], one.points_3d, atol=1e-6)
+
+    def layer(given: Any, sigma: Any) -> tuple[Any, ...]:
+        poses = align(model, given, camera, sigma=sigma)
+        return poses.rotation, poses.translation, poses.points_3d
+
+    given = pixels[:2].clone().requires_grad_()
+    sigma = torch.full((2, 9), 0.7, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(layer, (given, sigma), eps=1e-2, atol=1e-4, rtol=1e-3)
+
+
+def test_align_marks_what_has_too_few_keypoints() -> None:
+    model, pixels, camera = shapes()
+    mask = torch.ones(6, 9, dtype=torch.bool)
+    mask[1, 3:] = False
+    given = pixels.clone().requires_grad_()
+    found = align(model, given, camera, mask=mask)
+    assert found.valid.tolist() == [True, False, True, True, True, True]
+    found.points_3d.sum().backward()
+    assert torch.isfinite(given.grad).all()
+    assert not given.grad[1].any()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda p, x, c: fit(p, x[0], c),
+            "points_2d: shape (10, 2), expected (B, n, 2)",
+        ),
+        (
+            lambda p, x, c: fit(p[:, :5], x, c),
+            "points_3d: shape (3, 5, 3), expected one that expands to (3, 10, 3)",
+        ),
+        (lambda p, x, c: fit(p, x, [c, c]), "camera: 2 cameras for 3 problems"),
+        (
+            lambda p, x, c: PoseBatch(*fit(p, x, c).__dict__.values()).project(p, LENS),
+            "camera: projections in PyTorch know no lens distortion; undistort keypoints and "
+            "camera first",
+        ),
+    ],
+)
+def test_refusals(call: Any, message: str) -> None:
+    with pytest.raises(InputError) as refused:
+        call(*tensors(3))
+    assert str(refused.value) == message

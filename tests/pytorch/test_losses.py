@@ -1,0 +1,164 @@
+"""Losses: zero at the truth, the least over symmetries, with useful gradients."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.problems import problem_of
+
+from cadalign import Camera, Symmetry
+
+torch = pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
+from cadalign.torch import (  # noqa: E402
+    PoseBatch,
+    box_loss,
+    fit,
+    posterior_loss,
+    reprojection_loss,
+    rotation_loss,
+)
+
+pytestmark = pytest.mark.slow
+CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
+CORNERS = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3)
+BOUNDS = torch.tensor([[-1.0, -1, -1], [1, 1, 1]]).double()
+
+
+def poses(turns: np.ndarray, scale: Any = (1.0, 1.0, 1.0)) -> PoseBatch:
+    """Poses (B,) of rotation vectors (B, 3), 8 away."""
+    count = len(turns)
+    return PoseBatch(
+        torch.tensor(Rotation.from_rotvec(turns).as_matrix()),
+        torch.tensor([[0.1, 0.2, 8.0]] * count).double(),
+        torch.tensor([list(scale)] * count).double(),
+    )
+
+
+def losses(found: PoseBatch, truth: PoseBatch, symmetry: Symmetry | None) -> list[Any]:
+    return [
+        rotation_loss(found, truth, symmetry=symmetry),
+        reprojection_loss(found, truth, CORNERS, CAMERA, symmetry=symmetry),
+        box_loss(found, truth, BOUNDS, symmetry=symmetry),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("symmetry", "turn"),
+    [
+        (None, 0.0),
+        (Symmetry.around((0, 1, 0), fold=2), math.pi),
+        (Symmetry.around((0, 1, 0), fold=4), math.pi / 2),
+        (Symmetry.around((0, 1, 0), fold=None), math.radians(10)),
+    ],
+)
+def test_zero_for_what_looks_the_same_and_positive_otherwise(
+    symmetry: Symmetry | None, turn: float
+) -> None:
+    rng = np.random.default_rng(0)
+    truth = poses(rng.normal(0, 1, (5, 3)))
+    about = torch.tensor(Rotation.from_rotvec([0, turn, 0]).as_matrix())
+    same = PoseBatch(truth.rotation @ about, truth.translation, truth.scale)
+    for loss in losses(same, truth, symmetry):
+        assert loss.max() < 1e-5
+    tilt = torch.tensor(Rotation.from_rotvec([0.2, 0, 0]).as_matrix())
+    other = PoseBatch(truth.rotation @ tilt, truth.translation, truth.scale)
+    for loss in losses(other, truth, symmetry):
+        assert loss.min() > 1e-3
+
+
+def test_rotation_loss_is_one_minus_the_cosine() -> None:
+    angles = torch.tensor([0.0, 0.3, 1.2, math.pi]).double()
+    found = poses(np.outer(angles, [0, 0, 1.0]))
+    loss = rotation_loss(found, poses(np.zeros((4, 3))))
+    np.testing.assert_allclose(loss, 1 - torch.cos(angles), atol=1e-12)
+
+
+def test_descent_on_losses_through_the_fit_brings_keypoints_to_the_truth() -> None:
+    problem = problem_of(3, points=10, noise_px=3.0)
+    alignment = problem.alignment
+    truth = PoseBatch(
+        *(
+            torch.tensor(each)[None]
+            for each in (alignment.rotation, alignment.translation, alignment.scale)
+        )
+    )
+    points = torch.tensor(problem.points_3d)
+    pixels = torch.tensor(problem.points_2d)[None].requires_grad_()
+    optimizer = torch.optim.Adam([pixels], lr=0.2)
+    values = []
+    for _ in range(60):
+        found = fit(points, pixels, problem.camera)
+        loss = (
+            10 * rotation_loss(found, truth)
+            + reprojection_loss(found, truth, points, problem.camera)
+            + box_loss(found, truth, BOUNDS)
+        ).sum()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        values.append(loss.item())
+    assert values[-1] < 0.2 * values[0]
+
+
+def seen_problem(noise: float) -> tuple[Any, Any, PoseBatch]:
+    truth = poses(np.array([[0.3, 0.5, 0.1]]), (1.0, 1.2, 0.9))
+    generator = torch.Generator().manual_seed(0)
+    exact = truth.project(CORNERS, CAMERA)
+    return CORNERS, exact + noise * torch.randn(exact.shape, generator=generator).double(), truth
+
+
+def test_posterior_integral_is_laplaces_where_keypoints_are_precise() -> None:
+    points, pixels, _ = seen_problem(0.1)
+    found = fit(points, pixels, CAMERA, sigma=0.1)
+    at_fit = PoseBatch(found.rotation, found.translation, found.scale)
+    loss = posterior_loss(found, at_fit, points, pixels, CAMERA, sigma=0.1, samples=4000)
+    kept = [0, 1, 2, 3, 4, 5, 7, 8]
+    covariance = found.covariance[0][kept][:, kept]
+    laplace = 0.5 * torch.logdet(2 * math.pi * covariance)
+    assert abs(loss.item() - laplace.item()) < 0.1
+    again = posterior_loss(found, at_fit, points, pixels, CAMERA, sigma=0.1, samples=4000)
+    assert loss.item() == again.item()
+
+
+def test_posterior_loss_prefers_the_truth_and_the_right_noise() -> None:
+    points, pixels, truth = seen_problem(1.0)
+    values = {}
+    for sigma in (0.3, 1.0, 4.0):
+        found = fit(points, pixels, CAMERA, sigma=sigma)
+        values[sigma] = posterior_loss(found, truth, points, pixels, CAMERA, sigma=sigma).item()
+    assert min(values, key=values.__getitem__) == 1.0
+    found = fit(points, pixels, CAMERA)
+    wrong = PoseBatch(truth.rotation, truth.translation * 1.2, truth.scale)
+    assert posterior_loss(found, wrong, points, pixels, CAMERA) > values[1.0]
+
+
+def test_posterior_loss_has_gradients_by_keypoints_and_sigmas() -> None:
+    points, pixels, truth = seen_problem(1.0)
+    given = pixels.clone().requires_grad_()
+    sigma = torch.ones(1, 8, dtype=torch.float64, requires_grad=True)
+    found = fit(points, given.detach(), CAMERA, sigma=sigma.detach())
+
+    def value(pixels: Any, sigma: Any) -> Any:
+        return posterior_loss(found, truth, points, pixels, CAMERA, sigma=sigma, samples=4000)
+
+    value(given, sigma).sum().backward()
+    assert torch.isfinite(given.grad).all()
+    direction = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1)).double()
+    step = 0.05
+    ends = [value(pixels + s * step * direction, sigma.detach()) for s in (1, -1)]
+    slope = ((ends[0] - ends[1]) / (2 * step)).item()
+    assert slope == pytest.approx((given.grad * direction).sum().item(), rel=0.1)
+
+
+def test_invalid_estimates_cost_nothing() -> None:
+    points, pixels, truth = seen_problem(1.0)
+    pixels = torch.full_like(pixels, torch.nan).requires_grad_()
+    found = fit(points, pixels, CAMERA)
+    total = sum(each.sum() for each in losses(found, truth, None))
+    total = total + posterior_loss(found, truth, points, pixels, CAMERA).sum()
+    assert total.item() == 0
+    total.backward()

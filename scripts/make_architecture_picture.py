@@ -11,7 +11,7 @@ WIDTH, ROW, TOP = 1080, 34, 56
 # Layers by kind, and the kind's colour.
 KINDS = {
     "#e8e8ec": "errors lazy arrays notebook seeding compile",
-    "#d9e8f7": "geometry metrics io solvers shapes export estimation fitting",
+    "#d9e8f7": "geometry metrics io solvers shapes export estimation fitting torch",
     "#dcf0dc": "datasets render web",
     "#fbe9d0": "retrieval evaluation batch report annotate health cli scripts",
 }

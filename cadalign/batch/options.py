@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from cadalign.errors import DataError
+from cadalign.estimation.detector_noise import opened_noise
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.stated import Stated
@@ -124,8 +125,9 @@ class FitRunOptions(ManyOptions):
 
     def contents(self) -> dict[str, Any]:
         """See `ManyOptions.contents`."""
-        shape = self.estimate.shape
-        return {"shapes": None if shape is None else ShapeModel.open(shape).category}
+        shape, noise = self.estimate.shape, self.estimate.noise
+        found = {"shapes": None if shape is None else ShapeModel.open(shape).category}
+        return found if noise is None else found | {"noise": str(opened_noise(noise))}
 
 
 def _photo_doubt(view: ObservedImage) -> tuple[str, ...]:

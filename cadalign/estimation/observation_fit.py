@@ -49,6 +49,9 @@ class ObservationFit:
 
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
+    noise: Path | None = None
+    """File of a detector's noise, from `cadalign.calibrate_detector`: standard deviations of the
+    keypoints by their confidences and names, in the place of the file's."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object. Its
     proportions are similar, too: --scale-prior-sigma is 0.2, unless the file or a flag says
@@ -111,6 +114,12 @@ class ObservationFit:
 
         None is to be estimated.
         """
+        if self.noise is not None:
+            if self.sigma is not None or self.similar:
+                other = self.named("similar" if self.similar else "sigma")
+                what = f"{self.named('noise')} has the standard deviations, which {other} gives"
+                raise InputError(what, where=other, fix="give one of the two options")
+            return {}
         if self.similar:
             if self.sigma is not None:
                 similar, sigma = self.named("similar"), self.named("sigma")
@@ -254,7 +263,13 @@ class ObservationFit:
             data = fill_xyz(data)
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder)
-        return changes.applied_to(seen, where)  # whose errors name options
+        found = changes.applied_to(seen, where)  # whose errors name options
+        if self.noise is None:
+            return found
+        from cadalign.estimation.detector_noise import with_noise
+
+        with in_file(where):
+            return with_noise(found, self.noise)
 
     def fit(
         self,

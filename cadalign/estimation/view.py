@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,9 @@ from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import DeclaredEvidence
 from cadalign.io.images import ByteImage, read_grey, read_photo
 
+if TYPE_CHECKING:
+    from cadalign.estimation.detector_noise import DetectorNoise
+
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
 _DEFAULTS = {"depth_sigma": 0.01, "up_sigma_deg": 1.0, "camera_height_sigma": 0.02}
@@ -50,7 +53,10 @@ class View(DeclaredEvidence):
         Standard deviation of the keypoints, of each, or covariance of each [px]. None estimates one
         for all views that have none, by its likelihood under a weak prior about 2 px.
     confidences : (n,) float, optional
-        Confidences of the keypoints, for a robust search.
+        Confidences of the keypoints, for a robust search and ``noise``.
+    noise : DetectorNoise, optional
+        Calibrated noise of the detector that found the keypoints, all that it found of the object:
+        ``sigma`` becomes what it says of their confidences and ids.
     depth : (n,) or (h, w) float, or path, optional
         Depths of the keypoints, their z in the camera's frame, or an image of such depths that is
         registered to the photo, as an array or as a 16-bit PNG [model units, or the unit in which
@@ -109,10 +115,11 @@ class View(DeclaredEvidence):
     sigma: Sigma | None = 1.0
     confidences: npt.ArrayLike | None = None
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
+    noise: InitVar[DetectorNoise | None] = field(default=None, kw_only=True)
     is_numbered: bool = field(init=False, repr=False)
     """True where no ids are given."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, noise: DetectorNoise | None) -> None:
         self._check_more()
         for name, value in _DEFAULTS.items():
             if getattr(self, name) is None:
@@ -124,6 +131,10 @@ class View(DeclaredEvidence):
         object.__setattr__(self, "points_2d", read_only(points))
         object.__setattr__(self, "is_numbered", self.ids is None)
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
+        if noise is not None:
+            known = None if self.is_numbered else self.keypoint_ids
+            sigma = noise.sigma(points, scores=self.confidences, ids=known)
+            object.__setattr__(self, "sigma", sigma)
         if self.depth is not None:
             depth = checked_depth(self.depth, self.camera, len(points), self.depth_scale)
             object.__setattr__(self, "depth", read_only(depth))

@@ -103,7 +103,7 @@ def posterior_loss(
     weights = given.mask.to(points_2d) * valid[:, None].to(points_2d)
     calibration = calibrations(camera, len(points)).to(points_2d)
     pixels = torch.where(weights[..., None] > 0, points_2d, torch.zeros_like(points_2d))
-    scene = _Scene(points, pixels, given.sigma, weights, calibration, loss, loss_scale)
+    scene = _SampledKeypoints(points, pixels, given.sigma, weights, calibration, loss, loss_scale)
     with torch.no_grad():
         steps, log_density = _samples(scene, found, found.covariance, (samples, rounds), seed)
     costs = scene.costs(*_moved(found, steps))
@@ -118,7 +118,7 @@ def posterior_loss(
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class _SampledKeypoints:
     """Keypoints of a batch, and the cost of k poses of each problem."""
 
     points: Tensor  # (B, n, 3)
@@ -156,7 +156,11 @@ def _bent(squares: Tensor, loss: str, bend: float) -> Tensor:
 
 
 def _samples(
-    scene: _Scene, found: PoseBatch, covariance: Tensor, effort: tuple[int, int], seed: int
+    scene: _SampledKeypoints,
+    found: PoseBatch,
+    covariance: Tensor,
+    effort: tuple[int, int],
+    seed: int,
 ) -> tuple[Tensor, Tensor]:
     """Steps (B, k, 10) from the fits, and the log densities (B, k) of the mixture drawn from."""
     generator = torch.Generator().manual_seed(seed)

@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Raw
 
 from cadalign.arrays import FloatArray, read_only
+from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.photos.dataset import parse, read_list, read_table
 from cadalign.datasets.photos.photo import (
     CadModel,
@@ -348,6 +349,36 @@ def car_shape(folder: Path) -> ShapeModel | None:
         up_axis="z",
         unit="m",
     )
+
+
+def car_keypoints(shape: ShapeModel, box: Box, camera: Camera) -> ImageKeypoints:
+    """Keypoints of a car in an image as its true box places them, with their uncertainty.
+
+    The shape's keypoints given the lengths of the box, projected. ``sigma`` [px] is what the
+    lengths leave open of them: labels have no keypoints.
+
+    Raises InputError if the shape is no single Gaussian, or the car is behind the camera.
+    """
+    means, covariances, _ = shape.gaussians
+    if len(means) != 1:
+        raise InputError("a mixture has no single mean", where="shape")
+    mean, covariance, count = means[0].ravel(), covariances[0], len(shape.ids)
+    lengths = np.zeros((3, len(mean)))
+    axes = np.arange(3)
+    lengths[axes, 3 * count + 3 + axes], lengths[axes, 3 * count + axes] = 1.0, -1.0
+    gain = np.linalg.solve(
+        lengths @ covariance @ lengths.T + 1e-8 * np.eye(3), lengths @ covariance
+    )
+    points = (mean + (box.extents - lengths @ mean) @ gain).reshape(-1, 3)
+    left = (covariance - covariance @ lengths.T @ gain).reshape(count + 2, 3, count + 2, 3)
+    center = (points[-2] + points[-1]) / 2
+    in_camera = (points[:-2] - center) @ box.rotation.T + box.center
+    slopes = camera.projection_slopes(in_camera) @ box.rotation
+    own = np.einsum("iaib->iab", left)[:count]
+    variances = np.einsum("nka,nab,nkb->nk", slopes, own, slopes)
+    sigma = np.sqrt(np.maximum(variances.mean(axis=1), 1e-12))
+    names = tuple(str(each) for each in shape.ids)
+    return ImageKeypoints(camera.project(in_camera), names=names, sigma=sigma)
 
 
 def _mean_car(path: Path, table: dict[str, Raw]) -> MeanCar:

@@ -25,6 +25,7 @@ _MOST_KNOTS = 6
 _LEAST = 20  # keypoints to calibrate with
 _PRIOR_COUNT = 15.0  # keypoints that a factor of 1 of each keypoint is worth
 _FIRST_OUTLIERS = 0.05
+_MOST_OUTLIERS = 0.5
 _LEAST_SIGMA = 1e-6  # over the median error
 _CORE = 0.5  # probability of being no outlier at which a keypoint counts for the correlation
 
@@ -182,7 +183,7 @@ def _fitted(data: _DetectorErrors, by_score: int) -> _FittedNoise:
         before, cost = cost, float(-2 * np.log(inside + outside).sum())
         if before - cost < _TOLERANCE * abs(cost):
             break
-        share = float((1 - core).mean())
+        share = min(float((1 - core).mean()), _MOST_OUTLIERS)
         # The detector's part of each squared error, given the truth's variance.
         part = (own / whole) ** 2 * squares / 2 + own * data.variances / whole
         ratios = part / own

@@ -32,6 +32,7 @@ from cadalign.solvers.joint.evidence import (
     kept_rows,
     stacked,
 )
+from cadalign.solvers.marginal.problem import Seen
 
 _NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
 _RADIUS = 2  # of the window about a keypoint [px]
@@ -225,6 +226,15 @@ def sample_depth(image: FloatArray, points_2d: FloatArray, *, sigma: float) -> F
         if surfaces:
             found[row] = np.median(surfaces[0])
     return found
+
+
+def seen_keypoints(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:
+    """Keypoints of a view at pixels (n, 2), as the kernels of one view take them."""
+    rays = rays_of(np.require(pixels, requirements="W"), view.camera)
+    whitening = np.empty((len(rows), 3))
+    whitening[:] = whitening_of(view.sigma, rays, view.camera)
+    loss, scale = LOSSES[options.loss], float(options.loss_scale)
+    return Seen(np.array(rows, dtype=np.int64), rays, whitening, loss, scale)
 
 
 @dataclass(frozen=True, eq=False)

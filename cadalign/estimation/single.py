@@ -20,10 +20,9 @@ from cadalign.estimation.fit import fit
 from cadalign.estimation.joint import Estimate, result_of
 from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
 from cadalign.estimation.model import Model
-from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
-from cadalign.estimation.pack import SingleBasis
+from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.pack import SingleBasis, seen_keypoints
 from cadalign.estimation.prior import prior_of
-from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
@@ -36,7 +35,7 @@ from cadalign.shapes.tails import inflation_with
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.marginal.equations import POSE, force_of
 from cadalign.solvers.marginal.posterior import posteriors_of
-from cadalign.solvers.marginal.problem import Mixture, Seen
+from cadalign.solvers.marginal.problem import Mixture
 from cadalign.solvers.marginal.search import search_view
 
 _LEAST_POINTS = 3
@@ -201,15 +200,6 @@ def _mistake_in(
 
     found = find_in_all(score, len(rows), explain, larger_sizes(given, view.camera))
     return None if found is None else f"{found[0]}: corrected, the keypoints fit the learned shapes"
-
-
-def seen_keypoints(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:
-    """Keypoints of a view at pixels (n, 2), as the kernels of one view take them."""
-    rays = rays_of(np.require(pixels, requirements="W"), view.camera)
-    whitening = np.empty((len(rows), 3))
-    whitening[:] = whitening_of(view.sigma, rays, view.camera)
-    loss, scale = LOSSES[options.loss], float(options.loss_scale)
-    return Seen(np.array(rows, dtype=np.int64), rays, whitening, loss, scale)
 
 
 def _given(init: Alignment | None) -> FloatArray:

@@ -13,11 +13,10 @@ from cadalign.errors import InputError
 from cadalign.estimation.estimates import placed_box
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, pixel_information
-from cadalign.estimation.pack import SingleBasis
+from cadalign.estimation.pack import SingleBasis, seen_keypoints
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
-from cadalign.estimation.result import Result
-from cadalign.estimation.single import seen_keypoints
+from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.uncertainty.derivatives import (
     UNKNOWNS,
     Optima,
@@ -104,7 +103,7 @@ class Sensitivity:
         return "\n".join(lines)
 
 
-def sensitivity_of(result: Result, *, exact: bool) -> Sensitivity:
+def sensitivity_of(result: ResultData, *, exact: bool) -> Sensitivity:
     """The sensitivity of a result; see `cadalign.Result.sensitivity`."""
     statistics = result.statistics
     if len(result.views) == 1 and not result.camera.is_wide and result.principal_std is None:
@@ -127,7 +126,7 @@ def sensitivity_of(result: Result, *, exact: bool) -> Sensitivity:
     )
 
 
-def _of_keypoints(result: Result, fitted: KeypointStatistics, exact: bool) -> Sensitivity:
+def _of_keypoints(result: ResultData, fitted: KeypointStatistics, exact: bool) -> Sensitivity:
     kept, view, options = result.inliers, result.views[0], fitted.options
     pixels = np.require(view.points_2d[kept], requirements=["C", "W"])
     optima = _optimum(fitted, pixels, exact)
@@ -210,7 +209,7 @@ def _sigmas(sigma: object, count: int) -> FloatArray:
     return np.asarray(np.sqrt(np.trace(variances, axis1=1, axis2=2) / 2))
 
 
-def _of_shape(result: Result, basis: SingleBasis) -> Sensitivity:
+def _of_shape(result: ResultData, basis: SingleBasis) -> Sensitivity:
     """The sensitivity of a learned shape: of the pose and the forces, and all that follows."""
     view, options = basis.view, basis.options
     rows = np.array(prior_of(basis.model).rows_of(view.keypoint_ids, "views[0].ids"))
@@ -250,7 +249,7 @@ def _of_shape(result: Result, basis: SingleBasis) -> Sensitivity:
 
 
 def _corner_rows(
-    result: Result, margins: BoxMargins | None, linear: FloatArray, seen: IntArray
+    result: ResultData, margins: BoxMargins | None, linear: FloatArray, seen: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Rows (3,) of the shape's points that the least and the greatest corner move with.
 

@@ -1,0 +1,235 @@
+"""Train a keypoint network on rendered views, fine-tune it through the alignment, and compare.
+
+    python scripts/train_detector.py                    # the whole table
+    python scripts/train_detector.py --steps 100 --tuning 30 --views 200
+
+One network is trained by heat maps alone, then goes on in five ways: by heat maps; through a fit of
+the mean shape, rigid, with stretch, and through the alignment of the learned shape; and by the
+Monte-Carlo loss over the posterior. All are judged on renders of models that they have not seen, by
+`cadalign.align` with the learned shape and sigmas from the spread of the heat maps. Writes
+detector/table.json, the keypoints of some images in the folder seen, car.shape and detector.noise,
+which `cadalign fit` takes.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import cadalign
+from cadalign.datasets import ImageKeypoints, sample_models
+from cadalign.geometry.metrics import box_iou_up_to_scale
+from cadalign.io.files import write_json
+from cadalign.torch import PoseBatch, align, fit, posterior_loss, rotation_loss
+from cadalign.torch.detector import KeypointDetector, LossOfKeypoints, train
+from cadalign.torch.renders import RenderedViews, learned_shape, render_views
+
+_RATE = 5e-4  # of fine-tuning
+_REPROJECTION = 0.02  # weight of a pixel beside a unit of the rotation's loss
+_POSTERIOR = 0.02  # weight of the Monte-Carlo loss beside the heat maps' loss
+_POSE = 0.5  # weight of the other losses of poses
+_MOST = 4.0  # beyond which the loss of one view does not pull any more
+_FLIPPED = 90.0  # [degrees]
+
+
+@dataclass
+class TrainOptions:
+    """Size and effort of the training."""
+
+    category: str = "car"
+    """Category of the sample data."""
+    models: int = 80
+    """Models; a quarter of them is held out."""
+    views: int = 1200
+    """Rendered views of the models to train with."""
+    held_out: int = 200
+    """Rendered views of the held-out models."""
+    steps: int = 500
+    """Steps of the first training, by heat maps."""
+    tuning: int = 120
+    """Steps of each fine-tuning."""
+    batch: int = 24
+    """Views of a step."""
+    seed: int = 0
+    """Seed of views, network and batches."""
+    out: Path = Path("detector")
+    """Folder for the table and what `cadalign fit` takes."""
+
+
+def pose_losses(
+    views: RenderedViews, shape: cadalign.ShapeModel
+) -> dict[str, LossOfKeypoints | None]:
+    """Losses of keypoints and sigmas by the way of fine-tuning."""
+    mean = torch.as_tensor(np.array(shape.components[0].mean[: len(views.ids)]))
+    points = torch.as_tensor(views.points_3d)
+    truth = PoseBatch(
+        torch.as_tensor(views.rotation),
+        torch.as_tensor(views.translation),
+        torch.ones(len(views), 3, dtype=torch.float64),
+    )
+    stretched = stretched_mean(truth.apply(points), truth.rotation, mean)
+
+    def through(estimate: Callable[[Any, Any], PoseBatch], own: Any) -> LossOfKeypoints:
+        def loss(pixels: Any, sigma: Any, rows: Any) -> Any:
+            found = estimate(pixels.double(), sigma.double())
+            true = PoseBatch(truth.rotation[rows], truth.translation[rows], truth.scale[rows])
+            shown = own if found.points_3d is None else found.points_3d
+            apart = found.project(shown, views.camera) - true.project(points[rows], views.camera)
+            error = rotation_loss(found, true) + _REPROJECTION * torch.where(
+                found.valid, apart.abs().mean(dim=(1, 2)), 0.0
+            )
+            return (_MOST * torch.tanh(error / _MOST)).float()
+
+        return loss
+
+    def posterior(pixels: Any, sigma: Any, rows: Any) -> Any:
+        pixels, sigma = pixels.double(), sigma.double()
+        found = fit(mean, pixels.detach(), views.camera, sigma=sigma.detach())
+        true = PoseBatch(
+            stretched.rotation[rows], stretched.translation[rows], stretched.scale[rows]
+        )
+        value = posterior_loss(
+            found, true, mean, pixels, views.camera, sigma=sigma, loss="huber", loss_scale=3.0
+        )
+        return torch.clamp(value, max=200.0).float()
+
+    return {
+        "heat maps": None,
+        "PnP, rigid mean": through(
+            lambda p, s: fit(mean, p, views.camera, sigma=s, stretch="none"), mean
+        ),
+        "PnP, stretched mean": through(lambda p, s: fit(mean, p, views.camera, sigma=s), mean),
+        "learned shape": through(lambda p, s: align(shape, p, views.camera, sigma=s), mean),
+        "Monte-Carlo": posterior,
+    }
+
+
+def stretched_mean(in_camera: Any, rotation: Any, mean: Any) -> PoseBatch:
+    """Alignments of the mean's keypoints nearest to objects, of which x is the mean's."""
+    center = mean.mean(dim=0)
+    own = in_camera - in_camera.mean(dim=1, keepdim=True)
+    turned = own @ rotation  # in the model's frame
+    scale = (turned * (mean - center)).sum(dim=1) / ((mean - center) ** 2).sum(dim=0)
+    shift = in_camera.mean(dim=1) - (rotation @ (scale * center)[..., None])[..., 0]
+    size = scale[:, :1]
+    return PoseBatch(rotation, shift / size, scale / size)
+
+
+def judged(
+    detector: KeypointDetector, views: RenderedViews, shape: cadalign.ShapeModel
+) -> dict[str, float]:
+    """Errors on views: keypoints, rotation, box, flips of the object, coverage of the sigmas."""
+    pixels, sigma = detector.predict(views)
+    lengths = np.linalg.norm(pixels - views.points_2d, axis=2)
+    turns, ious = [], []
+    for b in range(len(views)):
+        view = cadalign.View(views.camera, pixels[b], ids=views.ids, sigma=sigma[b])
+        result = cadalign.align(shape, view)
+        cosine = (np.trace(result.alignment.rotation.T @ views.rotation[b]) - 1) / 2
+        turns.append(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+        ious.append(box_iou_up_to_scale(est=result.box, gt=views.box(b)))
+    return {
+        "keypoints, px": float(np.median(lengths)),
+        "within 2.45 sigma, %": 100 * float((lengths < 2.4477 * sigma).mean()),
+        "rotation, deg": float(np.median(turns)),
+        "90 %": float(np.percentile(turns, 90)),
+        "flipped, %": 100 * float(np.mean(np.array(turns) > _FLIPPED)),
+        "box IoU": float(np.median(ious)),
+    }
+
+
+def main(options: TrainOptions) -> None:
+    """Train, fine-tune in all ways, and write the table."""
+    torch.set_num_threads(2)
+    begun = time.perf_counter()
+    models = list(sample_models(per_category=options.models, categories=[options.category]))
+    common = set.intersection(*({k.semantic_id for k in each.keypoints} for each in models))
+    ids = tuple(sorted(common))
+    known, unseen = models[: 3 * len(models) // 4], models[3 * len(models) // 4 :]
+    shape = learned_shape(known, ids, options.category)
+    views = render_views(known, ids=ids, count=options.views, seed=options.seed)
+    held_out = render_views(unseen, ids=ids, count=options.held_out, seed=options.seed + 1)
+    spare = render_views(known, ids=ids, count=options.held_out, seed=options.seed + 2)
+    print(f"{len(ids)} keypoints, views rendered: {time.perf_counter() - begun:.0f} s", flush=True)
+    first = KeypointDetector.untrained(len(ids), seed=options.seed)
+    rows = {"untrained": judged(first, held_out, shape)}
+    train(first, views, steps=options.steps, batch=options.batch, seed=options.seed)
+    rows["trained"] = judged(first.calibrated(spare), held_out, shape)
+    print(f"trained: {time.perf_counter() - begun:.0f} s", flush=True)
+    last = first
+    for name, pose_loss in pose_losses(views, shape).items():
+        last = first.calibrated(spare).copy()
+        train(
+            last,
+            views,
+            steps=options.tuning,
+            batch=options.batch,
+            rate=_RATE,
+            pose_loss=pose_loss,
+            pose_weight=_POSTERIOR if name == "Monte-Carlo" else _POSE,
+            seed=options.seed + 1,
+        )
+        last = last.calibrated(spare)
+        rows[f"+ {name}"] = judged(last, held_out, shape)
+        print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
+    show(rows)
+    write(options.out, rows, last, spare, held_out, shape)
+
+
+def show(rows: dict[str, dict[str, float]]) -> None:
+    """Print the table."""
+    table = Table(title="Held-out renders")
+    for column in ("trained by", *next(iter(rows.values()))):
+        table.add_column(column, justify="right")
+    for name, row in rows.items():
+        table.add_row(name, *(f"{value:.3g}" for value in row.values()))
+    Console(width=140).print(table)
+
+
+def write(
+    folder: Path,
+    rows: dict[str, dict[str, float]],
+    detector: KeypointDetector,
+    spare: RenderedViews,
+    views: RenderedViews,
+    shape: cadalign.ShapeModel,
+) -> None:
+    """Write the table, and keypoints with their noise and shape for `cadalign fit`."""
+    (folder / "seen").mkdir(parents=True, exist_ok=True)
+    write_json(folder / "table.json", rows)
+    shape.save(folder / f"{shape.category}.shape")
+    pixels, sigma = detector.predict(spare)
+    seen = [
+        ImageKeypoints(p, 1 / s, semantic_ids=spare.ids) for p, s in zip(pixels, sigma, strict=True)
+    ]
+    true = [ImageKeypoints(p, semantic_ids=spare.ids) for p in spare.points_2d]
+    noise = cadalign.calibrate_detector(seen, true)
+    noise.save(folder / "detector.noise")
+    print(noise)
+    pixels, sigma = detector.predict(views)
+    lines = [
+        {
+            "camera": views.camera.to_dict(),
+            "shape": f"../{shape.category}.shape",
+            "keypoints": [
+                {"semantic_id": name, "uv": uv, "confidence": 1 / s}
+                for name, uv, s in zip(views.ids, p.tolist(), sigmas.tolist(), strict=True)
+            ],
+        }
+        for p, sigmas in zip(pixels, sigma, strict=True)
+    ]
+    for number, line in enumerate(lines[:20]):
+        write_json(folder / "seen" / f"{number}.json", line)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(TrainOptions, description=__doc__))

@@ -53,7 +53,7 @@ class DetectorNoise:
     Examples
     --------
     >>> noise = DetectorNoise([0.2, 0.8], [8.0, 2.0], factors={"roof": 1.5})
-    >>> noise.sigma([[0, 0], [90, 9]], scores=[0.5, 0.9], ids=["roof", "door"]).tolist()
+    >>> noise.sigma([[0, 0], [90, 9]], scores=[0.5, 0.9], ids=["roof", "door"]).round(6).tolist()
     [6.0, 2.0]
     """
 

@@ -154,8 +154,8 @@ def box_loss(
     ...     PoseBatch(torch.eye(3)[None], torch.tensor([[x, 0, 4.0]]), torch.ones(1, 3))
     ...     for x in (0.0, 0.3)
     ... )
-    >>> box_loss(found, truth, bounds).round(decimals=3).tolist()
-    [0.1]
+    >>> round(box_loss(found, truth, bounds).item(), 3)
+    0.1
     """
     own = bounds
     if found.points_3d is not None:

@@ -22,7 +22,7 @@ import tyro
 from benchmarks.accuracy import Coverage, Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
 from benchmarks.cameras import PhotoLenses, Scenes
-from benchmarks.masks import Masks
+from benchmarks.masks import MaskAlone, Masks
 from benchmarks.photo import Photos
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
 from benchmarks.runs import Evaluation, Fits, Ransac, RealDetections
@@ -47,6 +47,7 @@ SECTIONS: dict[str, type[Section]] = {
     "render": Rendering,
     "annotator": Annotator,
     "masks": Masks,
+    "mask_alone": MaskAlone,
     "photo": Photos,
     "align": Align,
     "retrieval": Retrieval,
@@ -57,7 +58,7 @@ SECTIONS: dict[str, type[Section]] = {
     "unseen_retrieval": UnseenRetrieval,
     "similar": Similar,
 }
-ON_REQUEST = ("photo", "detections", "unseen_retrieval", "similar")
+ON_REQUEST = ("mask_alone", "photo", "detections", "unseen_retrieval", "similar")
 STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2
 

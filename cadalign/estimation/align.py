@@ -22,7 +22,13 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
 from cadalign.estimation.search import JointProblem, find_minima, widened_by_noise
-from cadalign.estimation.single import align_plain, align_single, is_plain, is_single
+from cadalign.estimation.single import (
+    align_plain,
+    align_single,
+    is_mask_alone,
+    is_plain,
+    is_single,
+)
 from cadalign.estimation.view import View
 from cadalign.estimation.weak_views import (
     check_first,
@@ -187,7 +193,12 @@ def _align_all(
             found_by_used = _align_all(model, others, known, size, options, ransac, start)
         return with_views_left_out(found_by_used, prior, views, left_out)
     problem = JointProblem(prior, views, size, options, lenses)
-    problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
+    if is_mask_alone(model, views, inits):
+        from cadalign.estimation.contours.proposals import minima_of_mask  # with OpenCV and embree
+
+        minima, iterations, hypotheses = minima_of_mask(problem, cast(Model, model))
+    else:
+        problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
     if not minima:
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",

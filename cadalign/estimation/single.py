@@ -55,6 +55,15 @@ def is_single(model: object, views: Sequence[View]) -> bool:
     return views[0].sigma is not None and len(views[0].keypoint_ids) >= _LEAST_POINTS
 
 
+def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignment | None]) -> bool:
+    """True where nothing but the mask of one view tells the pose of an exact model with a mesh."""
+    if not isinstance(model, Model) or model.shape_sigma is not None or model.mesh is None:
+        return False
+    view = views[0]
+    is_alone = len(views) == 1 and inits[0] is None and not len(view.keypoint_ids)
+    return is_alone and view.mask is not None and view.camera.focal_known
+
+
 def _has_keypoints_alone(views: Sequence[View]) -> bool:
     return len(views) == 1 and not views[0].sources
 

@@ -18,6 +18,7 @@ from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.contours.view_contour import contour_bound
 from cadalign.evaluation.instances.scene import DAMAGES, damaged_mask
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
@@ -26,6 +27,7 @@ _CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _NOISE_PX = 1.0
 _STRETCH = 2.0
 _LEAST_KEYPOINTS = 4
+_RIGHT_DEG, _RIGHT_STRETCH = 2.0, 0.02
 _ERRORS = ("R", "stretch", "IoU")
 
 
@@ -120,6 +122,57 @@ class Masks:
         }
 
 
+@dataclass
+class MaskAlone:
+    """The own model, of unknown stretch, from a mask without keypoints.
+
+    Right is an estimate within 2 degrees and 2 % of stretch, up to the model's symmetry; of a model
+    that is round about an axis, up to its size as well.
+    """
+
+    views: int = 3
+    """Views of every model."""
+    kinds: tuple[str, ...] = ("exact", "dilated", "smoothed", "hidden", "border")
+    """Kinds of masks."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure all kinds of masks."""
+        with tempfile.TemporaryDirectory() as folder:
+            sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
+            models = [model for model in sample if model.mesh_path is not None]
+            if given.keypointnet is not None:
+                models.extend(m for m in KeypointNet(given.keypointnet) if _has_obj(m))
+            cases = list(_draw_cases(models, self.views, given.seed))
+        rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
+        yield RatioTable(f"a mask alone, {len(cases)} views", rows)
+
+    def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
+        first, among, times = [], [], []
+        for number, each in enumerate(cases):
+            rng = np.random.default_rng([seed, 1, number])
+            case = _cut_by_border(each, rng) if kind == "border" else each
+            mask = case.mask if kind == "border" else damaged_mask(case.mask, kind, rng)
+            model = Model(mesh=case.scene.mesh, symmetry=case.annotated.symmetry)
+            try:
+                wall, _, result = clocked(partial(align, model, View(case.camera, mask=mask)))
+            except CadalignError as error:
+                print(kind, case.annotated.model_id, error)
+                first.append(False)
+                among.append(False)
+                continue
+            times.append(wall)
+            poses = [result.alignment, *(each.alignment for each in result.alternatives[:4])]
+            right = [case.is_right(pose) for pose in poses]
+            first.append(right[0])
+            among.append(any(right))
+        return {
+            "mask": kind,
+            "first": float(np.mean(first)),
+            "among five": float(np.mean(among)),
+            "seconds": float(np.median(times)),
+        }
+
+
 @dataclass(frozen=True)
 class _Case:
     """A view of a model: true alignment, and keypoints with noise."""
@@ -147,6 +200,15 @@ class _Case:
         iou = alignment_box_iou(est=est, gt=gt, bounds=self.scene.bounds)
         stretch = 100 * float(np.abs(est.scale / gt.scale - 1)[1:].max())
         return [rotation_error(est=est, gt=gt), stretch, iou]
+
+    def is_right(self, est: Alignment) -> bool:
+        """True for an estimate near the truth, or near one that is equal to it."""
+        symmetry = self.annotated.symmetry
+        gt = nearest_truth(est=est, gt=self.truth, symmetry=symmetry)
+        logs = np.log(est.scale / gt.scale)
+        if symmetry.axes:
+            logs -= logs.mean()
+        return rotation_error(est=est, gt=gt) < _RIGHT_DEG and np.abs(logs).max() < _RIGHT_STRETCH
 
     def ideal(self, bound: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """`errors` of an ideal estimator, (3, draws)."""

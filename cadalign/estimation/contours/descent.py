@@ -315,6 +315,26 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
     return None if here is None else _settled(here, noises, rounds)
 
 
+class Approached(NamedTuple):
+    """Where the first steps from a start lead, and the mean distance [px] of the contours there."""
+
+    state: State
+    misfit: float
+
+
+def approached(masked: Masked, state: State) -> Approached | None:
+    """Take the first steps of `settle` from a start that may be far off."""
+    reach = _first_reach(masked, _WIDE_REACH)
+    own = np.zeros((len(masked.views), OWN_MODES))
+    found = _approach(masked, Place(state, own), reach)
+    if found is None:
+        return None
+    place = found[0]
+    look = rims_at(masked, place, reach, is_fine=False)
+    distances = [np.where(each.found, np.abs(each.offset), reach) for each in look.rims]
+    return Approached(place.state, float(np.minimum(np.concatenate(distances), reach).mean()))
+
+
 def settle_with(
     masked: Masked, place: Place, noises: list[Noise], others: Sequence[Place] = ()
 ) -> Settled | None:

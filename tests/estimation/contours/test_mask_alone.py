@@ -1,0 +1,115 @@
+"""`align` with nothing but a mask: pose and stretch of the own model."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+
+from cadalign import Alignment, Camera, Mesh, Model, Symmetry, View, align
+from cadalign.errors import DegenerateError
+from cadalign.estimation.contours.silhouettes import atlas_of, resembling_poses
+from cadalign.geometry.metrics import nearest_truth
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.metrics import rotation_error
+from cadalign.render import Scene, cast_geometry
+
+pytestmark = pytest.mark.long
+
+CAMERA = Camera(320, 240, 450, 450, 159.5, 119.5)
+FREE = np.array([False, True, True])
+
+
+@cache
+def body() -> Mesh:
+    """A body without symmetry: a block, a post, and an arm."""
+    return _blocks(
+        [[-0.5, -0.3, -0.2], [0.5, -0.1, 0.3]],
+        [[-0.5, -0.3, -0.2], [-0.3, 0.6, 0.0]],
+        [[-0.5, 0.4, -0.2], [0.2, 0.55, -0.05]],
+    )
+
+
+def _blocks(*bounds: list[list[float]]) -> Mesh:
+    choices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    one = np.array(
+        [[0, 1, 3], [0, 3, 2], [4, 7, 5], [4, 6, 7], [0, 5, 1], [0, 4, 5]]
+        + [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+    )
+    vertices = [np.array(each)[choices, np.arange(3)] for each in bounds]
+    faces = [one + 8 * number for number in range(len(bounds))]
+    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def posed(seed: int, scale: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Alignment:
+    rng = np.random.default_rng(seed)
+    turn = rotation_from_vector(rng.normal(0, 1.2, 3))
+    return Alignment(turn, [0.15, -0.1, 3.2], np.array(scale))
+
+
+def mask_of(mesh: Mesh, pose: Alignment) -> np.ndarray:
+    return np.asarray(cast_geometry(Scene(mesh), CAMERA, pose).mask)
+
+
+class TestOwnModel:
+    @pytest.mark.parametrize("seed", [0, 1, 2])
+    def test_pose_and_stretch_are_found(self, seed: int) -> None:
+        truth = posed(seed, (1.0, 1.4, 0.7))
+        found = align(Model(mesh=body()), View(CAMERA, mask=mask_of(body(), truth)))
+        assert rotation_error(est=found.alignment, gt=truth) < 1.0
+        assert found.alignment.scale == pytest.approx(truth.scale, rel=0.02)
+
+    def test_held_stretch_is_held(self) -> None:
+        truth = posed(3)
+        model = Model(mesh=body(), stretch="none")
+        found = align(model, View(CAMERA, mask=mask_of(body(), truth)))
+        assert found.alignment.scale.tolist() == [1.0, 1.0, 1.0]
+        assert rotation_error(est=found.alignment, gt=truth) < 0.5
+
+    def test_dilated_mask(self) -> None:
+        truth = posed(4, (1.0, 0.8, 1.2))
+        mask = cv2.dilate(mask_of(body(), truth).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        found = align(Model(mesh=body()), View(CAMERA, mask=mask))
+        assert rotation_error(est=found.alignment, gt=truth) < 4.0
+
+    def test_same_evidence_gives_the_same_estimate(self) -> None:
+        view = View(CAMERA, mask=mask_of(body(), posed(1)))
+        first, second = (align(Model(mesh=body()), view).alignment for _ in range(2))
+        assert first.rotation.tolist() == second.rotation.tolist()
+
+    def test_symmetry_is_known(self) -> None:
+        box = _blocks([[-0.5, -0.2, -0.3], [0.5, 0.2, 0.3]])
+        symmetry = Symmetry.around((0, 1, 0), fold=2)
+        truth = posed(5)
+        model = Model(mesh=box, stretch="none", symmetry=symmetry)
+        found = align(model, View(CAMERA, mask=mask_of(box, truth)))
+        poses = [found.alignment, *(each.alignment for each in found.alternatives)]
+        errors = [
+            rotation_error(est=each, gt=nearest_truth(est=each, gt=truth, symmetry=symmetry))
+            for each in poses
+        ]
+        assert min(errors) < 1.0
+
+
+def test_a_similar_model_needs_a_start() -> None:
+    truth = posed(0)
+    model = Model(points_3d=body().vertices, mesh=body(), shape_sigma=0.05)
+    with pytest.raises(DegenerateError, match="give at least 3 keypoints in one view, or `init`"):
+        align(model, View(CAMERA, mask=mask_of(body(), truth)))
+
+
+class TestSilhouettes:
+    def test_are_rendered_once(self) -> None:
+        assert atlas_of(body()) is atlas_of(body())
+
+    def test_resembling_poses_are_distinct_and_sorted(self) -> None:
+        truth = posed(1, (1.0, 1.4, 0.7))
+        mask = mask_of(body(), truth)
+        found = resembling_poses(body(), mask, CAMERA, free=FREE, count=16)
+        overlaps = [each.iou for each in found]
+        assert overlaps == sorted(overlaps, reverse=True)
+        assert len({each.alignment.rotation.tobytes() for each in found}) == len(found)
+        nearest = min(rotation_error(est=each.alignment, gt=truth) for each in found)
+        assert nearest < 25.0

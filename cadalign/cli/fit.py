@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 
 from cadalign.cli.evidence import CameraOptions, EvidenceOptions
@@ -225,7 +226,8 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
 
     Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
     known lengths. Prints the alignment and, where there is more than keypoints of one image, the
-    standard deviations without each piece of evidence. Writes fit.json and overlay.png,
+    standard deviations without each piece of evidence. --mask, --model and --camera without any
+    observation align the model to a mask alone. Writes fit.json and overlay.png,
     overlay_1.png and so on for further views; of a file with several objects of one photo, which
     share its camera, scene.json and a folder for each. Many observations are a run, which goes on
     where it was killed: it writes results.parquet and results.csv with a row for each, and
@@ -245,6 +247,8 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
 
     def run(self) -> int:
         """Run the fit, or the fits; returns the exit code."""
+        if not self.observations and "mask" in self.given and self.model is not None:
+            return self._fit_mask(self.given["mask"])
         path = self.first()
         refuse_photo(path)
         is_read = len(self.observations) == 1 and path.suffix.lower() == ".json" and path.is_file()
@@ -255,7 +259,10 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
             from cadalign.cli.fit_scene import fit_scene
 
             return fit_scene(self, path, data)
-        fitted = self._fit_file(path, data)
+        return self._write(self._fit_file(path, data), path)
+
+    def _write(self, fitted: FittedFile, path: Path) -> int:
+        """Write and print what was fitted of a file; returns the exit code."""
         out = self.out or path.with_name(f"{path.stem}_fit")
         paths = fitted.write(out, overlay=self.overlay)
         if self.json:
@@ -266,6 +273,22 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
             listed = ", ".join(str(path) for path in paths)
             say(f"{'Picture' if len(paths) == 1 else 'Pictures'}: {listed}")
         return 0
+
+    def _fit_mask(self, mask: Path) -> int:
+        """Align the model to a mask alone; returns the exit code."""
+        from cadalign.geometry.camera import Camera
+        from cadalign.io.images import photo_size
+        from cadalign.io.observation import Observation
+
+        width, height = photo_size(mask)
+        nothing, camera = np.empty((0, 3)), Camera.without_focal(width, height)
+        seen = Observation(nothing, nothing[:, :2], camera, model=self.model)
+        with named_as_flags(self, self.fitting, self.ransac):
+            observation = self.changes.applied_to(seen)
+            style, status = self._style(observation, mask), waiting("fitting")
+            result, views = self.fit(observation, str(mask), note=say, status=status)
+        fitted = self.fitted(mask, observation, result, views, style=style)
+        return self._write(replace(fitted, sources={"mask": mask}), mask)
 
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""
@@ -295,18 +318,19 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
         with named_as_flags(self, self.fitting, self.ransac):
             data = read_json(path) if data is None else data
             observation = self.read(data, str(path), folder=path.parent, changes=self.changes)
-            style = None
-            if self.overlay is not None:
-                style = overlay_style(
-                    path,
-                    mode=self.overlay_mode,
-                    opacity=self.overlay_opacity,
-                    has_model=self.shape_of(observation) is not None
-                    or observation.model is not None,
-                )
+            style = self._style(observation, path)
             status = waiting("fitting")
             result, views = self.fit(observation, str(path), note=say, status=status)
         return self.fitted(path, observation, result, views, style=style)
+
+    def _style(self, observation: Observation, path: Path) -> OverlayStyle | None:
+        """The style of the overlay, where one is asked for."""
+        if self.overlay is None:
+            return None
+        has_model = self.shape_of(observation) is not None or observation.model is not None
+        return overlay_style(
+            path, mode=self.overlay_mode, opacity=self.overlay_opacity, has_model=has_model
+        )
 
     def fitted(
         self,

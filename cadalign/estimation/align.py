@@ -196,16 +196,16 @@ def _align_all(
     if is_mask_alone(model, views, inits):
         from cadalign.estimation.contours.proposals import minima_of_mask  # with OpenCV and embree
 
-        minima, iterations, hypotheses = minima_of_mask(problem, cast(Model, model))
+        minima, iterations, hypotheses, mistake = minima_of_mask(problem, cast(Model, model))
     else:
         problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
+        mistake = joint_mistake(problem, minima[0], ransac) if minima else None
     if not minima:
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",
             where="views",
             fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
-    mistake = joint_mistake(problem, minima[0], ransac)
     masks = None
     if any(view.mask is not None for view in views):
         from cadalign.estimation.contours.depth import fit_depths

@@ -68,6 +68,9 @@ class ObservationFit:
     shape_sigma: float | None = None
     """Estimate the object's own shape from the model's: standard deviation of the keypoints'
     positions on the object about those on the stretched model [model units]."""
+    image: bool = False
+    """Take the photo itself as evidence: the model's outline is sought in it, from the estimate by
+    everything else. The model needs a mesh."""
     focal: Literal["known", "estimate"] | None = None
     """Focal length: known (the file's) or estimate; by default known, if every view has one. Views
     of equal cameras share an estimated one."""
@@ -109,6 +112,10 @@ class ObservationFit:
             return self.shape_sigma
         return cast("float | None", observation.fit_options.get("shape_sigma"))
 
+    def uses_photos(self, observation: Observation) -> bool:
+        """True if the photos themselves are evidence: by the flag, or else by the file."""
+        return self.image or (self.stored and bool(observation.fit_options.get("image", False)))
+
     def stated_sigma(self, observation: Observation) -> dict[str, Sigma | None]:
         """The deviation that takes the place of the keypoints' own, empty if there is none.
 
@@ -146,7 +153,8 @@ class ObservationFit:
     ) -> FitOptions:
         """Options of the fit: those that are given, otherwise those of the file."""
         given = dict(observation.fit_options) if self.stored else {}
-        given.pop("shape_sigma", None)  # which is the model's
+        for name in ("shape_sigma", "image"):  # which are of the model and of the views
+            given.pop(name, None)
         with in_file(where), within("fit"):
             stored = FitOptions(**{key: given[key] for key in given if key != "focal_prior"})
         set_by_flags = {
@@ -246,6 +254,8 @@ class ObservationFit:
             return "the file's shape"
         if self.shape_sigma_of(observation) is not None:
             return "the file's shape_sigma"
+        if self.image:
+            return self.named("image")
         return f"the file's {_evidence(observation)}"
 
     def read(
@@ -304,6 +314,7 @@ class ObservationFit:
         """
         notes: list[str] = []
         is_plain = observation.is_plain and self.shape_of(observation) is None
+        is_plain &= not self.uses_photos(observation)
         found: tuple[Result, tuple[View, ...] | None]
         if is_plain and self.shape_sigma_of(observation) is None:
             found = self._fit(observation, where, notes.append), None
@@ -370,8 +381,16 @@ class ObservationFit:
         options = self.options_for(observation, where, note)
         model = self._model(observation, where, options)
         stated = self.stated_sigma(observation)
+        has_photos = self.uses_photos(observation)
+        if has_photos and all(image.image is None for image in observation.views):
+            raise InputError(
+                "the observation names no photo",
+                where=self.named("image"),
+                fix="write its path as `image` into the file, or leave the option away",
+            )
         with in_file(where):
-            views = views_of(observation, model, sigma=stated.get("sigma"))
+            given = stated.get("sigma")
+            views = views_of(observation, model, sigma=given, with_photos=has_photos)
         if "sigma" in stated and stated["sigma"] is None:
             views = tuple(replace(view, sigma=None) for view in views)
         return model, views, options

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import nullcontext
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -72,7 +73,11 @@ def model_of(
 
 
 def views_of(
-    observation: Observation, model: Model | ShapeModel, *, sigma: Sigma | None = None
+    observation: Observation,
+    model: Model | ShapeModel,
+    *,
+    sigma: Sigma | None = None,
+    with_photos: bool = False,
 ) -> tuple[View, ...]:
     """Evidence of an observation's images about a model.
 
@@ -85,6 +90,8 @@ def views_of(
     sigma : float or array, optional
         Standard deviation of the keypoints [px] in place of the observation's, which is 1 where it
         has none.
+    with_photos : bool
+        Take the photos themselves as evidence, too.
 
     Raises
     ------
@@ -92,14 +99,15 @@ def views_of(
         If the shape has no such keypoints, the observation has no ids or names, one of them occurs
         twice, or what the observation says of an image is invalid.
     DataError
-        If a mask or a depth image cannot be read.
+        If a mask, a depth image or a photo cannot be read.
     """
     own = own_ids(observation.views)
     views = []
     for number, image in enumerate(observation.views):
         with within(f"views[{number}]") if observation.others else nullcontext():
             ids = shape_ids(image, model) if isinstance(model, ShapeModel) else own[number]
-            views.append(_view(image, ids, sigma))
+            photo = image.image if with_photos else None
+            views.append(_view(image, ids, sigma, photo))
     return tuple(views)
 
 
@@ -145,7 +153,9 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
     )
 
 
-def _view(image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None) -> View:
+def _view(
+    image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None, photo: Path | None
+) -> View:
     evidence = image.evidence.given
     if image.depths is not None:
         evidence["depth"] = image.depths
@@ -157,6 +167,7 @@ def _view(image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None) ->
         ids=ids,
         sigma=sigma,
         confidences=image.confidences,
+        image=photo,
         **as_arguments(evidence),
     )
 

@@ -61,7 +61,7 @@ def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignmen
         return False
     view = views[0]
     is_alone = len(views) == 1 and inits[0] is None and not len(view.keypoint_ids)
-    return is_alone and view.mask is not None and view.camera.focal_known
+    return is_alone and view.mask is not None
 
 
 def _has_keypoints_alone(views: Sequence[View]) -> bool:

@@ -21,7 +21,8 @@ class DetectorOptions:
 
     model: Path | None = None
     """Keypoints of the model, NAME.keypoints.json, that those of a detector's file are paired with:
-    by name, otherwise by semantic id, otherwise by order. With --shape, the shape's by default."""
+    by name, otherwise by semantic id, otherwise by order. With --shape, the shape's by default. Of
+    `fit --mask` without an observation, the model itself."""
     images: Path | None = None
     """Folder of the photos that a detector's file names."""
     min_score: float = 0.0

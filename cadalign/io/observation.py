@@ -29,8 +29,9 @@ relative to the file. ``fit`` holds options for `cadalign.fit` where they are no
 ``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis``, ``focal`` and
 ``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``"usual"`` for that of usual lenses,
 ``null`` for none; by default that of the first photo's EXIF data, unless another photo's differ,
-and otherwise the usual one); and ``shape_sigma`` of
-`cadalign.Model`, for a model that is only similar.
+and otherwise the usual one); ``shape_sigma`` of
+`cadalign.Model`, for a model that is only similar; and ``"image": true``, to take the photos
+themselves as evidence (``image`` of `cadalign.View`).
 
 ``object`` is the object's name, to tell the objects of a photo apart. ``unfinished`` has what an
 annotator has marked and a fit cannot use, such as a point of the photo without one of the model.
@@ -57,10 +58,11 @@ Evidence beyond keypoints stands beside them, each field optional, sigmas and sc
 units per count; in its place keypoints may have a ``depth`` [units], left out where unknown.
 ``shape`` is a file of `cadalign shape learn`, which takes the model's place. ``init`` is an
 alignment to start from, as `cadalign.align` takes it, in the form of ``alignment`` in a fit.json;
-its ``scale`` is 1 unless given. With it ``keypoints`` may be few, or none. Several images of one
-object stand in ``views``, each with camera, image, keypoints (or none) and evidence of its own; and
-``cam_from_rig``, a 4 x 4 matrix by rows, for all of them or for none, if the cameras' motion is
-known. Keypoints of the same ``semantic_id`` (or else ``name``, or else ``xyz``) are the same::
+its ``scale`` is 1 unless given. With it, or with a mask, ``keypoints`` may be few, or none. Several
+images of one object stand in ``views``, each with camera, image, keypoints (or none) and evidence
+of its own; and ``cam_from_rig``, a 4 x 4 matrix by rows, for all of them or for none, if the
+cameras' motion is known. Keypoints of the same ``semantic_id`` (or else ``name``, or else ``xyz``)
+are the same::
 
     {
       "model": "chair.obj",

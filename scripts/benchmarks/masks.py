@@ -27,7 +27,7 @@ _CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _NOISE_PX = 1.0
 _STRETCH = 2.0
 _LEAST_KEYPOINTS = 4
-_RIGHT_DEG, _RIGHT_STRETCH = 2.0, 0.02
+_RIGHT_DEG, _RIGHT_STRETCH = 10.0, 0.15
 _ERRORS = ("R", "stretch", "IoU")
 
 
@@ -126,8 +126,8 @@ class Masks:
 class MaskAlone:
     """The own model, of unknown stretch, from a mask without keypoints.
 
-    Right is an estimate within 2 degrees and 2 % of stretch, up to the model's symmetry; of a model
-    that is round about an axis, up to its size as well.
+    Right is an estimate within 10 degrees and 15 % of stretch, up to the model's symmetry; of a
+    model that is round about an axis, up to its size as well.
     """
 
     views: int = 3

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from support.refusals import refusal_line
 from support.scenes import CAMERA, around, in_camera, keypoints, truth_of
@@ -30,6 +31,11 @@ from cadalign.render import Scene, cast_geometry
 from cadalign.render.drawing.overlay import EST_COLOR
 
 POINTS = keypoints()
+BLOCKS = (
+    [[-0.5, -0.3, -0.2], [0.5, -0.1, 0.3]],
+    [[-0.5, -0.3, -0.2], [-0.3, 0.6, 0.0]],
+    [[-0.5, 0.4, -0.2], [0.2, 0.55, -0.05]],
+)
 TRUTH = truth_of()
 UP = TRUTH.rotation[:, 1]
 
@@ -370,3 +376,65 @@ def test_options_without_effect_are_refused(
     assert refusal_line(capsys, "fit", path, "--method", "aepnp") == (
         "--method: has no effect together with the file's up; leave out one of the two"
     )
+
+
+class TestPhotoAndMaskAlone:
+    """A photo of a body that has the keypoints of `support.scenes`, and its mask."""
+
+    @pytest.fixture
+    def mesh(self, tmp_path: Path) -> Path:
+        path = tmp_path / "body.ply"
+        blocks = [trimesh.creation.box(bounds=each) for each in BLOCKS]
+        trimesh.util.concatenate(blocks).export(path)
+        return path
+
+    @pytest.fixture
+    def shown(self, mesh: Path) -> np.ndarray:
+        return np.asarray(cast_geometry(Scene(load_mesh(mesh)), CAMERA, TRUTH).mask)
+
+    def kinds(self, folder: Path) -> list[str]:
+        return [each.kind for each in result_in(folder).evidence]
+
+    def test_photo_is_evidence_where_asked_for(
+        self, mesh: Path, shown: np.ndarray, tmp_path: Path
+    ) -> None:
+        photo = np.where(shown[:, :, None], [200, 60, 40], [60, 90, 160]).astype(np.uint8)
+        Image.fromarray(photo).save(tmp_path / "photo.png")
+        seen = replace(observed(), image=tmp_path / "photo.png")
+        path = write(tmp_path, seen, model=mesh)
+        assert main(["fit", str(path), "--no-picture"]) == 0
+        assert self.kinds(tmp_path) == ["keypoints"]
+        assert main(["fit", str(path), "--no-picture", "--image"]) == 0
+        assert self.kinds(tmp_path) == ["keypoints", "photo"]
+        path = write(tmp_path, seen, model=mesh, fit_options={"image": True})
+        assert main(["fit", str(path), "--no-picture"]) == 0
+        assert self.kinds(tmp_path) == ["keypoints", "photo"]
+        assert main(["fit", str(path), "--no-picture", "--no-stored"]) == 0
+        assert self.kinds(tmp_path) == ["keypoints"]
+
+    def test_photo_that_is_not_named_is_asked_for(
+        self, mesh: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        path = write(tmp_path, observed(), model=mesh)
+        line = refusal_line(capsys, "fit", str(path), "--image")
+        assert "--image: the observation names no photo" in line
+
+    def test_mask_alone_needs_no_file(
+        self, mesh: Path, shown: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        Image.fromarray(shown.astype(np.uint8) * 255).save(tmp_path / "a.png")
+        (tmp_path / "camera.json").write_text(json.dumps(CAMERA.to_dict()))
+        given = ["--model", str(mesh), "--camera", str(tmp_path / "camera.json")]
+        assert main(["fit", "--mask", str(tmp_path / "a.png"), *given]) == 0
+        result = result_in(tmp_path)
+        overlap = cast_geometry(Scene(load_mesh(mesh)), CAMERA, result.alignment).mask
+        assert (overlap & shown).sum() > 0.95 * (overlap | shown).sum()
+        assert (tmp_path / "a_fit" / "overlay.png").exists()
+
+    def test_mask_alone_needs_a_camera(
+        self, mesh: Path, shown: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        Image.fromarray(shown.astype(np.uint8) * 255).save(tmp_path / "a.png")
+        path = str(tmp_path / "a.png")
+        line = refusal_line(capsys, "fit", "--mask", path, "--model", str(mesh))
+        assert "a mask alone does not tell the focal length" in line

@@ -7,6 +7,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.errors import InputError
 from cadalign.estimation.contours.descent import Masked, approached
 from cadalign.estimation.contours.silhouettes import differ, resembling_poses
 from cadalign.estimation.contours.surface import surfaces_of
@@ -16,7 +17,12 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
 from cadalign.geometry.mesh import Mesh
 
-_MOST_STARTS = 16
+_MOST_STARTS = 40
+_FEW_STARTS = 12  # that are enough where one of them meets the mask
+_MEETS = 0.003  # misfit of such a start, relative to the mask's size
+_MEETS_PX = 0.5
+_FAR = 0.01  # misfit, relative to the mask's size, of a model that may be another
+_FAR_PX = 2.0
 _MOST_PROPOSALS = 4
 _CLOSE = 3.0  # misfit, relative to the least, at which a proposal is still one
 _CLOSE_PX = 3.0
@@ -29,13 +35,27 @@ class _Proposal(NamedTuple):
     misfit: float
 
 
-def minima_of_mask(problem: JointProblem, model: Model) -> tuple[list[Minimum], int, int]:
+class MaskProposals(NamedTuple):
+    """Minima near a mask, the best first; numbers of iterations and of starts, and a mistake."""
+
+    minima: list[Minimum]
+    iterations: int
+    starts: int
+    mistake: str | None
+
+
+def minima_of_mask(problem: JointProblem, model: Model) -> MaskProposals:
     """Minima of the evidence beside the mask of the only view, at alignments that resemble it.
 
-    Returns them, the best first, and the numbers of iterations and of starts. Raises InputError if
-    the mask has no contour.
+    Raises InputError if the mask has no contour, or the focal length is unknown.
     """
     (view,), camera = problem.views, problem.lenses.cameras[0]
+    if not view.camera.focal_known:
+        raise InputError(
+            "a mask alone does not tell the focal length",
+            where="views[0].camera",
+            fix="give a calibrated camera, or keypoints",
+        )
     contour = contour_view(0, view, "views[0].mask", camera)
     keypoints = len(problem.prior.ids)
     free = np.asarray(problem.prior.scales.free > 0)
@@ -44,7 +64,8 @@ def minima_of_mask(problem: JointProblem, model: Model) -> tuple[list[Minimum], 
         cast(Mesh, model.mesh), mask, camera, free=free, count=_MOST_STARTS
     )
     (surface,) = surfaces_of(model, np.empty((0, 3)), "views[0].mask").surfaces
-    proposals, steps = [], 0
+    proposals: list[_Proposal] = []
+    steps, starts, least = 0, 0, np.inf
     for each in resembling:
         _, minima, iterations, _ = find_minima(problem, [each.alignment], None)
         steps += iterations
@@ -54,7 +75,18 @@ def minima_of_mask(problem: JointProblem, model: Model) -> tuple[list[Minimum], 
             if found is not None:
                 moved = minimum._replace(state=found.state)
                 proposals.append(_Proposal(moved, found.misfit))
-    return [each.minimum for each in _chosen(proposals)], steps, len(resembling)
+        starts += 1
+        least = min((each.misfit for each in proposals), default=np.inf)
+        if starts >= _FEW_STARTS and least < max(_MEETS_PX, _MEETS * contour.contour.size):
+            break
+    mistake = None
+    if least > max(_FAR_PX, _FAR * contour.contour.size):
+        mistake = (
+            f"views[0].mask: no pose found brings the outline closer to the mask's than {least:.1f} "
+            "px on average: the model may be another, the mask incomplete, or the pose wrong"
+        )
+    chosen = [each.minimum for each in _chosen(proposals)]
+    return MaskProposals(chosen, steps, starts, mistake)
 
 
 def _chosen(proposals: list[_Proposal]) -> list[_Proposal]:

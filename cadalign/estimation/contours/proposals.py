@@ -82,8 +82,9 @@ def minima_of_mask(problem: JointProblem, model: Model) -> MaskProposals:
     mistake = None
     if least > max(_FAR_PX, _FAR * contour.contour.size):
         mistake = (
-            f"views[0].mask: no pose found brings the outline closer to the mask's than {least:.1f} "
-            "px on average: the model may be another, the mask incomplete, or the pose wrong"
+            "views[0].mask: no pose found brings the outline closer to the mask's than "
+            f"{least:.1f} px on average: the model may be another, the mask incomplete, or the "
+            "pose wrong"
         )
     chosen = [each.minimum for each in _chosen(proposals)]
     return MaskProposals(chosen, steps, starts, mistake)

@@ -58,11 +58,10 @@ Evidence beyond keypoints stands beside them, each field optional, sigmas and sc
 units per count; in its place keypoints may have a ``depth`` [units], left out where unknown.
 ``shape`` is a file of `cadalign shape learn`, which takes the model's place. ``init`` is an
 alignment to start from, as `cadalign.align` takes it, in the form of ``alignment`` in a fit.json;
-its ``scale`` is 1 unless given. With it, or with a mask, ``keypoints`` may be few, or none. Several
-images of one object stand in ``views``, each with camera, image, keypoints (or none) and evidence
-of its own; and ``cam_from_rig``, a 4 x 4 matrix by rows, for all of them or for none, if the
-cameras' motion is known. Keypoints of the same ``semantic_id`` (or else ``name``, or else ``xyz``)
-are the same::
+its ``scale`` is 1 unless given. With it ``keypoints`` may be few, or none. Several images of one
+object stand in ``views``, each with camera, image, keypoints (or none) and evidence of its own; and
+``cam_from_rig``, a 4 x 4 matrix by rows, for all of them or for none, if the cameras' motion is
+known. Keypoints of the same ``semantic_id`` (or else ``name``, or else ``xyz``) are the same::
 
     {
       "model": "chair.obj",

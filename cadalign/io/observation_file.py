@@ -124,7 +124,7 @@ class OneView(_ImageFields, kw_only=True):
 
 
 class StartedView(OneView, kw_only=True):
-    """A file of one image with a start or a mask, which needs no keypoints."""
+    """A file of one image with a start, which needs no keypoints."""
 
     keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
 
@@ -168,9 +168,7 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
         If a field is missing, unknown or invalid.
     """
     if not isinstance(data, Mapping) or "views" not in data:
-        is_started = isinstance(data, Mapping) and not (
-            data.get("init") is None and data.get("mask") is None
-        )
+        is_started = isinstance(data, Mapping) and data.get("init") is not None
         one: OneView = convert(data, with_evidence(StartedView if is_started else OneView))
         sigma = one.fit.sigma
         if isinstance(sigma, list) and len(sigma) != len(one.keypoints):

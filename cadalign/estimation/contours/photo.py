@@ -48,7 +48,7 @@ _LEAST_TURN = np.radians(2.0)  # of a further start
 _MOST_TURN = np.radians(40.0)
 _SAME_TURN = np.radians(1.0)
 _LEAST_SUPPORT = 0.5  # share of the outline that must be found
-_GOOD_SUPPORT = 0.7  # below which a warning says so
+_GOOD_SUPPORT = 0.75  # below which a warning says so
 _LEAST_PROBABILITY = 1e-3  # of such a rise of the other residuals by chance
 
 

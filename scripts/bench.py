@@ -22,6 +22,7 @@ import tyro
 from benchmarks.accuracy import Coverage, Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
 from benchmarks.cameras import PhotoLenses, Scenes
+from benchmarks.gradients import NoiseOfDetector, TorchLayer
 from benchmarks.masks import MaskAlone, Masks
 from benchmarks.photo import Photos
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
@@ -57,6 +58,8 @@ SECTIONS: dict[str, type[Section]] = {
     "ransac": Ransac,
     "unseen_retrieval": UnseenRetrieval,
     "similar": Similar,
+    "torch": TorchLayer,
+    "noise": NoiseOfDetector,
 }
 ON_REQUEST = ("mask_alone", "photo", "detections", "unseen_retrieval", "similar")
 STORED = Path(__file__).parent / "benchmark_ratios.json"

@@ -53,6 +53,8 @@ class TrainOptions:
     """Rendered views of the models to train with."""
     held_out: int = 200
     """Rendered views of the held-out models."""
+    size: int = 64
+    """Width and height of the images [px]."""
     steps: int = 500
     """Steps of the first training, by heat maps."""
     tuning: int = 120
@@ -61,6 +63,8 @@ class TrainOptions:
     """Views of a step."""
     seed: int = 0
     """Seed of views, network and batches."""
+    threads: int = 2
+    """Threads of PyTorch."""
     out: Path = Path("detector")
     """Folder for the table and what `cadalign fit` takes."""
 
@@ -149,16 +153,20 @@ def judged(
 
 def main(options: TrainOptions) -> None:
     """Train, fine-tune in all ways, and write the table."""
-    torch.set_num_threads(2)
+    torch.set_num_threads(options.threads)
     begun = time.perf_counter()
     models = list(sample_models(per_category=options.models, categories=[options.category]))
     common = set.intersection(*({k.semantic_id for k in each.keypoints} for each in models))
     ids = tuple(sorted(common))
     known, unseen = models[: 3 * len(models) // 4], models[3 * len(models) // 4 :]
     shape = learned_shape(known, ids, options.category)
-    views = render_views(known, ids=ids, count=options.views, seed=options.seed)
-    held_out = render_views(unseen, ids=ids, count=options.held_out, seed=options.seed + 1)
-    spare = render_views(known, ids=ids, count=options.held_out, seed=options.seed + 2)
+    views = render_views(known, ids=ids, size=options.size, count=options.views, seed=options.seed)
+    held_out = render_views(
+        unseen, ids=ids, size=options.size, count=options.held_out, seed=options.seed + 1
+    )
+    spare = render_views(
+        known, ids=ids, size=options.size, count=options.held_out, seed=options.seed + 2
+    )
     print(f"{len(ids)} keypoints, views rendered: {time.perf_counter() - begun:.0f} s", flush=True)
     first = KeypointDetector.untrained(len(ids), seed=options.seed)
     rows = {"untrained": judged(first, held_out, shape)}

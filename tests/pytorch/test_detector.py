@@ -18,11 +18,12 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def views() -> tuple[RenderedViews, RenderedViews]:
     """Views to train with, and those of another model."""
+    torch.set_num_threads(1)  # others run beside
     cars = list(sample_models(per_category=5, categories=["car"]))
     ids = tuple(each.semantic_id for each in cars[0].keypoints)[::2]
     return (
-        render_views(cars[:4], ids=ids, count=96, size=64),
-        render_views(cars[4:], ids=ids, count=16, size=64, seed=1),
+        render_views(cars[:4], ids=ids, count=160, size=48),
+        render_views(cars[4:], ids=ids, count=16, size=48, seed=1),
     )
 
 
@@ -31,7 +32,7 @@ def test_views_are_the_same_for_the_same_seed_and_show_their_keypoints(
 ) -> None:
     known, _ = views
     cars = list(sample_models(per_category=4, categories=["car"]))
-    again = render_views(cars, ids=known.ids, count=3, size=64)
+    again = render_views(cars, ids=known.ids, count=3, size=48)
     assert (again.images == known.images[:3]).all()
     assert known.visible.any(axis=1).all()
     assert known.camera.contains(known.points_2d.reshape(-1, 2)).all()
@@ -48,9 +49,9 @@ def test_training_lowers_loss_and_held_out_errors_by_a_factor(
         return float(np.median(np.linalg.norm(pixels - held_out.points_2d, axis=2)))
 
     before = error()
-    losses = train(detector, known, steps=120, batch=12, rate=4e-3)
-    assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])
-    assert error() < before / 1.5
+    losses = train(detector, known, steps=200, batch=16, rate=3e-3)
+    assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:10])
+    assert error() < before / 1.4
     calibrated = detector.calibrated(held_out)
     pixels, sigma = calibrated.predict(held_out)
     inside = np.linalg.norm(pixels - held_out.points_2d, axis=2) < 1.1774 * sigma  # the median
@@ -62,7 +63,7 @@ def test_the_pose_layer_lowers_its_loss_in_training(
 ) -> None:
     known, _ = views
     detector = KeypointDetector.untrained(len(known.ids), width=16)
-    train(detector, known, steps=40, batch=12, rate=4e-3)
+    train(detector, known, steps=40, batch=12, rate=3e-3)
     points = torch.as_tensor(known.points_3d)
     values: list[float] = []
 
@@ -77,7 +78,7 @@ def test_the_pose_layer_lowers_its_loss_in_training(
         values.append(float(loss.detach().mean()))
         return loss
 
-    train(detector, known, steps=60, batch=12, rate=2e-3, pose_loss=through_the_fit)
+    train(detector, known, steps=60, batch=12, rate=1e-3, pose_loss=through_the_fit)
     assert np.mean(values[-10:]) < 0.8 * np.mean(values[:10])
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import AlignResult, FitResult, Result
     from cadalign.estimation.results import BatchResult, Results, to_dataframe
     from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
+    from cadalign.estimation.tracks.motion import Motion, Trajectory
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
@@ -56,6 +57,7 @@ __all__ = [
     "Material",
     "Mesh",
     "Model",
+    "Motion",
     "Observation",
     "RansacOptions",
     "Result",
@@ -64,6 +66,7 @@ __all__ = [
     "ShapeModel",
     "Size",
     "Symmetry",
+    "Trajectory",
     "View",
     "align",
     "align_batch",

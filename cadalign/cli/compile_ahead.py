@@ -67,7 +67,10 @@ def _align_shape(*, views: int) -> None:
     points, pixels = _points()
     directions = np.random.default_rng(0).normal(size=(2, 12, 3))
     shape = ShapeModel.from_basis(points, directions, [0.1, 0.1])
-    align(shape, [View(_CAMERA, pixels, sigma=1.0)] * views)
+    seen = [View(_CAMERA, pixels, sigma=1.0)] * views
+    align(shape, seen)
+    if views > 1:
+        align(shape, seen, motion="smooth")
 
 
 def _retrieval_and_boxes() -> None:

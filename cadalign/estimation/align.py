@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import numpy as np
 
@@ -42,6 +42,9 @@ from cadalign.geometry.camera import needs_facing
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 
+if TYPE_CHECKING:
+    from cadalign.estimation.tracks.motion import Motion
+
 T = TypeVar("T")
 
 
@@ -58,6 +61,7 @@ def align(
     focal: str = "known",
     focal_prior: PriorOption = USUAL,
     principal_sigma: float | None = None,
+    motion: Motion | Literal["smooth"] | None = None,
 ) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
 
@@ -89,6 +93,11 @@ def align(
     principal_sigma : float, optional
         Standard deviation of the principal point about the camera's [px], as for `cadalign.fit`:
         of views of one camera, with neither masks nor depth images.
+    motion : Motion or "smooth", optional
+        The views are frames of a video (``View.time``) in which the object, or the camera, moves
+        smoothly. Frames of few keypoints or none take part, and with ``ransac`` so do frames whose
+        keypoints are all wrong. ``cam_from_rig`` is then the pose of a camera that moves itself,
+        and ``result.trajectory`` has the poses at all times.
 
     Returns
     -------
@@ -129,6 +138,16 @@ def align(
     )
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
+    if motion is not None:
+        from cadalign.estimation.tracks.motion import Motion
+        from cadalign.estimation.tracks.smooth import align_track  # with the kernels of tracks
+
+        if principal_sigma is not None:
+            what = "a motion takes the principal point as known"
+            raise InputError(what, where="principal_sigma", fix="leave one of both away")
+        return align_track(
+            model, given, Motion.of(motion), size=size, inits=inits, options=options, ransac=ransac
+        )
     if principal_sigma is not None:
         return _align_cropped(model, given, options, size=size, init=init, ransac=ransac)
     if size is None and init is None and is_plain(model, given):

@@ -29,7 +29,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior, is_exact, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.search import JointProblem, Minimum
+from cadalign.estimation.search import JointProblem, Minimum, Track
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
     SAME_SQUARES,
@@ -40,7 +40,7 @@ from cadalign.estimation.symmetry import (
 )
 from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
-from cadalign.estimation.uncertainty.held_out import ShapeTails
+from cadalign.estimation.uncertainty.held_out import ShapeTails, misfits
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
@@ -56,8 +56,8 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import Equal, group_of
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.tails import inflation_with
-from cadalign.solvers.joint.covariance import joint_covariance
-from cadalign.solvers.joint.evidence import points_of
+from cadalign.solvers.joint.covariance import JointCovariance, joint_covariance
+from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 
 _Held = tuple[bool, bool, bool]
@@ -93,7 +93,7 @@ def result_of(
     is_curved: bool,
     warnings: tuple[str, ...],
     evidence: tuple[EvidenceSummary, ...],
-    basis: AnyBasis,
+    basis: AnyBasis | None,
     **of_result: Any,
 ) -> Result:
     """The result of likely estimates, the best first.
@@ -220,12 +220,12 @@ def result_of_minima(
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
     likely = _one_of_equals(likely, symmetry, held)
-    warnings = warnings_of(
-        minimum.evidence,
-        minimum.state,
-        minimum.cost,
-        ShapeTails(inflation, prior.degrees_of_freedom),
-    )
+    tails = ShapeTails(inflation, prior.degrees_of_freedom)
+    track = minimum.track
+    if track is None:
+        warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails)
+    else:
+        warnings = misfits(minimum.cost, track.redundancy, tails)
     return result_of(
         model,
         prior,
@@ -235,7 +235,7 @@ def result_of_minima(
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=warnings if mistake is None else (mistake,),
         evidence=summaries_of(minimum.evidence, minimum.state, likely[0].cameras),
-        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
+        basis=None if track else Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
@@ -259,7 +259,7 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
     if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         sighted = np.unique(evidence.sightings.point)
         widen_box(stretched, sighted[sighted < keypoints])
-    found = joint_covariance(evidence, state)
+    found = _covariance(evidence, state, minimum.track)
     return Estimate(
         stretched / scale,
         scale,
@@ -274,6 +274,15 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
         likelihood,
         tuple(minimum.lenses.cameras_at(state.log_focals)),
     )
+
+
+def _covariance(evidence: Evidence, state: State, track: Track | None) -> JointCovariance:
+    if track is None:
+        return joint_covariance(evidence, state)
+    from cadalign.solvers.tracks.system import Path, moving_covariance  # kernels of tracks alone
+
+    found = moving_covariance(evidence, track.motion, Path(state, track.velocities)).joint
+    return JointCovariance(*(track.widening * part for part in found))
 
 
 def _in_rig(views: Sequence[View], minimum: Minimum, best: Estimate) -> Alignment | None:

@@ -50,11 +50,13 @@ def evidence_of(
     loss_scale: float,
     lenses: Lenses | None = None,
     noise: float = 1.0,
+    frames: Sequence[int] | None = None,
 ) -> Evidence:
     """All that the views, the size and the first component of the prior tell.
 
     By default the views' focal lengths are known. Keypoints without a sigma have the standard
-    deviation ``noise`` [px].
+    deviation ``noise`` [px]. ``frames`` number the poses of the views of a
+    moving object.
 
     Raises InputError if a view names a keypoint that the model lacks, tells nothing, or tells of an
     up axis that the model lacks, or if only some views have a known pose.
@@ -66,19 +68,20 @@ def evidence_of(
         for number, view in enumerate(views)
     ]
     for number, view in enumerate(views):
-        _check_view(view, number)
+        if frames is None:
+            _check_view(view, number)
     directions, offsets = known_of(prior, [view.given for view in views], size)
     if any(camera.turn for camera in lenses.cameras):
         directions = _in_turned_frames(directions, lenses.cameras)
     return Evidence(
         prior.components[0],
         _sightings(rows, views, lenses.cameras, noise, loss, loss_scale),
-        _rig(views),
+        _rig(views, frames),
         lenses.focals(),
         directions,
         offsets,
         sampled_planes(prior.components[0], rows, views),
-        scale_priors(prior, _is_metric(offsets, views)),
+        scale_priors(prior, _is_metric(offsets, views, frames)),
     )
 
 
@@ -92,11 +95,13 @@ def _in_turned_frames(directions: Directions, cameras: Sequence[Camera]) -> Dire
     )
 
 
-def _is_metric(offsets: Offsets, views: Sequence[View]) -> bool:
+def _is_metric(offsets: Offsets, views: Sequence[View], frames: Sequence[int] | None) -> bool:
     """True if the object's size is told: by distances, depths, or known camera poses."""
     depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
     if len(offsets.value) or any(np.isfinite(depth).any() for depth in depths):
         return True
+    if frames is not None:  # several cameras at one time
+        return len(set(frames)) < len(frames) and views[0].cam_from_rig is not None
     return len(views) > 1 and views[0].cam_from_rig is not None
 
 
@@ -152,7 +157,7 @@ def _depths(view: View, count: int) -> FloatArray:
     return found
 
 
-def _rig(views: Sequence[View]) -> Rig:
+def _rig(views: Sequence[View], frames: Sequence[int] | None) -> Rig:
     posed = [view.cam_from_rig is not None for view in views]
     if any(posed) != all(posed):
         raise InputError(
@@ -161,10 +166,12 @@ def _rig(views: Sequence[View]) -> Rig:
             fix="give it for all views, or for none",
         )
     if not all(posed):
-        return Rig(np.tile(_NO_RIG, (len(views), 1)), np.arange(len(views)))
+        own = np.arange(len(views)) if frames is None else np.array(frames)
+        return Rig(np.tile(_NO_RIG, (len(views), 1)), own.astype(np.int64))
     cameras = [cast(FloatArray, view.cam_from_rig) for view in views]
     rows = [np.concatenate([pose[:3, :3].ravel(), pose[:3, 3]]) for pose in cameras]
-    return Rig(np.array(rows), np.zeros(len(views), dtype=np.int64))
+    shared = np.zeros(len(views)) if frames is None else np.array(frames)
+    return Rig(np.array(rows), shared.astype(np.int64))
 
 
 def sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> Planes:

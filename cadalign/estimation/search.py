@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.io.evidence import Size
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
+
+if TYPE_CHECKING:
+    from cadalign.solvers.tracks.motion import MotionPrior
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
@@ -55,6 +58,7 @@ class JointProblem(NamedTuple):
     options: FitOptions
     lenses: Lenses
     noise: float = 1.0  # [px], where it is not given
+    frames: tuple[int, ...] | None = None  # of the views, where the object moves
 
     @property
     def lacks_sigma(self) -> bool:
@@ -78,8 +82,21 @@ class JointProblem(NamedTuple):
             loss_scale=self.options.loss_scale,
             lenses=lenses,
             noise=self.noise,
+            frames=self.frames,
         )
         return everything._replace(shape=shape)
+
+
+class Track(NamedTuple):
+    """The motion of an estimate: its prior and velocities (P, 6).
+
+    ``redundancy`` is that of all evidence, ``widening`` a factor on the variances.
+    """
+
+    motion: MotionPrior
+    velocities: FloatArray
+    redundancy: int
+    widening: float
 
 
 class Minimum(NamedTuple):
@@ -95,6 +112,7 @@ class Minimum(NamedTuple):
     cost: float
     score: float
     lenses: Lenses
+    track: Track | None = None
 
     @property
     def prior_score(self) -> float:
@@ -276,6 +294,8 @@ def find_minima(
         return problem, *minima_at_noise(problem, inits, ransac)
     counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
     poses = 1 if problem.views[0].cam_from_rig is not None else len(problem.views)
+    if problem.frames is not None:
+        poses = max(problem.frames) + 1
     if 2 * sum(counts) <= 6 * poses:
         raise no_redundancy_error(sum(counts))
     effort = np.zeros(2, dtype=int)

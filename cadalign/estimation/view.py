@@ -57,6 +57,8 @@ class View(DeclaredEvidence):
     noise : DetectorNoise, optional
         Calibrated noise of the detector that found the keypoints, all that it found of the object:
         ``sigma`` becomes what it says of their confidences and ids.
+    time : float, optional
+        When the image was taken [s], for an estimate with a motion: views of one time share a pose.
     depth : (n,) or (h, w) float, or path, optional
         Depths of the keypoints, their z in the camera's frame, or an image of such depths that is
         registered to the photo, as an array or as a 16-bit PNG [model units, or the unit in which
@@ -116,6 +118,7 @@ class View(DeclaredEvidence):
     confidences: npt.ArrayLike | None = None
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
     noise: InitVar[DetectorNoise | None] = field(default=None, kw_only=True)
+    time: float | None = field(default=None, kw_only=True)
     is_numbered: bool = field(init=False, repr=False)
     """True where no ids are given."""
 
@@ -135,6 +138,8 @@ class View(DeclaredEvidence):
             known = None if self.is_numbered else self.keypoint_ids
             sigma = noise.sigma(points, scores=self.confidences, ids=known)
             object.__setattr__(self, "sigma", sigma)
+        if self.time is not None and not (is_number(self.time) and np.isfinite(self.time)):
+            raise InputError(f"{quote(self.time)} is not a finite number", where="time")
         if self.depth is not None:
             depth = checked_depth(self.depth, self.camera, len(points), self.depth_scale)
             object.__setattr__(self, "depth", read_only(depth))

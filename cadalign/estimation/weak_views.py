@@ -52,7 +52,7 @@ def views_without_pose(
             or view.image is not None
             or is_told(view.given)
         )
-        and _is_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
+        and lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
     ]
 
 
@@ -130,7 +130,8 @@ def _renumbered(text: str, used: Sequence[int]) -> str:
     return re.sub(r"views\[(\d+)\]", lambda found: f"views[{used[int(found[1])]}]", text)
 
 
-def _is_on_a_line(points: FloatArray) -> bool:
+def lie_on_a_line(points: FloatArray) -> bool:
+    """True for points (n, 3) that determine no rotation: fewer than three, or on one line."""
     if len(points) < _LEAST_POINTS:
         return True
     return are_on_a_line(points, _ON_A_LINE)

@@ -48,20 +48,29 @@ class Piece(NamedTuple):
 
 def pieces_of(evidence: Evidence) -> list[Piece]:
     """All pieces, view by view."""
-    pieces: list[Piece] = []
-    poses = np.bincount(evidence.rig.pose)
-    for view, pose in enumerate(evidence.rig.pose.tolist()):
-        told = {
-            "keypoints": keypoints_in(evidence, view),
-            "mask": contours_in(evidence, view),
-            "depth": np.append(depths_in(evidence, view), evidence.planes.image == view),
-            **{kind: _known_in(evidence, Piece(kind, view)) for kind in kind_names()},
-            "rig": np.array([poses[pose] > 1]),
-        }
-        pieces.extend(Piece(kind, view) for kind, rows in told.items() if rows.any())
-    if _known_in(evidence, Piece(SIZE, None)).any():
+    rig, sightings = evidence.rig, evidence.sightings
+    is_ray, is_keypoint = sightings.whitening.any(axis=1), sightings.whitening[:, 2] > 0
+    measured = sightings.image[sightings.depths[:, 1] > 0]
+    told = {
+        "keypoints": sightings.image[is_keypoint],
+        "mask": sightings.image[is_ray & ~is_keypoint],
+        "depth": np.append(measured, evidence.planes.image),
+        **{kind: _views_of_known(evidence, number) for number, kind in enumerate(kind_names())},
+        "rig": np.flatnonzero(np.bincount(rig.pose)[rig.pose] > 1),
+    }
+    views = {kind: set(rows.tolist()) for kind, rows in told.items()}
+    pieces = [
+        Piece(kind, view) for view in range(len(rig.pose)) for kind in views if view in views[kind]
+    ]
+    if -1 in views[SIZE]:
         pieces.append(Piece(SIZE, None))
     return pieces
+
+
+def _views_of_known(evidence: Evidence, kind: int) -> IntArray:
+    """Views of the known directions and distances of a kind."""
+    tables = (evidence.directions, evidence.offsets)
+    return np.concatenate([each.image[each.kind == kind] for each in tables])
 
 
 def _known_in(evidence: Evidence, piece: Piece) -> BoolArray:
@@ -162,12 +171,14 @@ def summaries_of(
     """Root mean square residuals of all pieces but masks, view by view."""
     points = points_of(evidence.shape, state)
     found = []
-    for view, camera in enumerate(cameras):
-        found.extend(_of_keypoints(evidence, state, points, view, camera))
-        found.extend(_of_depths(evidence, state, points, view))
-        for kind in kind_names():
-            found.extend(_of_known(evidence, state, Piece(kind, view)))
-    found.extend(_of_known(evidence, state, Piece(SIZE, None)))
+    for piece in pieces_of(evidence):
+        if piece.kind in kind_names():
+            found.extend(_of_known(evidence, state, piece))
+        elif piece.view is not None and piece.kind == "keypoints":
+            camera = cameras[piece.view]
+            found.append(_of_keypoints(evidence, state, points, piece.view, camera))
+        elif piece.view is not None and piece.kind == "depth":
+            found.append(_of_depths(evidence, state, points, piece.view))
     return tuple(found)
 
 
@@ -184,17 +195,15 @@ def seen_in_cameras(
 
 def _of_keypoints(
     evidence: Evidence, state: State, points: FloatArray, view: int, camera: Camera
-) -> list[EvidenceSummary]:
+) -> EvidenceSummary:
     sightings, rows = evidence.sightings, keypoints_in(evidence, view)
-    if not rows.any():
-        return []
     seen = seen_in_cameras(evidence, state, points[sightings.point[rows]], _numbers(rows, view))
     log_ratio = log_focals_of(evidence, state)[view]
     ratio = np.exp(log_ratio)
     seen_rays = seen[:, :2] / seen[:, 2:]
     errors = seen_rays - (sightings.rays[rows] + log_ratio * sightings.slopes[rows]) / ratio
     whitening = ratio * sightings.whitening[rows]
-    return [summary_of_keypoints(errors, seen_rays, whitening, view, camera)]
+    return summary_of_keypoints(errors, seen_rays, whitening, view, camera)
 
 
 def summary_of_keypoints(
@@ -208,17 +217,13 @@ def summary_of_keypoints(
     return _summary("keypoints", view, in_pixels, whitened, "px", 2)
 
 
-def _of_depths(
-    evidence: Evidence, state: State, points: FloatArray, view: int
-) -> list[EvidenceSummary]:
-    if not depths_in(evidence, view).any() and not (evidence.planes.image == view).any():
-        return []
+def _of_depths(evidence: Evidence, state: State, points: FloatArray, view: int) -> EvidenceSummary:
     expected, measured, weights = _depths(evidence, state, points, view)
     errors = expected - measured
     counted = np.abs(errors * weights) < _OUTLIER
     if not counted.any():
         counted[:] = True
-    return [_summary("depth", view, errors[counted], (errors * weights)[counted], "")]
+    return _summary("depth", view, errors[counted], (errors * weights)[counted], "")
 
 
 def measured_factor(evidence: Evidence, state: State, piece: Piece) -> float | None:

@@ -1,1 +1,1 @@
-"""The AEPnP paper's simulation."""
+"""Simulated problems: those of the AEPnP paper, and videos."""

@@ -65,21 +65,41 @@ def _covariance_of(
     system = Joint(reduced, False)
     equations = joint_room(reduced)
     evaluate_joint(system, row, equations)
-    state = unpacked(reduced, row)
     arrow = equations.arrow
-    poses, points = state.poses.shape[0], evidence.shape.mean.shape[0]
-    decide_on_undetermined(arrow, poses)
-    first = first_scale(evidence)
+    decide_on_undetermined(arrow, arrow.blocks.shape[0])
     if not factorize_arrow(arrow):
-        size = first + 3 + basis.shape[0]
-        return JointCovariance(
-            np.full((poses, 6, 6), np.inf),
-            np.full((poses, 6, size), np.inf),
-            np.full((size, size), np.inf),
-            np.full((points, 3, 3), np.inf),
-            np.full((points, 3, 3), np.inf),
-        )
+        return unbounded(evidence, arrow.blocks.shape[0])
     inverse = invert_arrow(arrow)
+    return covariances_from(evidence, reduced, basis, row, equations, inverse, sighted)
+
+
+@kernel
+def unbounded(evidence: Evidence, poses: int) -> JointCovariance:
+    """Infinite covariances, of what is not determined."""
+    size, points = first_scale(evidence) + 3, evidence.shape.mean.shape[0]
+    size += evidence.shape.modes.shape[0]
+    return JointCovariance(
+        np.full((poses, 6, 6), np.inf),
+        np.full((poses, 6, size), np.inf),
+        np.full((size, size), np.inf),
+        np.full((points, 3, 3), np.inf),
+        np.full((points, 3, 3), np.inf),
+    )
+
+
+@kernel
+def covariances_from(
+    evidence: Evidence,
+    reduced: Evidence,
+    basis: FloatArray,
+    row: FloatArray,
+    equations: JointEquations,
+    inverse: Arrow,
+    sighted: BoolArray,
+) -> JointCovariance:
+    """Covariances from the ``inverse`` information about poses and border in reduced modes."""
+    state, first = unpacked(reduced, row), first_scale(evidence)
+    points = evidence.shape.mean.shape[0]
     for a in range(3):
         if evidence.scales.free[a] == 0.0:
             inverse.border[first + a, first + a] = 0.0

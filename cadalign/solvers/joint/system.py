@@ -156,7 +156,7 @@ def _solve(system: Joint, equations: JointEquations, damping: float, step: Float
 
 @move.of(Joint)
 @kernel
-def _move(
+def move_joint(
     system: Joint,
     row: FloatArray,
     equations: JointEquations,
@@ -164,6 +164,7 @@ def _move(
     step: FloatArray,
     moved_row: FloatArray,
 ) -> None:
+    """Write the state that a step leads to; see `cadalign.solvers.search.move`."""
     evidence = system.evidence
     state, moved = unpacked(evidence, row), unpacked(evidence, moved_row)
     poses, focals = state.poses.shape[0], state.log_focals.shape[0]

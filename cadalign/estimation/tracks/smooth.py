@@ -1,0 +1,250 @@
+"""The estimate of a track: shape from some frames, a path through all, then everything together.
+
+The strength of the acceleration is the one of the greatest marginal likelihood: MacKay's fixed
+point ("Bayesian interpolation", 1992) of residuals and of the covariance they leave. Keypoints that
+do not fit a robust estimate of the track are outliers where these are expected.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import DegenerateError
+from cadalign.estimation.joint import result_of_minima
+from cadalign.estimation.joint_robust import whitened_lengths, with_loss, with_sightings
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.prior import Lenses, prior_of, widened
+from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import FitStats
+from cadalign.estimation.search import Inits, JointProblem, Minimum, Track, find_minima, thresholds
+from cadalign.estimation.tracks.candidates import best_path, candidates_of, filled, velocities_of
+from cadalign.estimation.tracks.frames import Frames
+from cadalign.estimation.tracks.motion import Motion, Trajectory
+from cadalign.estimation.uncertainty.evidence import count_equations
+from cadalign.estimation.uncertainty.posterior import widening_of
+from cadalign.estimation.view import View
+from cadalign.io.evidence import Size
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import CAUCHY
+from cadalign.solvers.joint.evidence import Evidence
+from cadalign.solvers.tracks.motion import MotionPrior
+from cadalign.solvers.tracks.system import Path, moving_covariance, refine_moving
+
+_FIRST_ITERATIONS = 15
+_ITERATIONS = 60
+_STRENGTH_ROUNDS = 12
+_STRENGTH_PRECISION = 0.05  # change of its logarithm
+_LARGEST_CHANGE = 5.0  # factor, of one round
+_PSEUDO_COUNT = 1.0  # residuals of the first strength that count as seen
+_INLIER_ROUNDS = 4
+_OF_MEDIAN = 1.5  # standard deviation over the median of absolute values
+_LEAST_STRENGTH = 1e-3  # change of the velocity over the whole track, over its size
+_LEAST_SPEED = 1e-6
+
+
+class Smoothed(NamedTuple):
+    """A path, the strength of its motion, and the sightings (N,) that it rests on."""
+
+    evidence: Evidence
+    inliers: BoolArray
+    path: Path
+    motion: MotionPrior
+    iterations: int
+
+
+def align_track(
+    model: Model | ShapeModel,
+    views: Sequence[View],
+    motion: Motion,
+    *,
+    size: Size | None,
+    inits: Inits,
+    options: FitOptions,
+    ransac: RansacOptions | None,
+) -> Result:
+    """The result of `cadalign.align` with a motion."""
+    start = perf_counter()
+    frames, prior = Frames.of(views), prior_of(model)
+    problem = JointProblem(
+        prior,
+        views,
+        size,
+        options,
+        Lenses.of(views, options.focal, options.focal_prior),
+        frames=tuple(frames.of_view.tolist()),
+    )
+    problem, first, iterations, hypotheses = _of_some(problem, frames, inits, ransac)
+    evidence = problem.evidence(first.evidence.shape, problem.lenses)
+    path = _first_path(problem, evidence, first, frames, may_skip=ransac is not None)
+    limits = None
+    if ransac is not None:
+        limits = thresholds(evidence, problem.lenses, problem.threshold(ransac))
+    found = smoothed(evidence, path, frames.times, motion, limits)
+    seconds = perf_counter() - start
+    stats = FitStats(iterations + found.iterations, hypotheses, seconds)
+    return _result(model, problem, found, frames, first.component, stats)
+
+
+def _of_some(
+    problem: JointProblem, frames: Frames, inits: Inits, ransac: RansacOptions | None
+) -> tuple[JointProblem, Minimum, int, int]:
+    """The likeliest estimate from some frames, and the problem with its noise."""
+    numbers = frames.chosen(problem.prior, problem.views)
+    views = [problem.views[number] for number in numbers]
+    minima: Sequence[Minimum] = ()
+    if views:
+        options = problem.options
+        some = problem._replace(
+            views=views,
+            lenses=Lenses.of(views, options.focal, options.focal_prior),
+            frames=frames.among(numbers),
+        )
+        known = [inits[number] for number in numbers]
+        some, minima, iterations, hypotheses = find_minima(some, known, ransac)
+    if not minima:
+        raise DegenerateError(
+            "no frame has keypoints that determine a pose",
+            where="views",
+            fix="give at least 3 keypoints in one frame, and check which is which",
+        )
+    problem = problem._replace(noise=some.noise)
+    return problem, minima[0], iterations, hypotheses
+
+
+def _first_path(
+    problem: JointProblem, evidence: Evidence, first: Minimum, frames: Frames, *, may_skip: bool
+) -> Path:
+    """The path through all frames' candidates for the shape of some frames."""
+    estimated = first.lenses.cameras_at(first.state.log_focals)
+    cameras = dict(zip(first.lenses.cameras, estimated, strict=True))
+    lenses = tuple(cameras.get(each, each) for each in problem.lenses.cameras)
+    known = Lenses(lenses, (-1,) * len(lenses))
+    still = problem.evidence(first.evidence.shape, known)
+    candidates = candidates_of(
+        with_loss(still, CAUCHY), first.points * np.exp(first.state.log_scales)
+    )
+    seen = evidence.rig.pose[evidence.sightings.image]
+    counts = np.bincount(seen, minlength=len(frames.times))
+    rows = best_path(candidates, frames.times, counts, may_skip=may_skip)
+    poses = filled(candidates.poses[rows], candidates.frame[rows], frames.times)
+    log_focals = np.zeros(len(evidence.focals.low))
+    log_focals[: len(first.state.log_focals)] = first.state.log_focals
+    state = first.state._replace(poses=poses, log_focals=log_focals)
+    return Path(state, velocities_of(poses, frames.times))
+
+
+def smoothed(
+    evidence: Evidence,
+    path: Path,
+    times: FloatArray,
+    motion: Motion,
+    limits: FloatArray | None = None,
+) -> Smoothed:
+    """The smooth path near a first one, with the likeliest strengths where these are not given.
+
+    Sightings whose whitened residuals exceed the ``limits`` (N,) are left out, where there are any.
+    """
+    seconds = np.diff(times)
+    unknown = _first_strength(path, seconds)
+    prior = MotionPrior(seconds, motion.strength(unknown))
+    inliers = np.ones(len(evidence.sightings.point), dtype=bool)
+    used = evidence if limits is None else with_loss(evidence, CAUCHY)
+    path, prior, spent = _likeliest(used, path, prior, motion)
+    if limits is None:
+        return Smoothed(evidence, inliers, path, prior, spent)
+    for _ in range(_INLIER_ROUNDS):
+        kept = whitened_lengths(evidence, path.state) < limits
+        if (kept == inliers).all() and used is not evidence:
+            break
+        inliers, used = kept, with_sightings(evidence, kept)
+        path, prior, more = _likeliest(used, path, prior, motion)
+        spent += more
+    return Smoothed(used, inliers, path, prior, spent)
+
+
+def _first_strength(path: Path, seconds: FloatArray) -> FloatArray:
+    """Strengths (2,) of the changes of a first path's velocity."""
+    changes = np.diff(path.velocities, axis=0) / np.sqrt(seconds)[:, None]
+    sizes = np.array([np.median(np.abs(part)) for part in np.split(changes, 2, axis=1)])
+    speeds = np.array([np.abs(part).mean() for part in np.split(path.velocities, 2, axis=1)])
+    least = _LEAST_STRENGTH * (speeds + _LEAST_SPEED) / np.sqrt(seconds.sum())
+    return np.asarray(np.maximum(_OF_MEDIAN * sizes, least))
+
+
+def _likeliest(
+    evidence: Evidence, path: Path, prior: MotionPrior, motion: Motion
+) -> tuple[Path, MotionPrior, int]:
+    """The path and the strengths of the greatest marginal likelihood."""
+    first, count = prior.strength, 6 * len(prior.seconds)
+    spent = 0
+    for _ in range(_STRENGTH_ROUNDS):
+        cost, path, iterations = refine_moving(
+            evidence, prior, path, max_iterations=_FIRST_ITERATIONS
+        )
+        spent += iterations
+        if not cost < np.inf:
+            raise DegenerateError(
+                "the path leads behind a camera",
+                where="views",
+                fix="give more keypoints in each frame, or times that agree with them",
+            )
+        if None not in (motion.angular_sigma, motion.linear_sigma):
+            break
+        found = moving_covariance(evidence, prior, path)
+        if not np.isfinite(found.squares).all():
+            break
+        seen = _PSEUDO_COUNT * (first / prior.strength) ** 2
+        left = np.maximum(count - found.variances, 0.0) + _PSEUDO_COUNT
+        change = np.sqrt((found.squares + seen) / left)
+        change = np.clip(change, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
+        prior = prior._replace(strength=motion.strength(prior.strength * change))
+        if np.abs(np.log(change)).max() < _STRENGTH_PRECISION:
+            break
+    _, path, iterations = refine_moving(evidence, prior, path, max_iterations=_ITERATIONS)
+    return path, prior, spent + iterations
+
+
+def _result(
+    model: Model | ShapeModel,
+    problem: JointProblem,
+    found: Smoothed,
+    frames: Frames,
+    component: int,
+    stats: FitStats,
+) -> Result:
+    evidence, path = found.evidence, found.path
+    covariance = moving_covariance(evidence, found.motion, path)
+    if not np.isfinite(covariance.costs).all():
+        what = "the evidence does not determine the track"
+        raise DegenerateError(what, where="views", fix="give more keypoints, or a size")
+    unknowns = 12 * len(frames.times) + int(evidence.scales.free.sum())
+    unknowns -= round(float(covariance.variances.sum()))
+    redundancy = count_equations(evidence) - len(evidence.shape.modes) - unknowns
+    widening = 1.0
+    if problem.lacks_sigma:
+        widening = widening_of(max(unknowns, 1), max(redundancy, 1))
+    track = Track(found.motion, path.velocities, redundancy, widening)
+    cost = float(covariance.costs[0])
+    minimum = Minimum(
+        component, found.inliers, evidence, path.state, cost, 0.0, problem.lenses, track
+    )
+    result = result_of_minima(model, problem, [minimum], stats)
+    wide, state = widened(evidence, path.state, problem.prior.inflation)
+    covariance = moving_covariance(wide, found.motion, path._replace(state=state))
+    trajectory = Trajectory(
+        frames.times,
+        path.state.poses,
+        path.velocities,
+        widening * covariance.frames,
+        widening * covariance.links,
+        np.exp(path.state.log_scales),
+        Motion.of_strength(found.motion.strength),
+    )
+    return replace(result, trajectory=trajectory)

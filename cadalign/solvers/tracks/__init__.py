@@ -1,0 +1,1 @@
+"""Poses over time: smooth motion of one object, factorized in linear time."""

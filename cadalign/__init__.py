@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.results import BatchResult, Results, to_dataframe
     from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
     from cadalign.estimation.tracks.motion import Motion, Trajectory
+    from cadalign.estimation.tracks.tracker import Tracker
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
@@ -66,6 +67,7 @@ __all__ = [
     "ShapeModel",
     "Size",
     "Symmetry",
+    "Tracker",
     "Trajectory",
     "View",
     "align",

@@ -80,6 +80,29 @@ def align_track(
         Lenses.of(views, options.focal, options.focal_prior),
         frames=tuple(frames.of_view.tolist()),
     )
+    found = estimate_track(problem, frames, motion, inits, ransac)
+    stats = FitStats(found.iterations, found.hypotheses, perf_counter() - start)
+    return _result(model, found, frames, stats)
+
+
+class EstimatedTrack(NamedTuple):
+    """A smooth path of the likeliest component of the shape, the problem with its noise."""
+
+    problem: JointProblem
+    smoothed: Smoothed
+    component: int
+    iterations: int
+    hypotheses: int
+
+
+def estimate_track(
+    problem: JointProblem,
+    frames: Frames,
+    motion: Motion,
+    inits: Inits,
+    ransac: RansacOptions | None,
+) -> EstimatedTrack:
+    """All stages of an estimate."""
     problem, first, iterations, hypotheses = _of_some(problem, frames, inits, ransac)
     evidence = problem.evidence(first.evidence.shape, problem.lenses)
     path = _first_path(problem, evidence, first, frames, may_skip=ransac is not None)
@@ -87,9 +110,8 @@ def align_track(
     if ransac is not None:
         limits = thresholds(evidence, problem.lenses, problem.threshold(ransac))
     found = smoothed(evidence, path, frames.times, motion, limits)
-    seconds = perf_counter() - start
-    stats = FitStats(iterations + found.iterations, hypotheses, seconds)
-    return _result(model, problem, found, frames, first.component, stats)
+    spent = iterations + found.iterations
+    return EstimatedTrack(problem, found, first.component, spent, hypotheses)
 
 
 def _of_some(
@@ -212,13 +234,9 @@ def _likeliest(
 
 
 def _result(
-    model: Model | ShapeModel,
-    problem: JointProblem,
-    found: Smoothed,
-    frames: Frames,
-    component: int,
-    stats: FitStats,
+    model: Model | ShapeModel, estimated: EstimatedTrack, frames: Frames, stats: FitStats
 ) -> Result:
+    problem, found = estimated.problem, estimated.smoothed
     evidence, path = found.evidence, found.path
     covariance = moving_covariance(evidence, found.motion, path)
     if not np.isfinite(covariance.costs).all():
@@ -233,7 +251,14 @@ def _result(
     track = Track(found.motion, path.velocities, redundancy, widening)
     cost = float(covariance.costs[0])
     minimum = Minimum(
-        component, found.inliers, evidence, path.state, cost, 0.0, problem.lenses, track
+        estimated.component,
+        found.inliers,
+        evidence,
+        path.state,
+        cost,
+        0.0,
+        problem.lenses,
+        track,
     )
     result = result_of_minima(model, problem, [minimum], stats)
     wide, state = widened(evidence, path.state, problem.prior.inflation)

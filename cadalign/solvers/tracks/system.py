@@ -15,8 +15,14 @@ from cadalign.compile import kernel
 from cadalign.solvers.joint.arrow import Arrow, empty_arrow
 from cadalign.solvers.joint.covariance import JointCovariance, covariances_from, unbounded
 from cadalign.solvers.joint.equations import JointEquations, joint_room, with_turns
-from cadalign.solvers.joint.evidence import Evidence, State, unpacked
-from cadalign.solvers.joint.reduction import reduced_row, sighted_points, whole_state
+from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked
+from cadalign.solvers.joint.reduction import (
+    reduce_modes,
+    reduced_row,
+    reduced_state,
+    sighted_points,
+    whole_state,
+)
 from cadalign.solvers.joint.search import has_latent
 from cadalign.solvers.joint.system import Joint, evaluate_joint, move_joint
 from cadalign.solvers.search import evaluate, move, refine, room_of, solve
@@ -37,19 +43,21 @@ _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
 
 class Anchor(NamedTuple):
-    """What is known beforehand of the first frame and the border, a Gaussian.
+    """What earlier frames tell of the first frame and the border, to second order.
 
-    Its mean is the ``pose`` (12,), the ``velocity`` (6,) and the ``border`` (b,), its inverse
-    covariance ``information`` (12 + b, 12 + b), (0, 0) for nothing.
+    At the ``pose`` (12,), the ``velocity`` (6,) and the ``border`` (b,) half the cost has the
+    ``gradient`` (12 + b,) and the ``information`` (12 + b, 12 + b), which is (0, 0) for nothing.
     """
 
     pose: FloatArray
     velocity: FloatArray
     border: FloatArray
+    gradient: FloatArray
     information: FloatArray
 
 
-NOTHING_KNOWN = Anchor(np.empty(0), np.empty(0), np.empty(0), np.empty((0, 0)))
+_NONE = np.empty(0)
+NOTHING_KNOWN = Anchor(_NONE, _NONE, _NONE, _NONE, np.empty((0, 0)))
 
 
 class Moving(NamedTuple):
@@ -150,13 +158,13 @@ def _add_anchor(anchor: Anchor, state: State, velocity: FloatArray, chain: Chain
     away[STATE + focals : STATE + focals + 3] = state.log_scales
     away[STATE + focals + 3 :] = state.coefficients
     away[STATE:] -= anchor.border
-    slope = anchor.information @ away
+    slope = anchor.information @ away + anchor.gradient
     chain.gradient[:STATE] += slope[:STATE]
     chain.gradient[last:] += slope[STATE:]
     chain.frames[0] += anchor.information[:STATE, :STATE]
     chain.later[0, :, STATE:] += anchor.information[:STATE, STATE:]
     chain.border[:] += anchor.information[STATE:, STATE:]
-    return float((slope * away).sum())
+    return float(((slope + anchor.gradient) * away).sum())
 
 
 @solve.of(Moving)
@@ -215,22 +223,38 @@ def refine_moving(
     path: Path,
     *,
     max_iterations: int,
-    integrates: bool = True,
-    anchor: Anchor = NOTHING_KNOWN,
 ) -> tuple[float, Path, int]:
-    """Improve a path; returns the objective, the path and the iterations.
+    """Improve a path, the shape integrated out; returns the objective, the path, the iterations.
 
-    The objective is infinite if a point lies behind a camera at the start. The ``anchor`` is in
-    the coefficients of `cadalign.solvers.joint.reduction.reduce_modes`.
+    The objective is infinite if a point lies behind a camera at the start.
     """
-    reduction, row = reduced_row(evidence, path.state)
+    reduction = reduce_modes(evidence)
     reduced = reduction.evidence
-    row = np.concatenate([row, path.velocities.ravel()])
-    system = Moving(reduced, integrates and has_latent(reduced), motion, anchor)
+    state = reduced_state(reduction, evidence.shape, path.state)
+    system = Moving(reduced, has_latent(reduced), motion, NOTHING_KNOWN)
+    cost, found, iterations = refine_path(system, path._replace(state=state), max_iterations)
+    whole = whole_state(reduction, evidence.shape, found.state)
+    return cost, found._replace(state=whole), iterations
+
+
+def refine_path(system: Moving, path: Path, max_iterations: int) -> tuple[float, Path, int]:
+    """Improve a path of a system whose modes are all used."""
+    row = row_of(path)
     cost, iterations, _ = refine(system, max_iterations, row)
     count = path.velocities.size
-    state = whole_state(reduction, evidence.shape, unpacked(reduced, row[:-count]))
+    state = unpacked(system.evidence, row[:-count])
     return cost, Path(state, row[-count:].reshape(-1, 6)), iterations
+
+
+def row_of(path: Path) -> FloatArray:
+    """The path as a row of numbers."""
+    return np.concatenate([packed(path.state), path.velocities.ravel()])
+
+
+def equations_of(system: Moving, path: Path) -> tuple[float, Chain]:
+    """The cost and the normal equations at a path."""
+    equations, _ = _room_of(system)
+    return evaluate_moving(system, row_of(path), equations), equations.chain
 
 
 class PathCovariance(NamedTuple):

@@ -1,0 +1,307 @@
+"""`cadalign.Tracker`: the pose of an object in the newest frame of a running video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, is_whole
+from cadalign.errors import DegenerateError, InputError, NoConsensusError
+from cadalign.estimation.align import align
+from cadalign.estimation.joint_robust import whitened_lengths, with_loss
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.prior import Lenses, prior_of
+from cadalign.estimation.result import Result
+from cadalign.estimation.search import JointProblem, thresholds
+from cadalign.estimation.tracks.between import moved_by
+from cadalign.estimation.tracks.candidates import candidates_of
+from cadalign.estimation.tracks.frames import Frames
+from cadalign.estimation.tracks.motion import Motion, PoseAt
+from cadalign.estimation.tracks.smooth import Smoothed, estimate_track
+from cadalign.estimation.tracks.window import Window, without_pose
+from cadalign.estimation.view import View
+from cadalign.estimation.weak_views import lie_on_a_line
+from cadalign.geometry.alignment import Alignment
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import CAUCHY
+from cadalign.solvers.joint.evidence import Evidence, Shape, points_of
+from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
+from cadalign.solvers.tracks.system import Path
+
+_FIRST_FRAMES = 6  # with keypoints that determine a pose, from which the track begins
+_ITERATIONS = 12
+_MOST_LOST = 0.5  # share of a frame's keypoints that agree, below which it contradicts the track
+_LOST_AFTER = 4  # such frames in a row
+_UNCERTAIN_DEG = 40.0  # standard deviation of the rotation at which the object counts as lost
+_AGREE = 0.7  # share of the keypoints that agree with a pose at which the track goes on
+_LEAST_FOUND = 4  # such keypoints
+
+
+@dataclass(frozen=True, eq=False)
+class TrackUpdate:
+    """What `Tracker.update` knows of the object after a frame.
+
+    Parameters
+    ----------
+    pose : PoseAt or None
+        The pose in the frame that all views share, at the time of the view; None until enough
+        frames determine it.
+    inliers : (n,) bool
+        The view's keypoints that agree with it.
+    is_lost : bool
+        The keypoints contradict the track, or there were none for long: the pose is a guess.
+    is_new : bool
+        The track begins with this frame, or was found again.
+    """
+
+    pose: PoseAt | None
+    inliers: BoolArray
+    is_lost: bool
+    is_new: bool
+
+
+class Tracker:
+    """Track one object online: each frame updates a window of the last ones.
+
+    What earlier frames tell of shape, stretch and motion is kept as Gaussian information, so that
+    an update takes the same few milliseconds however long the video is.
+
+    Parameters
+    ----------
+    model : Model or ShapeModel
+        As for `cadalign.align`.
+    motion : Motion or "smooth"
+        As for `cadalign.align`; a strength that is not given is that of the first frames.
+    lag : int
+        Number of frames in the window, 3 or more.
+    ransac : RansacOptions, optional
+        Expect outliers, among the keypoints and among frames.
+
+    Raises
+    ------
+    InputError
+        If an argument is invalid.
+
+    Examples
+    --------
+    >>> from cadalign import Camera
+    >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
+    >>> tracker = Tracker(Model(points_3d=corners, stretch="none"))
+    >>> for k in range(9):
+    ...     pose = Alignment(np.diag([-1.0, -1.0, 1.0]), [0.3 + 0.01 * k, 0.2, 6.0], np.ones(3))
+    ...     newest = tracker.update(View(camera, camera.project(pose.apply(corners)), time=k / 30))
+    >>> newest.is_lost, round(float(newest.pose.alignment.translation[0]), 3)
+    (False, 0.38)
+    """
+
+    def __init__(
+        self,
+        model: Model | ShapeModel,
+        *,
+        motion: Motion | str = "smooth",
+        lag: int = 10,
+        ransac: RansacOptions | None = None,
+    ) -> None:
+        if not is_whole(lag) or lag < 3:
+            raise InputError(f"{lag!r} is not a whole number from 3 on", where="lag")
+        self._model, self._motion, self._lag, self._ransac = model, Motion.of(motion), lag, ransac
+        self._prior = prior_of(model)
+        self._views: list[View] = []
+        self._recent: list[View] = []
+        self._window: Window | None = None
+        self._shape: Shape | None = None
+        self._contradicting = 0
+        self._is_lost = False
+
+    @property
+    def is_lost(self) -> bool:
+        """True if the last update lost the object, or none has found it yet."""
+        return self._window is None or self._is_lost
+
+    @property
+    def views(self) -> Sequence[View]:
+        """All views so far."""
+        return tuple(self._views)
+
+    @property
+    def points_3d(self) -> FloatArray | None:
+        """Keypoints (m, 3) of the object in the model's frame, with its stretch; None at first."""
+        if self._window is None:
+            return None
+        points = points_of(self._window.evidence.shape, self._window.path.state)
+        return points[: len(self._prior.ids)]
+
+    def smooth(self) -> Result:
+        """The whole track, as `cadalign.align` estimates it from all views."""
+        return align(self._model, self._views, motion=self._motion, ransac=self._ransac)
+
+    def update(self, view: View) -> TrackUpdate:
+        """Take a frame; returns the newest estimate.
+
+        Raises
+        ------
+        InputError
+            If the view has no time, or one that is not later than the last.
+        """
+        self._check(view)
+        self._views.append(view)
+        self._recent.append(view)
+        if self._window is None:
+            return self._begun(view)
+        window = self._grown(self._window, view)
+        tried = [window.refined(_ITERATIONS)]
+        share = self._agreement(tried[0][1])
+        if share.size and share.mean() < _AGREE:
+            tried += [self._from(window, pose).refined(_ITERATIONS) for pose in self._found(view)]
+        _, window = min(tried, key=lambda each: each[0])
+        inliers = self._agreement(window)
+        is_new = self._check_lost(window, inliers)
+        if self._is_lost and (again := self._again(view, window)) is not None:
+            window, is_new = again, True
+            inliers = self._agreement(window)
+        while len(window.times) > self._lag:
+            window = window.without_first()
+            self._recent.pop(0)
+        self._window = window
+        return self._told(view, inliers, is_new)
+
+    def _check(self, view: View) -> None:
+        if view.time is None:
+            raise InputError("a tracked view wants one", where="view.time", fix="give seconds")
+        if self._views and float(view.time) <= float(self._views[-1].time or 0.0):
+            what = f"{view.time} is not later than {self._views[-1].time}, that of the last view"
+            raise InputError(what, where="view.time")
+
+    def _begun(self, view: View) -> TrackUpdate:
+        """Begin the track where the views so far determine poses."""
+        mean = self._prior.components[0].mean
+        rows = [self._prior.rows_of(each.keypoint_ids, "view.ids") for each in self._recent]
+        told = [not lie_on_a_line(mean[own]) for own in rows]
+        nothing = TrackUpdate(None, np.ones(len(view.keypoint_ids), dtype=bool), True, False)
+        if sum(told) < _FIRST_FRAMES:
+            return nothing
+        del self._recent[: -max(self._lag, _FIRST_FRAMES)]
+        try:
+            found, component = self._estimated(self._recent)
+        except (DegenerateError, NoConsensusError):
+            self._recent.pop(0)
+            return nothing
+        evidence, path = self._with_all_modes(component, found)
+        times = np.array([each.time for each in self._recent], dtype=float)
+        window = Window(evidence, times, path, found.motion.strength)
+        _, window = window.refined(_ITERATIONS)
+        while len(window.times) > self._lag:
+            window = window.without_first()
+            self._recent.pop(0)
+        self._window, self._is_lost = window, False
+        return self._told(view, self._agreement(window), True)
+
+    def _estimated(self, views: Sequence[View]) -> tuple[Smoothed, int]:
+        frames = Frames.of(views)
+        problem = self._problem(views, frames.of_view.tolist())
+        found = estimate_track(problem, frames, self._motion, [None] * len(views), self._ransac)
+        return found.smoothed, found.component
+
+    def _problem(self, views: Sequence[View], frames: Sequence[int]) -> JointProblem:
+        lenses = Lenses.of(views, "known", None)
+        return JointProblem(self._prior, views, None, FitOptions(), lenses, frames=tuple(frames))
+
+    def _with_all_modes(self, component: int, found: Smoothed) -> tuple[Evidence, Path]:
+        """Evidence and path in modes that suffice for all keypoints."""
+        shape, ids = self._prior.components[component], self._prior.ids
+        camera = self._recent[0].camera
+        whole = View(camera, np.zeros((len(ids), 2)), ids=ids)
+        reduction = reduce_modes(
+            self._problem([whole, whole], (0, 1)).evidence(
+                shape, Lenses.of([whole, whole], "known", None)
+            )
+        )
+        self._shape = reduction.evidence.shape
+        state = reduced_state(reduction, shape, found.path.state)
+        return self._evidence(), found.path._replace(state=state)
+
+    def _evidence(self) -> Evidence:
+        """Evidence of the recent views."""
+        views, shape = self._recent, self._shape
+        assert shape is not None
+        problem = self._problem(views, range(len(views)))
+        evidence = problem.evidence(shape, problem.lenses)
+        return evidence if self._ransac is None else with_loss(evidence, CAUCHY)
+
+    def _grown(self, window: Window, view: View) -> Window:
+        """The window with a further frame, at which its velocity would lead."""
+        time, state = float(view.time or 0.0), window.path.state
+        velocity = window.path.velocities[-1]
+        ahead = moved_by(state.poses[-1], (time - window.times[-1]) * velocity)
+        path = Path(
+            state._replace(poses=np.vstack([state.poses, ahead])),
+            np.vstack([window.path.velocities, velocity]),
+        )
+        times = np.append(window.times, time)
+        return replace(window, evidence=self._evidence(), times=times, path=path)
+
+    def _from(self, window: Window, pose: FloatArray) -> Window:
+        """The window with another start of its last frame."""
+        state = window.path.state
+        poses = np.vstack([state.poses[:-1], pose])
+        return replace(window, path=window.path._replace(state=state._replace(poses=poses)))
+
+    def _found(self, view: View) -> FloatArray:
+        """Poses (C, 12) that the view's own keypoints suggest for the object's shape."""
+        assert self._window is not None
+        problem = self._problem([view], [0])
+        evidence = problem.evidence(self._prior.components[0], problem.lenses)
+        shape = points_of(self._window.evidence.shape, self._window.path.state)
+        found = candidates_of(with_loss(evidence, CAUCHY), shape)
+        return found.poses[np.argsort(found.costs)][:2]
+
+    def _agreement(self, window: Window) -> BoolArray:
+        """Marks the last frame's keypoints, in the view's order, that agree with the window."""
+        view = self._recent[-1]
+        options = self._ransac or RansacOptions()
+        problem = self._problem(self._recent, range(len(self._recent)))
+        limits = thresholds(window.evidence, problem.lenses, problem.threshold(options))
+        fits = whitened_lengths(window.evidence, window.path.state) < limits
+        last = window.evidence.sightings.image == len(self._recent) - 1
+        order = np.argsort(self._prior.rows_of(view.keypoint_ids, "view.ids"), kind="stable")
+        inliers = np.empty(len(order), dtype=bool)
+        inliers[order] = fits[last]
+        return inliers
+
+    def _check_lost(self, window: Window, inliers: BoolArray) -> bool:
+        """Note whether the object is lost; returns False, a track that goes on is not new."""
+        if len(inliers):
+            contradicts = inliers.mean() < _MOST_LOST
+            self._contradicting = self._contradicting + 1 if contradicts else 0
+        turn = np.trace(window.newest().covariance[:3, :3])
+        is_open = not np.degrees(np.sqrt(max(turn, 0.0))) < _UNCERTAIN_DEG
+        self._is_lost = self._contradicting >= _LOST_AFTER or is_open
+        return False
+
+    def _again(self, view: View, window: Window) -> Window | None:
+        """A window that begins anew where the view's keypoints fit the known shape."""
+        if len(view.keypoint_ids) < _LEAST_FOUND:
+            return None
+        for pose in self._found(view):
+            recent, self._recent = self._recent, [view]
+            begun = without_pose(window, pose, self._evidence())
+            agreement = self._agreement(begun)
+            if agreement.mean() >= _AGREE and agreement.sum() >= _LEAST_FOUND:
+                self._contradicting, self._is_lost = 0, False
+                return begun
+            self._recent = recent
+        return None
+
+    def _told(self, view: View, inliers: BoolArray, is_new: bool) -> TrackUpdate:
+        window = self._window
+        assert window is not None
+        pose = window.path.state.poses[-1]
+        scale = np.exp(window.path.state.log_scales)
+        alignment = Alignment(pose[:9].reshape(3, 3), pose[9:], scale)
+        covariance = window.newest().covariance[:6, :6]
+        at = PoseAt(float(view.time or 0.0), alignment, covariance, window.path.velocities[-1])
+        return TrackUpdate(at, inliers, self._is_lost, is_new)

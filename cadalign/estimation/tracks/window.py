@@ -1,0 +1,167 @@
+"""A window over the last frames of a track, and what the earlier ones tell of it.
+
+A frame that leaves the window is marginalised: what it tells of the next frame and of the shape
+stays as a quadratic (fixed-lag smoothing; Sibley, Matthies, Sukhatme, "Sliding window filter with
+application to planetary landing", 2010).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.solvers.joint.evidence import Evidence, Focals, Rig, State, kept_rows
+from cadalign.solvers.tracks.chain import STATE, Chain, factorize_chain, invert_chain
+from cadalign.solvers.tracks.motion import MotionPrior
+from cadalign.solvers.tracks.system import (
+    NOTHING_KNOWN,
+    Anchor,
+    Moving,
+    Path,
+    equations_of,
+    refine_path,
+)
+
+_LONG = 100.0  # seconds of the motion after which a velocity is unknown
+
+
+class NewestFrame(NamedTuple):
+    """Covariance (12, 12) of pose and velocity of the last frame; the cost of the window."""
+
+    covariance: FloatArray
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Evidence of successive frames at ``times`` (P,), their path, and what is known from earlier.
+
+    ``strength`` (2,) is that of the motion. The evidence's modes are all used, as
+    `cadalign.solvers.joint.reduction.reduce_modes` leaves them.
+    """
+
+    evidence: Evidence
+    times: FloatArray
+    path: Path
+    strength: FloatArray
+    anchor: Anchor = NOTHING_KNOWN
+
+    @property
+    def system(self) -> Moving:
+        """The system of equations."""
+        motion = MotionPrior(np.diff(self.times), self.strength)
+        return Moving(self.evidence, False, motion, self.anchor)
+
+    def refined(self, max_iterations: int) -> tuple[float, Window]:
+        """The cost, and the window with its most likely path."""
+        cost, path, _ = refine_path(self.system, self.path, max_iterations)
+        return cost, replace(self, path=path)
+
+    def newest(self) -> NewestFrame:
+        """Uncertainty of the last frame."""
+        cost, chain = equations_of(self.system, self.path)
+        for diagonal in range(STATE):
+            chain.frames[:, diagonal, diagonal] *= 1 + 1e-12
+        if not factorize_chain(chain):
+            return NewestFrame(np.full((STATE, STATE), np.inf), cost)
+        return NewestFrame(invert_chain(chain).frames[-1], cost)
+
+    def without_first(self) -> Window:
+        """The window without its first frame, which is marginalised."""
+        anchor = _told_by_first(self)
+        state = self.path.state
+        later = Path(state._replace(poses=state.poses[1:]), self.path.velocities[1:])
+        rig = self.evidence.rig
+        kept = rig.pose > 0
+        number = np.cumsum(kept) - 1
+        sightings = kept_rows(self.evidence.sightings, kept[self.evidence.sightings.image])
+        sightings = sightings._replace(image=number[sightings.image])
+        evidence = self.evidence._replace(
+            sightings=sightings,
+            rig=Rig(rig.cam_from_rig[kept], rig.pose[kept] - 1),
+            focals=_of_views(self.evidence, kept),
+        )
+        return replace(self, evidence=evidence, times=self.times[1:], path=later, anchor=anchor)
+
+
+def without_pose(window: Window, pose: FloatArray, evidence: Evidence) -> Window:
+    """A window of one frame at a pose, of ``evidence``, that keeps what is known of the shape."""
+    while len(window.times) > 2:
+        window = window.without_first()
+    known = _told_by_first(window)
+    gone, kept = slice(0, STATE), slice(STATE, None)
+    open_pose = known.information[gone, gone] + 1e-12 * np.eye(STATE)
+    gain = np.linalg.solve(open_pose, known.information[gone, kept]).T
+    information = np.zeros_like(known.information)
+    information[kept, kept] = known.information[kept, kept] - gain @ known.information[gone, kept]
+    gradient = np.zeros_like(known.gradient)
+    gradient[kept] = known.gradient[kept] - gain @ known.gradient[gone]
+    speeds = np.repeat(window.strength, 3) * _LONG**0.5
+    information[np.arange(6, STATE), np.arange(6, STATE)] = speeds**-2.0
+    state = window.path.state._replace(poses=pose[None])
+    still = np.zeros((1, 6))
+    anchor = Anchor(pose, still[0], known.border, gradient, information)
+    return replace(
+        window, evidence=evidence, times=window.times[-1:], path=Path(state, still), anchor=anchor
+    )
+
+
+def _told_by_first(window: Window) -> Anchor:
+    """What the first frame, and what is known of it, tell of the second one and of the border."""
+    evidence, path = window.evidence, window.path
+    rig, first = evidence.rig, evidence.rig.pose[evidence.sightings.image] == 0
+    two = rig.pose < 2
+    own = evidence._replace(
+        sightings=kept_rows(evidence.sightings, first),
+        rig=Rig(rig.cam_from_rig[two], rig.pose[two]),
+        focals=_of_views(evidence, two),
+    )
+    state = path.state._replace(poses=path.state.poses[:2])
+    pair = Path(state, path.velocities[:2])
+    motion = MotionPrior(np.diff(window.times[:2]), window.strength)
+    _, chain = equations_of(Moving(own, False, motion, window.anchor), pair)
+    none = kept_rows(evidence.sightings, np.zeros(len(first), dtype=bool))
+    nothing = own._replace(sightings=none)
+    _, prior = equations_of(Moving(nothing, False, motion, NOTHING_KNOWN), pair)
+    information, gradient = _dense(chain)
+    size = len(chain.border)
+    information[2 * STATE :, 2 * STATE :] -= prior.border  # it stays in the evidence
+    gradient[2 * STATE :] -= prior.gradient[2 * STATE :]
+    gone, kept = slice(0, STATE), slice(STATE, 2 * STATE + size)
+    gain = np.linalg.solve(information[gone, gone], information[gone, kept]).T
+    left = information[kept, kept] - gain @ information[gone, kept]
+    return Anchor(
+        path.state.poses[1].copy(),
+        path.velocities[1].copy(),
+        border_of(path.state),
+        gradient[kept] - gain @ gradient[gone],
+        (left + left.T) / 2,
+    )
+
+
+def _of_views(evidence: Evidence, kept: BoolArray) -> Focals:
+    return evidence.focals._replace(group=evidence.focals.group[kept])
+
+
+def border_of(state: State) -> FloatArray:
+    """The unknowns (b,) that all frames share."""
+    return np.concatenate([state.log_focals, state.log_scales, state.coefficients])
+
+
+def _dense(chain: Chain) -> tuple[FloatArray, FloatArray]:
+    """The matrix and the gradient of a chain of two frames."""
+    size = len(chain.border)
+    last = 2 * STATE
+    whole = np.zeros((last + size, last + size))
+    for p in range(2):
+        own = slice(STATE * p, STATE * (p + 1))
+        whole[own, own] = chain.frames[p]
+        whole[own, last:] = chain.later[p, :, STATE:]
+        whole[last:, own] = chain.later[p, :, STATE:].T
+    whole[:STATE, STATE:last] = chain.later[0, :, :STATE]
+    whole[STATE:last, :STATE] = chain.later[0, :, :STATE].T
+    whole[last:, last:] = chain.border
+    return whole, chain.gradient.copy()

@@ -30,6 +30,7 @@ from benchmarks.runs import Evaluation, Fits, Ransac, RealDetections
 from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Section
 from benchmarks.shapes import Align, FocalShapes, Similar
 from benchmarks.speed import Calls, Cold, Rendering
+from benchmarks.tracks import Tracks
 from rich.console import Console
 from rich.table import Table
 
@@ -60,8 +61,9 @@ SECTIONS: dict[str, type[Section]] = {
     "similar": Similar,
     "torch": TorchLayer,
     "noise": NoiseOfDetector,
+    "tracks": Tracks,
 }
-ON_REQUEST = ("mask_alone", "photo", "detections", "unseen_retrieval", "similar")
+ON_REQUEST = ("mask_alone", "photo", "detections", "unseen_retrieval", "similar", "tracks")
 STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2
 

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
+    from cadalign.estimation.tracks.motion import Motion, PoseAt, Trajectory
+    from cadalign.estimation.tracks.tracker import Tracker, TrackUpdate
     from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
     from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import (
@@ -54,12 +56,17 @@ __all__ = [
     "MaskResiduals",
     "Misfit",
     "Model",
+    "Motion",
+    "PoseAt",
     "RansacOptions",
     "Result",
     "Results",
     "SceneObject",
     "Sensitivity",
     "Size",
+    "TrackUpdate",
+    "Tracker",
+    "Trajectory",
     "Uncertainty",
     "View",
     "ViewResult",

@@ -41,6 +41,7 @@ _FIRST_ITERATIONS = 15
 _ITERATIONS = 60
 _STRENGTH_ROUNDS = 12
 _STRENGTH_PRECISION = 0.05  # change of its logarithm
+_FARTHER = 10.0  # than any frame, where the volume of paths is zero
 _LARGEST_CHANGE = 5.0  # factor, of one round
 _PSEUDO_COUNT = 1.0  # residuals of the first strength that count as seen
 _INLIER_ROUNDS = 4
@@ -217,17 +218,19 @@ def _likeliest(
                 where="views",
                 fix="give more keypoints in each frame, or times that agree with them",
             )
-        if None not in (motion.angular_sigma, motion.linear_sigma):
-            break
         found = moving_covariance(evidence, prior, path)
         if not np.isfinite(found.squares).all():
             break
-        seen = _PSEUDO_COUNT * (first / prior.strength) ** 2
-        left = np.maximum(count - found.variances, 0.0) + _PSEUDO_COUNT
-        change = np.sqrt((found.squares + seen) / left)
+        told = np.maximum(count - found.variances, 0.0)
+        seen = found.squares + _PSEUDO_COUNT * (first / prior.strength) ** 2
+        change = np.sqrt(seen / (told + _PSEUDO_COUNT))
         change = np.clip(change, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
-        prior = prior._replace(strength=motion.strength(prior.strength * change))
-        if np.abs(np.log(change)).max() < _STRENGTH_PRECISION:
+        strength = motion.strength(prior.strength * change)
+        farthest = _FARTHER * float(np.linalg.norm(path.state.poses[:, 9:], axis=1).max())
+        per_frame = float(told[1]) / len(path.velocities)
+        changes = [*np.log(strength / prior.strength), (prior.told - per_frame) / (per_frame + 1)]
+        prior = MotionPrior(prior.seconds, strength, per_frame, farthest)
+        if np.abs(changes).max() < _STRENGTH_PRECISION:
             break
     _, path, iterations = refine_moving(evidence, prior, path, max_iterations=_ITERATIONS)
     return path, prior, spent + iterations

@@ -32,11 +32,14 @@ from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
 from cadalign.solvers.tracks.system import Path
 
 _FIRST_FRAMES = 6  # with keypoints that determine a pose, from which the track begins
+_FIRST_WITH_OUTLIERS = 12
+_FORGOTTEN_AFTER = 15  # frames that contradict the track, at which it begins anew
 _ITERATIONS = 12
 _MOST_LOST = 0.5  # share of a frame's keypoints that agree, below which it contradicts the track
 _LOST_AFTER = 4  # such frames in a row
 _UNCERTAIN_DEG = 40.0  # standard deviation of the rotation at which the object counts as lost
 _AGREE = 0.7  # share of the keypoints that agree with a pose at which the track goes on
+_LEAST_SHARE = 0.6  # of all keypoints that agree where a track begins
 _LEAST_FOUND = 4  # such keypoints
 
 
@@ -159,15 +162,18 @@ class Tracker:
             tried += [self._from(window, pose).refined(_ITERATIONS) for pose in self._found(view)]
         _, window = min(tried, key=lambda each: each[0])
         inliers = self._agreement(window)
-        is_new = self._check_lost(window, inliers)
-        if self._is_lost and (again := self._again(view, window)) is not None:
-            window, is_new = again, True
-            inliers = self._agreement(window)
+        self._check_lost(window, inliers)
+        again = self._again(view, window) if self._is_lost else None
+        if again is not None:
+            window, inliers = again, self._agreement(again)
+        elif self._contradicting >= _FORGOTTEN_AFTER:
+            self._window = None
+            return self._begun(view)
         while len(window.times) > self._lag:
             window = window.without_first()
             self._recent.pop(0)
         self._window = window
-        return self._told(view, inliers, is_new)
+        return self._told(view, inliers, again is not None)
 
     def _check(self, view: View) -> None:
         if view.time is None:
@@ -182,22 +188,24 @@ class Tracker:
         rows = [self._prior.rows_of(each.keypoint_ids, "view.ids") for each in self._recent]
         told = [not lie_on_a_line(mean[own]) for own in rows]
         nothing = TrackUpdate(None, np.ones(len(view.keypoint_ids), dtype=bool), True, False)
-        if sum(told) < _FIRST_FRAMES:
+        first = _FIRST_FRAMES if self._ransac is None else _FIRST_WITH_OUTLIERS
+        if sum(told) < first:
             return nothing
-        del self._recent[: -max(self._lag, _FIRST_FRAMES)]
+        del self._recent[: -max(self._lag, first)]
         try:
             found, component = self._estimated(self._recent)
         except (DegenerateError, NoConsensusError):
-            self._recent.pop(0)
+            return nothing
+        if found.inliers.mean() < _LEAST_SHARE:
             return nothing
         evidence, path = self._with_all_modes(component, found)
         times = np.array([each.time for each in self._recent], dtype=float)
-        window = Window(evidence, times, path, found.motion.strength)
+        window = Window(evidence, times, path, found.motion)
         _, window = window.refined(_ITERATIONS)
         while len(window.times) > self._lag:
             window = window.without_first()
             self._recent.pop(0)
-        self._window, self._is_lost = window, False
+        self._window, self._is_lost, self._contradicting = window, False, 0
         return self._told(view, self._agreement(window), True)
 
     def _estimated(self, views: Sequence[View]) -> tuple[Smoothed, int]:
@@ -272,15 +280,14 @@ class Tracker:
         inliers[order] = fits[last]
         return inliers
 
-    def _check_lost(self, window: Window, inliers: BoolArray) -> bool:
-        """Note whether the object is lost; returns False, a track that goes on is not new."""
+    def _check_lost(self, window: Window, inliers: BoolArray) -> None:
+        """Note whether the object is lost."""
         if len(inliers):
             contradicts = inliers.mean() < _MOST_LOST
             self._contradicting = self._contradicting + 1 if contradicts else 0
         turn = np.trace(window.newest().covariance[:3, :3])
         is_open = not np.degrees(np.sqrt(max(turn, 0.0))) < _UNCERTAIN_DEG
         self._is_lost = self._contradicting >= _LOST_AFTER or is_open
-        return False
 
     def _again(self, view: View, window: Window) -> Window | None:
         """A window that begins anew where the view's keypoints fit the known shape."""

@@ -39,20 +39,20 @@ class NewestFrame(NamedTuple):
 class Window:
     """Evidence of successive frames at ``times`` (P,), their path, and what is known from earlier.
 
-    ``strength`` (2,) is that of the motion. The evidence's modes are all used, as
+    ``prior`` is that of the motion, but for the times. The evidence's modes are all used, as
     `cadalign.solvers.joint.reduction.reduce_modes` leaves them.
     """
 
     evidence: Evidence
     times: FloatArray
     path: Path
-    strength: FloatArray
+    prior: MotionPrior
     anchor: Anchor = NOTHING_KNOWN
 
     @property
     def system(self) -> Moving:
         """The system of equations."""
-        motion = MotionPrior(np.diff(self.times), self.strength)
+        motion = self.prior._replace(seconds=np.diff(self.times))
         return Moving(self.evidence, False, motion, self.anchor)
 
     def refined(self, max_iterations: int) -> tuple[float, Window]:
@@ -99,7 +99,7 @@ def without_pose(window: Window, pose: FloatArray, evidence: Evidence) -> Window
     information[kept, kept] = known.information[kept, kept] - gain @ known.information[gone, kept]
     gradient = np.zeros_like(known.gradient)
     gradient[kept] = known.gradient[kept] - gain @ known.gradient[gone]
-    speeds = np.repeat(window.strength, 3) * _LONG**0.5
+    speeds = np.repeat(window.prior.strength, 3) * _LONG**0.5
     information[np.arange(6, STATE), np.arange(6, STATE)] = speeds**-2.0
     state = window.path.state._replace(poses=pose[None])
     still = np.zeros((1, 6))
@@ -121,7 +121,7 @@ def _told_by_first(window: Window) -> Anchor:
     )
     state = path.state._replace(poses=path.state.poses[:2])
     pair = Path(state, path.velocities[:2])
-    motion = MotionPrior(np.diff(window.times[:2]), window.strength)
+    motion = window.prior._replace(seconds=np.diff(window.times[:2]))
     _, chain = equations_of(Moving(own, False, motion, window.anchor), pair)
     none = kept_rows(evidence.sightings, np.zeros(len(first), dtype=bool))
     nothing = own._replace(sightings=none)

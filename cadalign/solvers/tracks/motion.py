@@ -29,10 +29,18 @@ class MotionPrior(NamedTuple):
     """Intervals ``seconds`` (P - 1,) between frames, and the ``strength`` (2,) of acceleration.
 
     Angular [rad / s^1.5] and linear [model units / s^1.5], roots of power spectral densities.
+
+    The same image from nearer, of a smaller object, moves less, so that the most likely path is too
+    near: it lacks the volume of all paths, which shrinks as well. ``told`` is the number of numbers
+    of translation and velocity that the evidence tells of each frame, with the log determinant of
+    their information, ``-2 told log(depth)`` up to a constant, 0 to leave it out; ``farthest`` is a
+    depth that no frame exceeds.
     """
 
     seconds: FloatArray
     strength: FloatArray
+    told: float = 0.0
+    farthest: float = 1.0
 
 
 @kernel

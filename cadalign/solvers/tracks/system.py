@@ -124,8 +124,32 @@ def evaluate_moving(system: Moving, row: FloatArray, equations: MovingEquations)
     state = unpacked(system.evidence, _joint_part(system, row))
     velocities = _velocities(system, row)
     cost += add_motion(system.motion, state.poses, velocities, chain)
+    if system.motion.told > 0.0:
+        cost += _add_volume(system, state, chain)
     if system.anchor.information.shape[0] > 0:
         cost += _add_anchor(system.anchor, state, velocities[0], chain)
+    return cost
+
+
+@kernel
+def _add_volume(system: Moving, state: State, chain: Chain) -> float:
+    """Add the slope of what `MotionPrior` says of depths; returns its cost."""
+    rig, told, cost = system.evidence.rig, system.motion.told, 0.0
+    frames = state.poses.shape[0]
+    counts = np.zeros(frames)
+    for view in range(rig.pose.shape[0]):
+        counts[rig.pose[view]] += 1.0
+    for view in range(rig.pose.shape[0]):
+        p, camera = rig.pose[view], rig.cam_from_rig[view]
+        depth = camera[11]
+        for a in range(3):
+            depth += camera[6 + a] * state.poses[p, 9 + a]
+        if not depth > 0.0:
+            return np.inf
+        share = told / counts[p]
+        cost += 2.0 * share * np.log(system.motion.farthest / depth)
+        for a in range(3):
+            chain.gradient[STATE * p + 3 + a] -= share * camera[6 + a] / depth
     return cost
 
 
@@ -278,7 +302,7 @@ def moving_covariance(evidence: Evidence, motion: MotionPrior, path: Path) -> Pa
     reduction, row = reduced_row(evidence, path.state)
     row = np.concatenate([row, path.velocities.ravel()])
     basis = np.ascontiguousarray(reduction.basis[: len(evidence.shape.modes)])
-    system = Moving(reduction.evidence, False, motion, NOTHING_KNOWN)
+    system = Moving(reduction.evidence, False, motion._replace(told=0.0), NOTHING_KNOWN)
     return _covariance_of(evidence, system, basis, row, sighted_points(evidence))
 
 

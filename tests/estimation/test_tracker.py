@@ -1,0 +1,125 @@
+"""`cadalign.Tracker`: accuracy beside the whole track, gaps, mistakes, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cadalign import Camera, RansacOptions, ShapeModel, Tracker, View, align
+from cadalign.errors import InputError
+from cadalign.estimation.tracks.tracker import TrackUpdate
+from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
+from cadalign.geometry.rotations import angle_between
+
+pytestmark = pytest.mark.slow
+
+POINTS = 10
+
+
+def category() -> ShapeModel:
+    rng = np.random.default_rng(0)
+    mean, modes = rng.uniform(-0.4, 0.4, (POINTS, 3)), 0.05 * rng.normal(size=(5, POINTS, 3))
+    return ShapeModel.from_basis(mean, modes, np.ones(5), ids=list(range(POINTS)))
+
+
+CATEGORY = category()
+
+
+def video(seed: int, frames: int) -> SimulatedTrack:
+    rng = np.random.default_rng(seed)
+    component = CATEGORY.components[0]
+    shape = component.mean + np.tensordot(rng.normal(size=5), component.modes, 1)
+    return simulate_track(rng, shape[:POINTS], range(POINTS), frames=frames)
+
+
+def errors(updates: list[TrackUpdate], track: SimulatedTrack) -> np.ndarray:
+    """Rotation errors [deg], NaN where there is no pose."""
+    return np.array(
+        [
+            np.nan
+            if update.pose is None
+            else angle_between(update.pose.alignment.rotation, pose.rotation)
+            for update, pose in zip(updates, track.poses, strict=True)
+        ]
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_newest_frame_is_better_than_frame_by_frame_with_a_shared_shape(seed: int) -> None:
+    track = video(seed, 80)
+    tracker = Tracker(CATEGORY)
+    online = errors([tracker.update(view) for view in track.views], track)
+    views = align(CATEGORY, track.views).views
+    joint = [
+        angle_between(v.alignment.rotation, p.rotation)
+        for v, p in zip(views, track.poses, strict=True)
+    ]
+    assert np.isfinite(online[10:]).all()
+    assert np.median(online[20:]) < 1.1 * np.median(joint)
+    assert not tracker.is_lost
+    whole = tracker.smooth()
+    assert len(whole.views) == 80
+    assert tracker.points_3d == pytest.approx(whole.points_3d, abs=0.03)
+
+
+def test_flipped_frames_and_outliers_do_not_lose_the_object() -> None:
+    track = video(2, 80)
+    wrong = with_mistakes(track, np.random.default_rng(2), flipped=0.1, outliers=0.2)
+    tracker = Tracker(CATEGORY, ransac=RansacOptions())
+    updates = [tracker.update(view) for view in wrong.views]
+    assert np.nanmax(errors(updates, track)[10:]) < 8.0
+    assert not any(update.is_lost for update in updates[14:])
+
+
+def test_an_object_that_is_gone_is_lost_and_found_again() -> None:
+    track = video(3, 120)
+    views = [
+        replace(view, points_2d=(), ids=()) if 40 <= k < 100 else view
+        for k, view in enumerate(track.views)
+    ]
+    tracker = Tracker(CATEGORY)
+    updates = [tracker.update(view) for view in views]
+    assert updates[99].is_lost
+    assert not updates[105].is_lost
+    assert errors(updates, track)[105:].max() < 5.0
+    in_gap, before = updates[60].pose, updates[39].pose
+    assert in_gap is not None
+    assert before is not None
+    assert in_gap.rotation_std_deg > 3 * before.rotation_std_deg
+
+
+def test_an_object_that_jumps_is_reported_and_found_again() -> None:
+    track, other = video(4, 60), video(5, 60)
+    later = [
+        replace(view, points_2d=view.camera.project(pose.apply(track.points_3d)), ids=range(POINTS))
+        for view, pose in zip(other.views, other.poses, strict=True)
+    ]
+    views = [*track.views[:30], *later[30:]]
+    tracker = Tracker(CATEGORY)
+    updates = [tracker.update(view) for view in views]
+    assert any(update.is_new for update in updates[31:]) or not updates[-1].is_lost
+    last = updates[-1].pose
+    assert last is not None
+    assert angle_between(last.alignment.rotation, other.poses[-1].rotation) < 5.0
+
+
+def test_too_few_frames_have_no_pose() -> None:
+    tracker = Tracker(CATEGORY)
+    update = tracker.update(video(0, 2).views[0])
+    assert update.pose is None
+    assert update.is_lost
+    assert tracker.points_3d is None
+
+
+def test_bad_arguments_are_refused() -> None:
+    with pytest.raises(InputError, match="lag: 1 is not a whole number from 3 on"):
+        Tracker(CATEGORY, lag=1)
+    camera = Camera(640, 480, 600, 600, 319.5, 239.5)
+    tracker = Tracker(CATEGORY)
+    with pytest.raises(InputError, match=r"view.time: a tracked view wants one; give seconds"):
+        tracker.update(View(camera))
+    tracker.update(View(camera, time=1.0))
+    with pytest.raises(InputError, match=r"view.time: 0.5 is not later than 1.0"):
+        tracker.update(View(camera, time=0.5))

@@ -119,6 +119,7 @@ COMMANDS = {
     "observe": _Command(
         "observe", "Observe", "Pair the keypoints of a detector in a photo with a model's."
     ),
+    "track": _Command("track", "TrackCommand", "Track objects of a learned shape through a video."),
     "annotate": _Command(
         "annotate",
         "Annotate",

@@ -45,6 +45,8 @@ class ImageKeypoints:
     """How sure the detector is of the whole object."""
     source: str = "keypoints"
     """The file and the place in it, for messages."""
+    track: str | None = field(default=None, kw_only=True)
+    """Name or number of the object through the images of a video."""
     segmentation: Any = field(default=None, kw_only=True)
     """The object's mask as COCO writes it, unchecked; see
     `cadalign.datasets.detections.coco_masks.decode_segmentation`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ _COLUMNS: dict[str, Any] = {
     "u": Finite,
     "v": Finite,
     "image": str,
+    "track": str,
     "name": Text,
     "semantic_id": Finite,  # programs write whole numbers as 2.0 in columns with gaps
     "score": Finite,
@@ -52,20 +54,24 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
 
 
 def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read a CSV file, one object for each image."""
-    by_image: dict[str | None, list[dict[str, Any]]] = {}
+    """Read a CSV file, one object for each image, or for each track in it."""
+    by_image: dict[tuple[str | None, str | None], list[dict[str, Any]]] = {}
     try:
         lines = csv.reader(io.StringIO(read_text(path)), strict=True)
         header = _header(next(lines, []), f"{path}, line 1")
         for line in lines:
             row = _row(header, line, f"{path}, line {lines.line_num}")
             if row is not None:
-                by_image.setdefault(row.get("image") or None, []).append(row)
+                key = row.get("image") or None, row.get("track") or None
+                by_image.setdefault(key, []).append(row)
     except csv.Error as error:
         raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
     if not by_image:
         raise DataError("there are no keypoints", where=str(path))
-    return [_object(path, image, rows) for image, rows in by_image.items()]
+    return [
+        replace(_object(path, image, rows), track=track)
+        for (image, track), rows in by_image.items()
+    ]
 
 
 def _header(cells: list[str], where: str) -> list[str]:

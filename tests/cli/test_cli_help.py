@@ -14,6 +14,7 @@ from cadalign.cli import main
 
 PATHS = (
     *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
+    "track",
     *("library build", "library show", "shape learn", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate evidence", "evaluate photos"),
     *("evaluate correspondences", "evaluate retrieval", "evaluate show"),

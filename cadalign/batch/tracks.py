@@ -1,0 +1,157 @@
+"""Objects of a video: a detector's keypoints grouped by track, and the table of their poses."""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from cadalign.datasets import ImageKeypoints
+from cadalign.errors import DataError, InputError, quote
+from cadalign.estimation.result import Result
+from cadalign.estimation.view import View
+from cadalign.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from cadalign.evaluation.runs.tables import Columns, Row
+
+COLUMNS: Columns = (
+    *(("track", str), ("frame", int), ("image", str), ("time", float)),
+    *((name, float) for name in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")),
+    *((name, float) for name in ("rotation_std_deg", "tx_std", "ty_std", "tz_std")),
+    *((name, float) for name in ("speed", "angular_speed_deg")),
+    *(("keypoints", int), ("inliers", int), ("rms_px", float)),
+)
+"""Columns of the table of poses: that of the model in the camera, its uncertainty [degrees, model
+units], speeds in a second, keypoints and root mean square residual of the inliers."""
+
+
+class VideoTrack(NamedTuple):
+    """One object of a video: a view of each frame, the frames' numbers and images."""
+
+    name: str
+    views: tuple[View, ...]
+    frames: tuple[int, ...]
+    images: tuple[str, ...]
+
+
+def tracks_of(
+    objects: Sequence[ImageKeypoints],
+    camera: Camera,
+    ids: Sequence[object],
+    *,
+    rate: float,
+    sigma: float,
+    min_score: float,
+) -> list[VideoTrack]:
+    """The objects of a video by their track, each with a view of all frames from first to last.
+
+    A frame's number is the last one in its image's name, or its place among the images; ``rate``
+    is that of the frames [1/s]. Keypoints are those of the model's ``ids``, by name, by semantic
+    id, or in the model's order.
+
+    Raises
+    ------
+    DataError
+        If two objects of one frame have the same track, or the keypoints are none of the model's.
+    """
+    numbers = _frame_numbers([each.image or "" for each in objects])
+    by_track: dict[str, dict[int, ImageKeypoints]] = defaultdict(dict)
+    images = {numbers[each.image or ""]: each.image or "" for each in objects}
+    for each in objects:
+        own, frame = by_track[each.track or "0"], numbers[each.image or ""]
+        if frame in own:
+            what = f"a second object of track {quote(each.track)} in image {quote(each.image)}"
+            fix = "give each object of an image a track_id of its own"
+            raise DataError(what, where=each.source, fix=fix)
+        own[frame] = each
+    found = []
+    for name, own in by_track.items():
+        frames = range(min(own), max(own) + 1)
+        views = tuple(
+            _view(own.get(k), camera, ids, sigma=sigma, min_score=min_score, time=k / rate)
+            for k in frames
+        )
+        names = tuple(images.get(k, "") for k in frames)
+        found.append(VideoTrack(name, views, tuple(frames), names))
+    return found
+
+
+def _frame_numbers(images: Iterable[str]) -> dict[str, int]:
+    """Number of each image: the last one in its name, or its place where some have none."""
+    distinct = list(dict.fromkeys(images))
+    found = [re.findall(r"\d+", Path(image).stem) for image in distinct]
+    numbers = [int(each[-1]) if each else -1 for each in found]
+    if min(numbers) < 0 or len(set(numbers)) < len(numbers):
+        numbers = list(range(len(distinct)))
+    return dict(zip(distinct, numbers, strict=True))
+
+
+def _view(
+    seen: ImageKeypoints | None,
+    camera: Camera,
+    ids: Sequence[object],
+    *,
+    sigma: float,
+    min_score: float,
+    time: float,
+) -> View:
+    """A frame as a view, without keypoints where the object was not detected."""
+    if seen is None:
+        return View(camera, time=time)
+    given: Sequence[object] | None = seen.names if seen.names is not None else seen.semantic_ids
+    if given is None:
+        if len(seen) != len(ids):
+            what = f"{len(seen)} keypoints without names, but the model has {len(ids)}"
+            raise DataError(what, where=seen.source, fix="name them in the file's categories")
+        given = ids
+    kept = [
+        row
+        for row, name in enumerate(given)
+        if name in ids and (seen.scores is None or seen.scores[row] > min_score)
+    ]
+    if not set(given) & set(ids):
+        known = ", ".join(quote(each) for each in list(ids)[:5])
+        what = f"no keypoint is one of the model's, which are {known}, ..."
+        raise DataError(what, where=seen.source)
+    own = sigma if seen.sigma is None else seen.sigma[kept]
+    names = [given[row] for row in kept]
+    try:
+        return View(camera, seen.points_2d[kept], ids=names, sigma=own, time=time)
+    except InputError as error:
+        raise DataError(error.what, where=f"{seen.source}: {error.where}", fix=error.fix) from None
+
+
+def rows_of(track: VideoTrack, result: Result) -> Iterator[Row]:
+    """A row of the table for each frame."""
+    from cadalign.geometry.rotations import quat_wxyz_from_rotation
+
+    path = result.trajectory
+    assert path is not None
+    places = np.searchsorted(path.times, [float(view.time or 0.0) for view in track.views])
+    for number, image, view, k in zip(
+        track.frames, track.images, result.views, places.tolist(), strict=True
+    ):
+        pose, std = view.alignment, view.std
+        assert std is not None
+        quaternion = quat_wxyz_from_rotation(pose.rotation).tolist()
+        turning, moving = np.linalg.norm(path.velocities[k].reshape(2, 3), axis=1).tolist()
+        yield {
+            "track": track.name,
+            "frame": number,
+            "image": image,
+            "time": float(path.times[k]),
+            **dict(zip(("tx", "ty", "tz"), pose.translation.tolist(), strict=True)),
+            **dict(zip(("qw", "qx", "qy", "qz"), quaternion, strict=True)),
+            "rotation_std_deg": float(std.rotation_deg),
+            **dict(zip(("tx_std", "ty_std", "tz_std"), map(float, std.translation), strict=True)),
+            "speed": moving,
+            "angular_speed_deg": float(np.degrees(turning)),
+            "keypoints": len(view.inliers),
+            "inliers": int(view.inliers.sum()),
+            "rms_px": view.rms,
+        }

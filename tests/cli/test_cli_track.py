@@ -1,0 +1,122 @@
+"""`cadalign track`: files written, several objects, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from support.refusals import refusal_line
+
+from cadalign import ShapeModel
+from cadalign.cli import main
+from cadalign.evaluation.simulation.tracks import TRACK_CAMERA, SimulatedTrack, simulate_track
+
+pytestmark = pytest.mark.slow
+
+FRAMES, POINTS = 20, 8
+NAMES = [f"point {row}" for row in range(POINTS)]
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[SimulatedTrack]]:
+    """A folder with two objects' detections, their shape and the camera; the truth."""
+    folder = tmp_path_factory.mktemp("video")
+    rng = np.random.default_rng(0)
+    mean, modes = rng.uniform(-0.4, 0.4, (POINTS, 3)), 0.04 * rng.normal(size=(3, POINTS, 3))
+    ShapeModel.from_basis(mean, modes, np.ones(3), ids=NAMES).save(folder / "thing.shape")
+    objects = [
+        simulate_track(rng, mean + np.tensordot(rng.normal(size=3), modes, 1), NAMES, frames=FRAMES)
+        for _ in range(2)
+    ]
+    annotations = []
+    for name, each in zip((3, 7), objects, strict=True):
+        for k, view in enumerate(each.views):
+            if name == 7 and 8 <= k < 11:  # not detected
+                continue
+            marks = np.zeros((POINTS, 3))
+            rows = [NAMES.index(str(own)) for own in view.keypoint_ids]
+            marks[rows] = np.column_stack([np.asarray(view.points_2d), np.full(len(rows), 2.0)])
+            annotations.append(
+                {
+                    "image_id": k,
+                    "category_id": 1,
+                    "track_id": name,
+                    "keypoints": marks.ravel().tolist(),
+                }
+            )
+    images = [{"id": k, "file_name": f"frame_{k:04d}.png"} for k in range(FRAMES)]
+    category = {"id": 1, "keypoints": NAMES}
+    found = {"images": images, "annotations": annotations, "categories": [category]}
+    (folder / "found.json").write_text(json.dumps(found))
+    (folder / "camera.json").write_text(json.dumps(TRACK_CAMERA.to_dict()))
+    return folder, objects
+
+
+def command(folder: Path, *more: str) -> list[str]:
+    files = ["--shape", str(folder / "thing.shape"), "--camera", str(folder / "camera.json")]
+    return ["track", str(folder / "found.json"), *files, *more]
+
+
+def test_every_track_gets_its_trajectory_and_rows(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, objects = video
+    assert main(command(folder, "--out", str(tmp_path / "out"))) == 0
+    assert "track 3: 20 frames" in capsys.readouterr().out
+    table = pq.read_table(tmp_path / "out" / "results.parquet").to_pydict()
+    assert table["track"] == ["3"] * FRAMES + ["7"] * FRAMES
+    assert table["image"][:2] == ["frame_0000.png", "frame_0001.png"]
+    assert table["keypoints"][FRAMES + 9] == 0  # it has a pose all the same
+    for name, each in zip((3, 7), objects, strict=True):
+        lines = np.loadtxt(tmp_path / "out" / f"{name}.tum")
+        np.testing.assert_allclose(lines[:, 0], each.times, atol=1e-8)
+        truth = np.array([pose.translation for pose in each.poses])
+        assert np.abs(lines[:, 1:4] - truth).max() < 0.4
+        matrices = np.loadtxt(tmp_path / "out" / f"{name}.txt").reshape(-1, 3, 4)
+        np.testing.assert_allclose(matrices[:, :, 3], lines[:, 1:4], atol=1e-8)
+        assert len(matrices) == FRAMES
+
+
+def test_csv_with_tracks_is_read(video: tuple[Path, list[SimulatedTrack]], tmp_path: Path) -> None:
+    folder, objects = video
+    rows = [
+        f"frame_{k:04d}.png,a,{name},{u},{v}"
+        for k, view in enumerate(objects[0].views)
+        for name, (u, v) in zip(view.keypoint_ids, np.asarray(view.points_2d), strict=True)
+    ]
+    path = tmp_path / "found.csv"
+    path.write_text("\n".join(["image,track,name,u,v", *rows]))
+    files = ["--shape", str(folder / "thing.shape"), "--camera", str(folder / "camera.json")]
+    assert main(["track", str(path), *files]) == 0
+    assert (tmp_path / "found_tracks" / "a.tum").is_file()
+
+
+@pytest.mark.parametrize(
+    ("more", "line"),
+    [
+        (["--rate", "0"], "--rate: 0 is not positive"),
+        (["--angular-sigma", "-1"], "--angular-sigma: -1.0 is not positive"),
+    ],
+)
+def test_bad_options_are_refused(
+    video: tuple[Path, list[SimulatedTrack]],
+    more: list[str],
+    line: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert line in refusal_line(capsys, *command(video[0], *more))
+
+
+def test_two_objects_of_one_track_in_an_image_are_refused(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = video
+    found = json.loads((folder / "found.json").read_text())
+    found["annotations"].append(found["annotations"][0])
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    given = command(folder)
+    given[1] = str(tmp_path / "found.json")
+    assert "a second object of track '3' in image 'frame_0000.png'" in refusal_line(capsys, *given)

@@ -1,0 +1,68 @@
+"""Absolute and relative errors of trajectories: invariances and known values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cadalign.errors import InputError
+from cadalign.estimation.tracks.between import moved_by
+from cadalign.evaluation.metrics.trajectories import (
+    absolute_pose_error,
+    count_flips,
+    relative_pose_error,
+    rotation_jitter_deg,
+)
+
+ORIGIN = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+
+
+def screw(twist: np.ndarray, frames: int = 12) -> np.ndarray:
+    return np.array([moved_by(ORIGIN, k * twist) for k in range(frames)])
+
+
+def placed(poses: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Poses in another frame."""
+    turn = motion[:9].reshape(3, 3)
+    rotations = (turn @ poses[:, :9].reshape(-1, 3, 3)).reshape(-1, 9)
+    return np.concatenate([rotations, poses[:, 9:] @ turn.T + motion[9:]], axis=1)
+
+
+def test_the_errors_of_the_truth_are_zero() -> None:
+    poses = screw(np.array([0.1, 0.2, 0.0, 0.3, 0.0, 0.1]))
+    assert absolute_pose_error(est=poses, gt=poses).translation == 0
+    assert relative_pose_error(est=poses, gt=poses, step=3).rotation_deg < 1e-5
+    assert count_flips(est=poses, gt=poses) == 0
+
+
+def test_relative_errors_do_not_depend_on_the_frame() -> None:
+    poses = screw(np.array([0.1, 0.2, 0.0, 0.3, 0.0, 0.1]))
+    other = screw(np.array([0.1, 0.25, 0.0, 0.3, 0.1, 0.1]))
+    moved = placed(other, moved_by(ORIGIN, np.array([0.5, 1.0, -0.3, 2.0, 1.0, 0.0])))
+    errors = [relative_pose_error(est=each, gt=poses, step=2) for each in (other, moved)]
+    assert errors[0].rotation_deg == pytest.approx(errors[1].rotation_deg, rel=1e-6)
+    assert errors[0].translation == pytest.approx(errors[1].translation, rel=1e-9)
+    assert absolute_pose_error(est=moved, gt=other).translation > 1.0
+
+
+def test_a_constant_twist_has_no_jitter_and_noise_has() -> None:
+    poses = screw(np.array([0.1, 0.2, 0.0, 0.3, 0.0, 0.1]))
+    assert rotation_jitter_deg(poses) < 1e-5
+    rng = np.random.default_rng(0)
+    noisy = np.array([moved_by(each, 0.01 * rng.normal(size=6)) for each in poses])
+    assert rotation_jitter_deg(noisy) == pytest.approx(np.degrees(0.01 * np.sqrt(6)), rel=0.3)
+
+
+def test_half_turns_are_flips() -> None:
+    poses = screw(np.zeros(6), frames=4)
+    wrong = poses.copy()
+    wrong[1] = moved_by(wrong[1], np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    assert count_flips(est=wrong, gt=poses) == 1
+
+
+def test_other_frames_than_true_ones_are_refused() -> None:
+    poses = screw(np.zeros(6), frames=4)
+    with pytest.raises(InputError, match="est: 3 poses for 4 true ones"):
+        absolute_pose_error(est=poses[:3], gt=poses)
+    with pytest.raises(InputError, match="est: 4 poses, but 6 are needed"):
+        relative_pose_error(est=poses, gt=poses, step=5)

@@ -133,7 +133,7 @@ class _DetectorErrors:
 
     @property
     def scale(self) -> FloatArray:
-        """What a standard deviation of 1 is, in pixels, (n,)."""
+        """Pixels (n,) of a standard deviation of 1."""
         return self.sizes if self.unit == "size" else np.ones(len(self.sizes))
 
 

@@ -129,7 +129,7 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class _FitTask:
-    """What a fit is given beside tensors."""
+    """Input of a fit beside tensors."""
 
     cameras: tuple[Camera, ...]
     mask: BoolArray

@@ -55,7 +55,7 @@ def further_names(room: str) -> list[str]:
 
 
 class PublicNames(Directive):
-    """What the room of the argument names publicly."""
+    """The public names of the room in the argument."""
 
     required_arguments = 1
 

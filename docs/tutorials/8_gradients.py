@@ -1,6 +1,6 @@
 """
-Which keypoint a result hangs on
-================================
+Keypoints that move a result most
+=================================
 
 A result is the optimum of a cost. How it moves with every keypoint follows from the cost's
 curvature there, without another fit.

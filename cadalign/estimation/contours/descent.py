@@ -316,7 +316,7 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
 
 
 class Approached(NamedTuple):
-    """Where the first steps from a start lead, and the mean distance [px] of the contours there."""
+    """Place after the first steps from a start, and the contours' mean distance [px] there."""
 
     state: State
     misfit: float

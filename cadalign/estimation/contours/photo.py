@@ -15,14 +15,14 @@ from cadalign.estimation.contours.photo_descent import (
     OFFSET,
     Approach,
     LineNoise,
+    OutlineSupport,
     Pictured,
-    Support,
     approach,
     cost_of_rest,
     finish,
     support_of,
 )
-from cadalign.estimation.contours.photo_lines import Photo, photo_of
+from cadalign.estimation.contours.photo_lines import PhotoPyramid, photo_of
 from cadalign.estimation.contours.surface import Surface, surfaces_of, with_displacement_modes
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
@@ -55,18 +55,18 @@ _LEAST_PROBABILITY = 1e-3  # of such a rise of the other residuals by chance
 class PhotoFit(NamedTuple):
     """Minima with the photos, what each photo supports, and what is left out.
 
-    ``found`` has a view's number with its `Support`, None of which the outline was not found.
+    ``found`` has the `OutlineSupport` of each view by its number, None where no outline was found.
     """
 
     minima: list[Minimum]
-    found: dict[int, Support | None]
+    found: dict[int, OutlineSupport | None]
     warnings: tuple[str, ...]
 
     def noted_in(self, result: Result) -> Result:
         """The result with what is known of the photos."""
         if not self.found:
             return result
-        lacking = Support(0.0, 0, 0.0, 0.0, 0.0)
+        lacking = OutlineSupport(0.0, 0, 0.0, 0.0, 0.0)
         summaries = []
         for view, support in self.found.items():
             share, lines, rms, rms_sigmas, _ = support or lacking
@@ -93,8 +93,8 @@ class _Candidate(NamedTuple):
     reached: Approach
 
     @property
-    def supports(self) -> list[Support]:
-        """How each photo supports the outline."""
+    def supports(self) -> list[OutlineSupport]:
+        """OutlineSupport of the outline by each photo."""
         is_exact = self.pictured.surface.is_exact
         return [
             support_of(outline, OFFSET * own, is_exact=is_exact)
@@ -139,7 +139,7 @@ def fit_photos(
     keypoints = len(prior.ids)
     where = f"views[{photos[0].image}].image"
     surface = surfaces_of(model, minima[0].points[:keypoints], where).surfaces[0]
-    left_out: dict[int, Support | None] = {}
+    left_out: dict[int, OutlineSupport | None] = {}
     warnings = []
     while photos:
         best = _explored(minima, keypoints, photos, surface)
@@ -157,7 +157,7 @@ def fit_photos(
     return PhotoFit(list(minima), left_out, tuple(warnings))
 
 
-def _weak(found: dict[int, Support]) -> list[str]:
+def _weak(found: dict[int, OutlineSupport]) -> list[str]:
     """Warnings about photos that show only a part of the outline."""
     return [
         f"views[{view}].image shows only {100 * each.share:.0f} % of the model's outline"
@@ -167,7 +167,7 @@ def _weak(found: dict[int, Support]) -> list[str]:
 
 
 def _explored(
-    minima: Sequence[Minimum], keypoints: int, photos: list[Photo], surface: Surface
+    minima: Sequence[Minimum], keypoints: int, photos: list[PhotoPyramid], surface: Surface
 ) -> list[_Candidate]:
     """The distinct best of all starts, the likeliest first."""
     near: list[_Candidate] = []
@@ -229,7 +229,7 @@ def _sideways(minimum: Minimum) -> list[FloatArray]:
     return steps
 
 
-def _lacking(best: list[_Candidate], photos: list[Photo]) -> tuple[Photo, str] | None:
+def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> tuple[PhotoPyramid, str] | None:
     """The photo that lacks the outline, or in which it contradicts the rest, and how; or None."""
     if not best:
         return photos[0], "it shows no part of the model's outline"

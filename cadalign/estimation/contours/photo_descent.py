@@ -15,7 +15,12 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.contours.contour import correlation_length, trimmed_deviation
-from cadalign.estimation.contours.photo_lines import Outline, Photo, outline_of, silhouette_of
+from cadalign.estimation.contours.photo_lines import (
+    Outline,
+    PhotoPyramid,
+    outline_of,
+    silhouette_of,
+)
 from cadalign.estimation.contours.surface import (
     Measured,
     PosedSurface,
@@ -66,10 +71,10 @@ class Pictured(NamedTuple):
 
     evidence: Evidence
     keypoints: int
-    photos: list[Photo]
+    photos: list[PhotoPyramid]
     surface: Surface
 
-    def camera_at(self, photo: Photo, state: State) -> Camera:
+    def camera_at(self, photo: PhotoPyramid, state: State) -> Camera:
         """The camera of a photo with the focal length of a state."""
         if self.evidence.focals.group[photo.image] < 0:
             return photo.camera
@@ -147,7 +152,7 @@ def _round(
 
 
 def _rows(
-    photo: Photo,
+    photo: PhotoPyramid,
     outline: Outline,
     noise: LineNoise,
     surface: PosedSurface,
@@ -185,8 +190,8 @@ def _noise_of(outline: Outline | None, offset: float) -> LineNoise:
     return LineNoise(factor, max(length, _LEAST_CORRELATION))
 
 
-class Support(NamedTuple):
-    """How a photo supports an outline.
+class OutlineSupport(NamedTuple):
+    """Agreement of a photo with an outline.
 
     The ``share`` of it that was found within the tolerance, the number of ``lines``, their
     root mean square distance ``rms`` [px] and ``rms_sigmas``, and the ``contrast`` of the colours:
@@ -200,10 +205,10 @@ class Support(NamedTuple):
     contrast: float
 
 
-def support_of(outline: Outline | None, offset: float, *, is_exact: bool) -> Support:
+def support_of(outline: Outline | None, offset: float, *, is_exact: bool) -> OutlineSupport:
     """The support of an outline, which all lies outwards by an ``offset`` [px]."""
     if outline is None:
-        return Support(0.0, 0, 0.0, 0.0, 0.0)
+        return OutlineSupport(0.0, 0, 0.0, 0.0, 0.0)
     relative = _RELATIVE_TOLERANCE if is_exact else _SIMILAR_TOLERANCE
     tolerance = max(_TOLERANCE, relative * outline.silhouette.size)
     distances = outline.places - offset
@@ -212,10 +217,10 @@ def support_of(outline: Outline | None, offset: float, *, is_exact: bool) -> Sup
     patches = len(near) / _LINES_OF_PATCH
     contrast = 2 * patches * outline.contrast
     if not count:
-        return Support(0.0, 0, 0.0, 0.0, contrast)
+        return OutlineSupport(0.0, 0, 0.0, 0.0, contrast)
     rms = float(np.sqrt((distances[near] ** 2).mean()))
     rms_sigmas = float(np.sqrt((outline.in_sigmas(offset)[near] ** 2).mean()))
-    return Support(count / len(near), count, rms, rms_sigmas, contrast)
+    return OutlineSupport(count / len(near), count, rms, rms_sigmas, contrast)
 
 
 def cost_of_rest(pictured: Pictured, state: State) -> float:

@@ -29,7 +29,7 @@ _MOST_PIXELS = 30_000  # OpenCV takes 32,767
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
-class Photo(NamedTuple):
+class PhotoPyramid(NamedTuple):
     """A photo in view number ``image``, and copies of it, each half as wide as the last."""
 
     image: int
@@ -59,7 +59,7 @@ class Photo(NamedTuple):
         return np.concatenate(found).astype(np.float32, copy=False)
 
 
-def photo_of(image: int, camera: Camera, pixels: ByteImage) -> Photo:
+def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
     levels = [np.ascontiguousarray(pixels, dtype=np.float32)]
     while min(levels[-1].shape[:2]) > _SMALLEST:
@@ -68,7 +68,7 @@ def photo_of(image: int, camera: Camera, pixels: ByteImage) -> Photo:
         even = levels[-1][: 2 * size[1], : 2 * size[0]]
         smaller = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
         levels.append(np.asarray(smaller, dtype=np.float32))
-    return Photo(image, camera, tuple(levels))
+    return PhotoPyramid(image, camera, tuple(levels))
 
 
 class Silhouette(NamedTuple):
@@ -148,7 +148,7 @@ def _box_in_image(
 
 
 class Outline(NamedTuple):
-    """What a photo tells about a predicted outline.
+    """Evidence of a photo about a predicted outline.
 
     ``places`` (S,) [px] are outwards from the silhouette's contour, with their standard deviations
     ``sigmas`` (S,), infinite where nothing is told; ``contrast`` is that of `Regions`.
@@ -170,7 +170,7 @@ class Outline(NamedTuple):
         return np.isfinite(self.sigmas)
 
 
-def outline_of(photo: Photo, silhouette: Silhouette, reach: float) -> Outline | None:
+def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Outline | None:
     """Find the photo's contour on lines that reach so far [px]; None where there are no colours."""
     step = reach / STEPS
     inside, outside = _colors_beside(photo, silhouette, reach, step)
@@ -191,7 +191,7 @@ def outline_of(photo: Photo, silhouette: Silhouette, reach: float) -> Outline | 
 
 
 def _colors_beside(
-    photo: Photo, silhouette: Silhouette, reach: float, step: float
+    photo: PhotoPyramid, silhouette: Silhouette, reach: float, step: float
 ) -> tuple[IntArray, IntArray]:
     """Bins of the colours well inside, and outside near the outline."""
     cell = silhouette.cell
@@ -210,7 +210,7 @@ def _colors_beside(
     return seen(depth > margin), seen((height > margin) & (height < _BAND * reach))
 
 
-def _on_own_side(photo: Photo, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
+def _on_own_side(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
     """Pixels (S, 2 K + 1, 2) of lines, up to where a line leaves the image or enters again."""
     inside = silhouette.at(pixels)
     seen = photo.holds(pixels)

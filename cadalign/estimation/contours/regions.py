@@ -46,7 +46,7 @@ def _histogram(bins: IntArray) -> FloatArray:
 
 
 class Regions(NamedTuple):
-    """What colours on both sides of an outline tell.
+    """Colours on both sides of an outline.
 
     ``odds`` are, by bins, the probability of the object minus that of the background; ``contrast``
     is the mutual information of side and colour [nats], 0 without any, log 2 at most.
@@ -65,7 +65,7 @@ def regions_of(inside: IntArray, outside: IntArray) -> Regions:
 
 
 class Crossings(NamedTuple):
-    """Where lines leave the object, in steps outwards from their middles, for each of S lines.
+    """Places at which S lines leave the object, in steps outwards from their middles.
 
     ``places`` (S,) and ``variances`` (S,), infinite where a line tells nothing.
     """
@@ -75,7 +75,7 @@ class Crossings(NamedTuple):
 
 
 def crossings_of(odds: FloatArray, valid: BoolArray, edges: FloatArray) -> Crossings:
-    """Where the colours along lines change from the object's to the background's.
+    """Find where the colours along lines change from the object's to the background's.
 
     ``odds`` (S, 2 K + 1) are those of `Regions` at steps from the inside outwards, of which
     ``valid`` ones count; ``edges`` (S, 2 K + 1) are further log likelihoods of the places. The

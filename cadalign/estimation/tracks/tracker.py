@@ -45,7 +45,7 @@ _LEAST_FOUND = 4  # such keypoints
 
 @dataclass(frozen=True, eq=False)
 class TrackUpdate:
-    """What `Tracker.update` knows of the object after a frame.
+    """Estimate of the object after a frame, as `Tracker.update` returns it.
 
     Parameters
     ----------

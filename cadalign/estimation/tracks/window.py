@@ -110,7 +110,7 @@ def without_pose(window: Window, pose: FloatArray, evidence: Evidence) -> Window
 
 
 def _told_by_first(window: Window) -> Anchor:
-    """What the first frame, and what is known of it, tell of the second one and of the border."""
+    """Information of the first frame, and what is known of it, on the second one and the border."""
     evidence, path = window.evidence, window.path
     rig, first = evidence.rig, evidence.rig.pose[evidence.sightings.image] == 0
     two = rig.pose < 2

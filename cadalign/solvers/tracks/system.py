@@ -43,7 +43,7 @@ _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
 
 class Anchor(NamedTuple):
-    """What earlier frames tell of the first frame and the border, to second order.
+    """Information of earlier frames on the first frame and the border, to second order.
 
     At the ``pose`` (12,), the ``velocity`` (6,) and the ``border`` (b,) half the cost has the
     ``gradient`` (12 + b,) and the ``information`` (12 + b, 12 + b), which is (0, 0) for nothing.

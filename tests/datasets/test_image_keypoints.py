@@ -309,7 +309,7 @@ def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
     ("text", "expected"),
     [
         ("", "{path}, line 1: the column 'u' is missing; the first line names the columns, "),
-        ("1,2\n3,4\n", "{path}, line 1: unknown column '1'; known are u, v, image, name, "),
+        ("1,2\n3,4\n", "{path}, line 1: unknown column '1'; known are u, v, image, track, "),
         ("name,u\na,1\n", "{path}, line 1: the column 'v' is missing; "),
         ("u,x,v\n", "{path}, line 1: the column 'u' occurs twice"),
         ("u,v,score,visibility\n", "{path}, line 1: give score or visibility, not both"),

@@ -520,10 +520,10 @@ class Camera:
         return max(abs(x - 1 / 2), abs(y - 1 / 2)) < 1 / 8
 
     def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> BoolArray:
-        """Say which pixels (n, 2) lie inside the image by at least ``margin`` [px]; (n,) bool."""
+        """Say which pixels (..., 2) lie at least ``margin`` [px] inside the image; (...) bool."""
         low = -0.5 + margin
         high = np.array([self.width, self.height]) - 0.5 - margin
-        return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=1))
+        return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=-1))
 
     def _repr_html_(self) -> str:
         focal, angle = "unknown", "unknown"

@@ -49,12 +49,7 @@ class Masks:
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure all kinds of masks, and those of neighbours."""
-        with tempfile.TemporaryDirectory() as folder:
-            sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
-            models = [model for model in sample if model.mesh_path is not None]
-            if given.keypointnet is not None:
-                models.extend(m for m in KeypointNet(given.keypointnet) if _has_obj(m))
-            cases = list(_draw_cases(models, self.views, given.seed))
+        cases = _cases_of(given, self.views)
         rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
         yield RatioTable(f"masks, {len(cases)} views: medians", rows)
         if self.neighbours:
@@ -65,8 +60,7 @@ class Masks:
         alone, joint, bounds, times, sigmas, left_out, bottles = [], [], [], [], [], 0, []
         for number, each in enumerate(cases):
             rng = np.random.default_rng([seed, 1, number])
-            case = _cut_by_border(each, rng) if kind == "border" else each
-            mask = case.mask if kind == "border" else damaged_mask(case.mask, kind, rng)
+            case, mask = _damaged(each, kind, rng)
             view = case.view(mask)
             try:
                 without = align(case.model, case.view(None))
@@ -137,12 +131,7 @@ class MaskAlone:
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         """Measure all kinds of masks."""
-        with tempfile.TemporaryDirectory() as folder:
-            sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
-            models = [model for model in sample if model.mesh_path is not None]
-            if given.keypointnet is not None:
-                models.extend(m for m in KeypointNet(given.keypointnet) if _has_obj(m))
-            cases = list(_draw_cases(models, self.views, given.seed))
+        cases = _cases_of(given, self.views)
         rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
         yield RatioTable(f"a mask alone, {len(cases)} views", rows)
 
@@ -150,8 +139,7 @@ class MaskAlone:
         first, among, times = [], [], []
         for number, each in enumerate(cases):
             rng = np.random.default_rng([seed, 1, number])
-            case = _cut_by_border(each, rng) if kind == "border" else each
-            mask = case.mask if kind == "border" else damaged_mask(case.mask, kind, rng)
+            case, mask = _damaged(each, kind, rng)
             model = Model(mesh=case.scene.mesh, symmetry=case.annotated.symmetry)
             try:
                 wall, _, result = clocked(partial(align, model, View(case.camera, mask=mask)))
@@ -223,6 +211,24 @@ class _Case:
 
 def _has_obj(model: AnnotatedModel) -> bool:
     return model.mesh_path is not None and model.mesh_path.suffix == ".obj"
+
+
+def _cases_of(given: BenchmarkData, views: int) -> list[_Case]:
+    """Views of the models of the sample dataset and, where it is given, of KeypointNet."""
+    with tempfile.TemporaryDirectory() as folder:
+        sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
+        models = [model for model in sample if model.mesh_path is not None]
+        if given.keypointnet is not None:
+            models.extend(m for m in KeypointNet(given.keypointnet) if _has_obj(m))
+        return list(_draw_cases(models, views, given.seed))
+
+
+def _damaged(case: _Case, kind: str, rng: np.random.Generator) -> tuple[_Case, np.ndarray]:
+    """The case with its mask of one kind; moved, where the border cuts it."""
+    if kind == "border":
+        cut = _cut_by_border(case, rng)
+        return cut, cut.mask
+    return case, damaged_mask(case.mask, kind, rng)
 
 
 def _draw_cases(models: list[AnnotatedModel], views: int, seed: int) -> Iterator[_Case]:

@@ -127,6 +127,11 @@ def _on_level(
 
 def sampled(image: Image, points: FloatArray) -> FloatArray:
     """Values (n,) of an image at points (n, 2), bilinear."""
+    return interpolated(image, points).astype(np.float64)
+
+
+def interpolated(image: Image, points: FloatArray) -> Image:
+    """Values (n,) or colours (n, c) of an image (h, w) or (h, w, c) at points (n, 2), bilinear."""
     single = points.astype(np.float32)
     blocks = [
         cv2.remap(
@@ -139,7 +144,7 @@ def sampled(image: Image, points: FloatArray) -> FloatArray:
         for part in np.array_split(single, max(1, -(-len(single) // 30_000)))  # OpenCV takes 32,767
         if len(part)
     ]
-    return np.concatenate([*blocks, np.empty(0)]).astype(np.float64)
+    return np.concatenate([*blocks, np.empty((0, *image.shape[2:]), dtype=image.dtype)])
 
 
 def _resampled(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -8,12 +8,13 @@ import cv2
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.estimation.contours.contour import Contour, Image, contour_of
+from cadalign.estimation.contours.contour import Contour, Image, contour_of, interpolated
 from cadalign.estimation.contours.regions import bins_of, crossings_of, edges_of, regions_of
 from cadalign.estimation.contours.rims import across_rims, find_rims
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 from cadalign.geometry.projection import model_rays
 from cadalign.io.images import ByteImage
 
@@ -25,7 +26,6 @@ _LEAST_PIXELS = 30
 _RIM_REACH = 2.0  # cells
 _BORDER = 2.0  # [px]
 _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other things
-_MOST_PIXELS = 30_000  # OpenCV takes 32,767
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
@@ -36,27 +36,10 @@ class PhotoPyramid(NamedTuple):
     camera: Camera
     levels: tuple[Image, ...]
 
-    def holds(self, points: FloatArray) -> BoolArray:
-        """Tell which pixels (..., 2) lie in the photo."""
-        last = np.array([self.camera.width, self.camera.height]) - 1
-        return np.asarray(((points >= 0) & (points <= last)).all(axis=-1))
-
     def colors(self, points: FloatArray, step: float) -> Image:
         """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
         level = min(max(int(np.log2(max(step, 1.0))), 0), len(self.levels) - 1)
-        image = self.levels[level]
-        places = ((points + 0.5) / 2**level - 0.5).astype(np.float32)
-        found = [
-            cv2.remap(
-                image,
-                np.ascontiguousarray(part[:, :1]),
-                np.ascontiguousarray(part[:, 1:]),
-                cv2.INTER_LINEAR,
-                borderMode=cv2.BORDER_REPLICATE,
-            )[:, 0]
-            for part in np.array_split(places, -(-len(places) // _MOST_PIXELS))
-        ]
-        return np.concatenate(found).astype(np.float32, copy=False)
+        return interpolated(self.levels[level], rescaled_pixels(points, 0.5**level))
 
 
 def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
@@ -204,7 +187,7 @@ def _colors_beside(
     def seen(chosen: BoolArray) -> IntArray:
         rows, columns = np.nonzero(chosen)
         pixels = silhouette.corner + cell * (np.column_stack([columns, rows]) - room)
-        pixels = pixels[photo.holds(pixels)]
+        pixels = pixels[photo.camera.contains(pixels, margin=PIXEL_CENTRE)]
         return bins_of(photo.colors(pixels, step)) if len(pixels) else np.empty(0, dtype=np.int64)
 
     return seen(depth > margin), seen((height > margin) & (height < _BAND * reach))
@@ -213,7 +196,7 @@ def _colors_beside(
 def _on_own_side(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:
     """Pixels (S, 2 K + 1, 2) of lines, up to where a line leaves the image or enters again."""
     inside = silhouette.at(pixels)
-    seen = photo.holds(pixels)
+    seen = photo.camera.contains(pixels, margin=PIXEL_CENTRE)
     middle = STEPS
     inner = (inside & seen)[:, :middle][:, ::-1]
     outer = (~inside & seen)[:, middle + 1 :]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,8 +12,11 @@ import numpy as np
 from cadalign.datasets import ImageKeypoints
 from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.result import Result
+from cadalign.estimation.tracks.motion import Trajectory
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
+from cadalign.io.video import frame_numbers
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Columns, Row
@@ -39,56 +41,74 @@ class VideoTrack(NamedTuple):
     images: tuple[str, ...]
 
 
+class FoundTrack(NamedTuple):
+    """The estimate of a track, with the object's mesh before the stretch, where one is known."""
+
+    track: VideoTrack
+    result: Result
+    mesh: Mesh | None = None
+
+    @property
+    def path(self) -> Trajectory:
+        """The poses over time."""
+        assert self.result.trajectory is not None
+        return self.result.trajectory
+
+
 def tracks_of(
     objects: Sequence[ImageKeypoints],
-    camera: Camera,
+    camera: Camera | None,
     ids: Sequence[object],
     *,
     rate: float,
     sigma: float,
     min_score: float,
 ) -> list[VideoTrack]:
-    """The objects of a video by their track, each with a view of all frames from first to last.
+    """The objects of videos by their track, each with a view of all frames from first to last.
 
     A frame's number is the last one in its image's name, or its place among the images; ``rate``
-    is that of the frames [1/s]. Keypoints are those of the model's ``ids``, by name, by semantic
-    id, or in the model's order.
+    is that of the frames [1/s]. Images of several folders are several videos, whose tracks are
+    named after them. Without a ``camera`` each file's own is taken. Keypoints are those of the
+    model's ``ids``, by name, by semantic id, or in the model's order.
 
     Raises
     ------
     DataError
         If two objects of one frame have the same track, or the keypoints are none of the model's.
+    InputError
+        If no camera is known.
     """
-    numbers = _frame_numbers([each.image or "" for each in objects])
-    by_track: dict[str, dict[int, ImageKeypoints]] = defaultdict(dict)
-    images = {numbers[each.image or ""]: each.image or "" for each in objects}
+    numbers = frame_numbers([each.image or "" for each in objects])
+    by_track: dict[tuple[str, str], dict[int, ImageKeypoints]] = defaultdict(dict)
+    images = {(_video(name), number): name for name, number in numbers.items()}
     for each in objects:
-        own, frame = by_track[each.track or "0"], numbers[each.image or ""]
+        image = each.image or ""
+        own, frame = by_track[_video(image), each.track or "0"], numbers[image]
         if frame in own:
             what = f"a second object of track {quote(each.track)} in image {quote(each.image)}"
             fix = "give each object of an image a track_id of its own"
             raise DataError(what, where=each.source, fix=fix)
         own[frame] = each
     found = []
-    for name, own in by_track.items():
+    has_one = len({video for video, _ in by_track}) == 1
+    for (video, name), own in by_track.items():
+        known = camera or next(iter(own.values())).camera
+        if known is None:
+            raise InputError("tracks need one", where="camera", fix="give its file")
         frames = range(min(own), max(own) + 1)
         views = tuple(
-            _view(own.get(k), camera, ids, sigma=sigma, min_score=min_score, time=k / rate)
+            _view(own.get(k), known, ids, sigma=sigma, min_score=min_score, time=k / rate)
             for k in frames
         )
-        names = tuple(images.get(k, "") for k in frames)
-        found.append(VideoTrack(name, views, tuple(frames), names))
+        names = tuple(images.get((video, k), "") for k in frames)
+        label = name if has_one else f"{video}/{name}"
+        found.append(VideoTrack(label, views, tuple(frames), names))
     return found
 
 
-def _frame_numbers(images: Iterable[str]) -> dict[str, int]:
-    """Number of each image: the last one in its name, or its place where some have none."""
-    distinct = list(dict.fromkeys(images))
-    found = [re.findall(r"\d+", Path(image).stem) for image in distinct]
-    numbers = [int(each[-1]) if each else -1 for each in found]
-    if min(numbers) < 0 or len(set(numbers)) < len(numbers):
-        numbers = list(range(len(distinct)))
-    return dict(zip(distinct, numbers, strict=True))
+def _video(image: str) -> str:
+    """Name of the video that an image is of: its folder's."""
+    return Path(image).parent.name
 
 
 def _view(
@@ -126,12 +146,11 @@ def _view(
         raise DataError(error.what, where=f"{seen.source}: {error.where}", fix=error.fix) from None
 
 
-def rows_of(track: VideoTrack, result: Result) -> Iterator[Row]:
+def rows_of(found: FoundTrack) -> Iterator[Row]:
     """A row of the table for each frame."""
     from cadalign.geometry.rotations import quat_wxyz_from_rotation
 
-    path = result.trajectory
-    assert path is not None
+    track, result, path = found.track, found.result, found.path
     places = np.searchsorted(path.times, [float(view.time or 0.0) for view in track.views])
     for number, image, view, k in zip(
         track.frames, track.images, result.views, places.tolist(), strict=True

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -15,6 +16,16 @@ from cadalign.cli.runs import NOTHING_WORKED, SOME_FAILED, SUCCESS
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import RansacOptions
 
+if TYPE_CHECKING:
+    from cadalign.batch.tracks import FoundTrack, VideoTrack
+    from cadalign.datasets import ImageKeypoints
+    from cadalign.estimation.tracks.motion import Motion
+    from cadalign.geometry.camera import Camera
+    from cadalign.io.video import Video
+    from cadalign.shapes.model import ShapeModel
+
+_RATE = 30.0
+
 
 @dataclass(frozen=True)
 class TrackCommand(CameraOptions):
@@ -22,18 +33,27 @@ class TrackCommand(CameraOptions):
 
     Keypoints of one track are one object: its shape is shared by all frames, and its poses follow
     each other smoothly; frames in which it was not detected get a pose, too. Writes for each track
-    its trajectory in the forms of TUM (<track>.tum, with times) and KITTI (<track>.txt), and
-    results.parquet with a row for each frame of each track.
+    its trajectory in the forms of TUM (<track>.tum, with times) and KITTI (<track>.txt),
+    results.parquet with a row for each frame of each track, index.html with plots over time,
+    tracks.glb with the moving objects, and with --video the pictures with what was found drawn in,
+    overlay.mp4.
     """
 
     detections: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DETECTIONS")]
-    """COCO keypoint JSON with track_id, or CSV with the columns image, track, name, u, v."""
-    shape: Path
-    """The learned shape, a file of `cadalign shape learn`."""
+    """COCO keypoint JSON with track_id, CSV with the columns image, track, name, u, v, or a folder
+    of KITTI's cars with car_tracks.json."""
+    shape: Path | None = None
+    """The learned shape, a file of `cadalign shape learn`; by default that of a folder of KITTI's
+    cars."""
+    video: Path | None = None
+    """The video, a file or a folder of its pictures, to draw into."""
+    first_frame: int = 0
+    """Number of the first frame of a video file among the frames of the detections."""
     out: Path | None = None
     """Folder to write to; by default <detections>_tracks beside the detections."""
-    rate: float = 30.0
-    """Frames in a second; an image's frame is the last number in its name."""
+    rate: float | None = None
+    """Frames in a second; an image's frame is the last number in its name. By default the video's,
+    or 30."""
     sigma: float = 2.0
     """Standard deviation of the keypoints [px], where the file has none."""
     min_score: float = 0.1
@@ -47,59 +67,149 @@ class TrackCommand(CameraOptions):
     """Strength of the linear acceleration [model units / s^1.5]; estimated by default."""
 
     def run(self) -> int:
-        """Write trajectories and table; returns the exit code."""
-        from cadalign.batch.tracks import COLUMNS, rows_of, tracks_of
+        """Write trajectories, table, page and animation; returns the exit code."""
+        from cadalign.batch.tracks import tracks_of
         from cadalign.datasets import read_image_keypoints
-        from cadalign.estimation.align import align
         from cadalign.estimation.tracks.motion import Motion
-        from cadalign.evaluation.runs.tables import write_rows
-        from cadalign.export.trajectories import write_kitti, write_tum
-        from cadalign.shapes.model import ShapeModel
+        from cadalign.io.video import Video
 
-        objects, shape = read_image_keypoints(self.detections), ShapeModel.open(self.shape)
+        objects, shape = read_image_keypoints(self.detections), self._read_shape()
+        video = None if self.video is None else Video.open(self.video)
         with named_as_flags(self):
             motion = Motion(self.angular_sigma, self.linear_sigma)
-            for name in ("rate", "sigma"):
-                if not getattr(self, name) > 0:
-                    raise InputError(f"{getattr(self, name):g} is not positive", where=name)
-            camera = self.read_camera(objects[0].size)
-        if camera is None:
-            raise InputError("tracks need one", where="--camera", fix="give its file")
-        tracks = tracks_of(
-            objects,
-            camera,
-            shape.ids,
-            rate=self.rate,
-            sigma=self.sigma,
-            min_score=self.min_score,
-        )
+            for name, value in (("rate", self.rate), ("sigma", self.sigma)):
+                if value is not None and not value > 0:
+                    raise InputError(f"{value:g} is not positive", where=name)
+            rate = self.rate or (video.rate if video else None) or _RATE
+            tracks = tracks_of(
+                objects,
+                self._camera(objects, video),
+                shape.ids,
+                rate=rate,
+                sigma=self.sigma,
+                min_score=self.min_score,
+            )
+        if video is not None:
+            _require_video(video, tracks)
         folder = self.out or self.detections.with_name(f"{self.detections.stem}_tracks")
         make_folder(folder)
-        rows, failed, console = [], 0, new_console(stderr=False)
+        found, failures = self._estimate(tracks, shape, motion)
+        if found:
+            self._write(folder, found, failures, video)
+        say(f"Trajectories: {folder}")
+        if not found:
+            return NOTHING_WORKED
+        return SOME_FAILED if failures else SUCCESS
+
+    def _read_shape(self) -> ShapeModel:
+        from cadalign.datasets.photos.kitti_keypoints import car_shape
+        from cadalign.shapes.model import ShapeModel
+
+        if self.shape is not None:
+            return ShapeModel.open(self.shape)
+        folder = self.detections if self.detections.is_dir() else self.detections.parent
+        shape = car_shape(folder)
+        if shape is None:
+            fix = "give a file of `cadalign shape learn`"
+            raise InputError("tracks need one", where="--shape", fix=fix)
+        return shape
+
+    def _camera(self, objects: Sequence[ImageKeypoints], video: Video | None) -> Camera | None:
+        """The camera of the options, for pictures of the video's or the detections' size."""
+        from cadalign.geometry.camera import Camera
+        from cadalign.io.observation import with_lens
+
+        changes = self.of_camera
+        size = objects[0].size if video is None else video.size
+        camera = changes.read_camera(size)
+        if changes.focal is None and changes.fov is None:
+            return camera
+        if camera is None and size is None:
+            what = "the size of the pictures is unknown"
+            raise InputError(what, where="camera", fix="give --video, or the camera's file")
+        known = camera or Camera.without_focal(*(size or (1, 1)))
+        return with_lens(known, changes.focal, fov=changes.fov)
+
+    def _estimate(
+        self, tracks: Sequence[VideoTrack], shape: ShapeModel, motion: Motion
+    ) -> tuple[list[FoundTrack], dict[str, str]]:
+        """Estimate every track, and say how; also why some could not be."""
+        from cadalign.batch.tracks import FoundTrack
+        from cadalign.estimation.align import align
+        from cadalign.render.drawing.result_overlay import nearest_mesh
+
+        found, failures, console = [], dict[str, str](), new_console(stderr=False)
         ransac = RansacOptions() if self.robust else None
         for track in tracks:
             try:
                 with waiting(f"track {track.name}"):
                     result = align(shape, track.views, motion=motion, ransac=ransac)
             except CadalignError as error:
-                failed += 1
+                failures[track.name] = str(error)
                 console.print(f"track {track.name}: {error}", markup=False)
                 continue
-            path = result.trajectory
-            assert path is not None
-            stem = re.sub(r"[^\w.-]+", "_", track.name) or "track"
-            write_tum(folder / f"{stem}.tum", path.times, path.poses)
-            write_kitti(folder / f"{stem}.txt", path.poses)
-            rows += list(rows_of(track, result))
+            found.append(FoundTrack(track, result, nearest_mesh(result)))
             inliers = int(result.inliers.sum())
             console.print(
                 f"track {track.name}: {len(track.views)} frames, {inliers} of "
                 f"{len(result.inliers)} keypoints, rms {result.rms:.3g} px",
                 markup=False,
             )
-        if rows:
-            write_rows(folder / "results.parquet", COLUMNS, rows)
-        say(f"Trajectories: {folder}")
-        if failed == len(tracks):
-            return NOTHING_WORKED
-        return SOME_FAILED if failed else SUCCESS
+        return found, failures
+
+    def _write(
+        self,
+        folder: Path,
+        found: Sequence[FoundTrack],
+        failures: Mapping[str, str],
+        video: Video | None,
+    ) -> None:
+        from cadalign.batch.track_video import draw_video, moving_object
+        from cadalign.batch.tracks import COLUMNS, rows_of
+        from cadalign.evaluation.runs.tables import write_rows
+        from cadalign.export.moving_glb import write_moving_glb
+        from cadalign.export.trajectories import write_kitti, write_tum
+        from cadalign.render.drawing.movie import write_movie
+        from cadalign.report.track_page import write_track_page
+
+        for each in found:
+            stem = re.sub(r"[^\w.-]+", "_", each.track.name) or "track"
+            write_tum(folder / f"{stem}.tum", each.path.times, each.path.poses)
+            write_kitti(folder / f"{stem}.txt", each.path.poses)
+        rows = [row for each in found for row in rows_of(each)]
+        write_rows(folder / "results.parquet", COLUMNS, rows)
+        write_moving_glb(folder / "tracks.glb", [moving_object(each) for each in found])
+        count = f"{len(found)} track{'s' * (len(found) != 1)}"
+        write_track_page(
+            folder / "index.html",
+            found,
+            title=f"Tracks of {self.detections.stem}",
+            summary=f"{count} of {self.detections.name}, {len(rows):,} frames in all.",
+            settings=self._settings(),
+            failures=failures,
+        )
+        if video is not None:
+            rate = self.rate or video.rate or _RATE
+            with waiting("drawing"):
+                drawn = draw_video(video, found, first=self.first_frame)
+                write_movie(folder / "overlay.mp4", drawn, fps=rate)
+
+    def _settings(self) -> dict[str, str]:
+        given = {
+            "detections": self.detections,
+            "shape": self.shape or "KITTI's cars",
+            "noise where the file has none": f"{self.sigma:g} px",
+            "outliers expected": "yes" if self.robust else "no",
+        }
+        return {name: str(value) for name, value in given.items()}
+
+
+def _require_video(video: Video, tracks: Sequence[VideoTrack]) -> None:
+    """Refuse a video of another size, or one for detections of several."""
+    from cadalign.batch.track_video import require_size
+
+    folders = {str(Path(image).parent) for each in tracks for image in each.images if image}
+    if len(folders) > 1:
+        what = f"the detections are of {len(folders)} videos"
+        raise InputError(what, where="--video", fix="give the detections of one")
+    require_size(video, tracks[0].views[0].camera)

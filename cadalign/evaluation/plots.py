@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 # Colours that colour-blind people tell apart, too: Okabe and Ito's (jfly.uni-koeln.de/color), then
 # dark ones of Paul Tol's "muted" (personal.sron.nl/~pault).
-_COLORS = (
+COLORS = (
     "#0072B2",
     "#E69F00",
     "#D55E00",
@@ -44,6 +44,7 @@ _COLORS = (
     "#AA4499",
     "#117733",
 )
+"""Colours of lines, in their order."""
 _MARKERS = "os^DvP<X>phd"
 _LABELS = {
     "optimal": "optimal (ours)",
@@ -121,8 +122,8 @@ def look_of(method: str) -> Look:
         place = mark = names.index(method)
     else:  # of a registered one by its name, wherever it is drawn
         place = crc32(method.encode())
-        mark = place // len(_COLORS)
-    return Look(label, _COLORS[place % len(_COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
+        mark = place // len(COLORS)
+    return Look(label, COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
 
 
 @contextmanager

@@ -82,7 +82,7 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
         )
 
     def complete(tree: dict[str, Any]) -> None:
-        _set_materials(tree, {node.name: node.material for node in nodes})
+        set_materials(tree, {node.name: node.material for node in nodes})
         _add_cameras(tree, cameras)
 
     data = _gltf.export_glb(scene, include_normals=False, tree_postprocessor=complete)
@@ -93,12 +93,13 @@ def _model_nodes(exported: AlignedObject, root: FloatArray, frame: Frame) -> lis
     placing = root @ exported.frame_from_model(frame).cam_from_model
     placing[:3] *= exported.metres
     return [
-        _Node(f"{exported.name}_{number}", _part_mesh(part), _part_material(part), placing)
+        _Node(f"{exported.name}_{number}", part_mesh(part), part_material(part), placing)
         for number, part in enumerate(parts_of(exported.require_mesh()))
     ]
 
 
-def _part_mesh(part: MeshPart) -> trimesh.Trimesh:
+def part_mesh(part: MeshPart) -> trimesh.Trimesh:
+    """The triangles of one material as trimesh writes them."""
     if part.uv is not None:
         return _textured(part.vertices, part.faces, part.uv, part.material.texture)
     colors = None
@@ -126,7 +127,8 @@ def _photo_node(name: str, plane: PhotoPlane, depth: float, pose: FloatArray) ->
     return _Node(name, mesh, material, pose)
 
 
-def _part_material(part: MeshPart) -> dict[str, Any]:
+def part_material(part: MeshPart) -> dict[str, Any]:
+    """The material of a part as glTF has it."""
     material: Material = part.material
     red, green, blue, alpha = material.color
     linear = srgb_to_linear(np.array([red, green, blue])).tolist()
@@ -160,7 +162,7 @@ def _camera(plane: PhotoPlane, depth: float) -> dict[str, Any]:
     }
 
 
-def _set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> None:
+def set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> None:
     """Replace trimesh's materials, which only bring the textures along."""
     brought = tree.get("materials", [])
     tree["materials"] = []

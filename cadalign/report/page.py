@@ -198,14 +198,21 @@ def _plots(runs: Sequence[Run]) -> list[Plot]:
 def method_dict(name: str) -> dict[str, Any]:
     """A method for the page."""
     look = look_of(name)
-    is_limit = name == LIMIT
+    if name != LIMIT:
+        return line_dict(name, look.label, look.color)
+    limit = line_dict(name, look.label, _INK)
+    return {**limit, "color_dark": _INK_ON_DARK, "dash": "dash", "is_limit": True}
+
+
+def line_dict(key: str, label: str, color: str) -> dict[str, Any]:
+    """What stands for a method on the page, drawn as solid lines of a colour (#rrggbb)."""
     return {
-        "key": name,
-        "label": look.label,
-        "color": _INK if is_limit else look.color,
-        "color_dark": _INK_ON_DARK if is_limit else _on_dark(look.color),
-        "dash": "dash" if is_limit else "solid",
-        "is_limit": is_limit,
+        "key": key,
+        "label": label,
+        "color": color,
+        "color_dark": _on_dark(color),
+        "dash": "solid",
+        "is_limit": False,
     }
 
 

@@ -47,6 +47,8 @@ class ImageKeypoints:
     """The file and the place in it, for messages."""
     track: str | None = field(default=None, kw_only=True)
     """Name or number of the object through the images of a video."""
+    camera: Camera | None = field(default=None, kw_only=True)
+    """The calibrated camera, where the file has it."""
     segmentation: Any = field(default=None, kw_only=True)
     """The object's mask as COCO writes it, unchecked; see
     `cadalign.datasets.detections.coco_masks.decode_segmentation`."""

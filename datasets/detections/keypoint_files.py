@@ -13,6 +13,7 @@ import numpy as np
 
 from cadalign.datasets.detections.coco import read_coco_keypoints
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.photos.kitti_keypoints import TRACKS, read_track_keypoints
 from cadalign.errors import DataError, InputError, brief, quote
 from cadalign.io.documents import Finite, Text, convert, in_file
 from cadalign.io.files import read_text
@@ -32,12 +33,13 @@ _COLUMNS: dict[str, Any] = {
 
 
 def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
-    """Read a file of keypoints: COCO's JSON and its relatives, or CSV.
+    """Read a file of keypoints: COCO's JSON and its relatives, CSV, or KITTI's tracks of cars.
 
     Parameters
     ----------
     path : str or path-like
-        A .csv or JSON file as described in docs/formats/detections.md.
+        A .csv or JSON file as described in docs/formats/detections.md, or a folder with
+        ``car_tracks.json``.
 
     Returns
     -------
@@ -50,6 +52,8 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
         If the file is missing, malformed or of no known kind; names file and field.
     """
     path = Path(path)
+    if path.name == TRACKS or (path / TRACKS).is_file():
+        return read_track_keypoints(path if path.name == TRACKS else path / TRACKS)
     return read_csv_keypoints(path) if path.suffix.lower() == ".csv" else read_coco_keypoints(path)
 
 
@@ -115,7 +119,7 @@ def _row(header: list[str], line: list[str], where: str) -> dict[str, Any] | Non
 def _value(name: str, cell: str) -> str | float:
     """A cell as a number in the columns that hold numbers, where it is a finite one."""
     try:
-        number = np.nan if name in ("image", "name") else float(cell)
+        number = np.nan if name in ("image", "name", "track") else float(cell)
     except ValueError:
         return cell
     return number if np.isfinite(number) else cell

@@ -16,6 +16,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, read_each
 from cadalign.datasets.photos.kitti_keypoints import (
     CARS,
+    SIZE,
     TRACKS,
     UP,
     KeypointFrame,
@@ -32,8 +33,6 @@ from cadalign.io.documents import in_file
 from cadalign.io.files import damaged, read_text
 from cadalign.io.images import photo_size
 
-SIZE = (1242, 375)
-"""The size of most of KITTI's photos, taken where the photo itself is not there [px]."""
 _OBJECT, _TRACKING = ("label_2", "image_2"), ("label_02", "image_02")
 _PLACES = (".", "training")
 # The numbers after an object's type: truncated, occluded, alpha, bbox 4, dimensions h w l,

@@ -52,6 +52,8 @@ from cadalign.shapes.model import ShapeModel
 
 CARS = "cars.json"
 TRACKS = "car_tracks.json"
+SIZE = (1242, 375)
+"""The size of most of KITTI's photos, taken where the photo itself is not there [px]."""
 HIDDEN = 0.1
 """Scores below this are those of keypoints that something hides."""
 UP = read_only(np.array(LEVEL_UP))
@@ -235,6 +237,40 @@ def list_tracks(path: Path) -> Iterator[KeypointFrame | DataError]:
         for row, frame in enumerate(track.frames):
             name = f"{track.sequence}/track {track.track}/{row}"
             yield KeypointFrame(name, path, f"{place}.frames[{row}]", frame, model, track)
+
+
+def read_track_keypoints(path: Path) -> list[ImageKeypoints]:
+    """Read the keypoints of ``car_tracks.json``, with camera, track and frame, as detectors' files.
+
+    The image of a frame is called ``<sequence>/<frame>.png``.
+
+    Raises
+    ------
+    DataError
+        If the file, or a frame in it, cannot be read.
+    """
+    found = []
+    for each in list_tracks(path):
+        if isinstance(each, DataError):
+            raise each
+        assert each.track is not None
+        assert each.model is not None
+        with in_file(path), within(each.place):
+            frame = convert(each.entry, _Frame)
+        keypoints = ImageKeypoints(
+            np.array(frame.uv, dtype=float).reshape(-1, 2),
+            scores=None if frame.score is None else np.array(frame.score),
+            names=tuple(each.model.names),
+            image=f"{each.track.sequence:04d}/{frame.frame:06d}.png",
+            size=SIZE,
+            source=f"{path}: {each.place}",
+            track=str(each.track.track),
+            camera=_camera(each.track.K, SIZE),
+        )
+        found.append(keypoints)
+    if not found:
+        raise DataError("there are no tracks", where=str(path))
+    return found
 
 
 def car_bounds(points: FloatArray) -> FloatArray:

@@ -124,6 +124,19 @@ def mesh_of(observation: Observation, result: Result) -> Mesh | None:
         mesh = load_mesh(observation.model)
         targets = result.points_3d[rows]
         return warp_mesh(mesh, np.array(list(sources.values())), targets, bounds=result.bounds)
+    return nearest_mesh(result)
+
+
+def nearest_mesh(result: Result) -> Mesh | None:
+    """The mesh of the training model nearest to a result of a learned shape, warped.
+
+    In the model's frame, before the stretch. None where no mesh is known; one that cannot be read
+    is warned of (logger "cadalign").
+    """
+    from cadalign.shapes.model import ShapeModel  # takes time to import
+
+    if not isinstance(result.model, ShapeModel):
+        return None
     training = result.model.training
     if training is None or not len(training) or result.nearest.mesh_path is None:
         return None

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import trimesh
 from support.refusals import refusal_line
 
 from cadalign import ShapeModel
 from cadalign.cli import main
 from cadalign.evaluation.simulation.tracks import TRACK_CAMERA, SimulatedTrack, simulate_track
+from cadalign.io.images import write_image
+from cadalign.io.video import Video
+from cadalign.render.drawing.movie import write_movie
 
 pytestmark = pytest.mark.slow
 
@@ -78,6 +83,69 @@ def test_every_track_gets_its_trajectory_and_rows(
         matrices = np.loadtxt(tmp_path / "out" / f"{name}.txt").reshape(-1, 3, 4)
         np.testing.assert_allclose(matrices[:, :, 3], lines[:, 1:4], atol=1e-8)
         assert len(matrices) == FRAMES
+
+
+def test_the_page_and_the_animation_hold_every_track(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path
+) -> None:
+    assert main(command(video[0], "--out", str(tmp_path))) == 0
+    page = (tmp_path / "index.html").read_text()
+    (text,) = re.findall(r'id="payload">(.*?)</script>', page)
+    payload = json.loads(text)
+    assert [row["method"] for row in payload["headline"]["rows"]] == ["3", "7"]
+    plots = {plot["id"]: plot for plot in payload["plots"]}
+    assert {"place_ahead", "turn_y", "speed", "turning", "residual"} <= set(plots)
+    lines = np.loadtxt(tmp_path / "7.tum")
+    (ahead,) = (t for t in plots["place_ahead"]["traces"] if t["method"] == "7")
+    np.testing.assert_allclose(ahead["y"], lines[:, 3], rtol=1e-5)
+    assert (np.array(ahead["low"]) < ahead["y"]).all()
+    assert (np.array(ahead["high"]) > ahead["y"]).all()
+    residuals = next(t for t in plots["residual"]["traces"] if t["method"] == "7")
+    assert residuals["y"][9] is None  # nothing was detected
+    assert min(plots["speed"]["traces"][0]["low"]) >= 0
+    scene = trimesh.load(tmp_path / "tracks.glb")
+    assert isinstance(scene, trimesh.Scene)
+    assert len(scene.geometry) == 2
+
+
+def is_red(picture: np.ndarray) -> np.ndarray:
+    """Pixels (h, w) of the predicted box."""
+    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+    return np.asarray((red > green + 60) & (red > blue + 60))
+
+
+def test_the_video_shows_the_objects_where_they_are(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path
+) -> None:
+    folder, objects = video
+    size = (TRACK_CAMERA.height, TRACK_CAMERA.width, 3)
+    pictures = [np.full(size, 120, dtype=np.uint8) for _ in range(FRAMES + 2)]
+    write_movie(tmp_path / "clip.mp4", pictures, fps=30)
+    given = ["--video", str(tmp_path / "clip.mp4"), "--first-frame", "-1"]
+    assert main(command(folder, "--out", str(tmp_path), *given)) == 0
+    overlay = Video.open(tmp_path / "overlay.mp4")
+    drawn = [is_red(picture) for _, picture in overlay.pictures()]
+    assert (len(drawn), overlay.rate) == (FRAMES + 2, 30.0)
+    assert not drawn[0].any()
+    assert not drawn[-1].any()
+    for k, red in enumerate(drawn[1:-1]):
+        corners = []
+        for each in objects:
+            low, high = each.points_3d.min(axis=0), each.points_3d.max(axis=0)
+            corners.append(each.poses[k].apply([(low + high) / 2]))
+        rows, columns = np.nonzero(red)
+        for u, v in TRACK_CAMERA.project(np.concatenate(corners)):
+            assert columns.min() < u < columns.max()
+            assert rows.min() < v < rows.max()
+
+
+def test_a_video_of_another_size_is_refused(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "pictures").mkdir()
+    write_image(tmp_path / "pictures" / "0.png", np.zeros((48, 64, 3), dtype=np.uint8))
+    line = refusal_line(capsys, *command(video[0], "--video", str(tmp_path / "pictures")))
+    assert "its pictures are 64 x 48 px, those of the camera 640 x 480" in line
 
 
 def test_csv_with_tracks_is_read(video: tuple[Path, list[SimulatedTrack]], tmp_path: Path) -> None:

@@ -305,6 +305,16 @@ def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
     assert [(found.image, len(found)) for found in objects] == [("a.jpg", 2), ("b.jpg", 1)]
 
 
+def test_csv_of_several_tracks_gives_an_object_each(tmp_path: Path) -> None:
+    text = "image,track,name,u,v\na.jpg,1,nose,1,2\na.jpg,2,nose,3,4\nb.jpg,1,nose,5,6\n"
+    objects = read(tmp_path, text, "keypoints.csv")
+    assert [(found.image, found.track) for found in objects] == [
+        ("a.jpg", "1"),
+        ("a.jpg", "2"),
+        ("b.jpg", "1"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

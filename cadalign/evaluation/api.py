@@ -36,10 +36,10 @@ def evaluate(
     ----------
     root : str or path-like, optional
         The dataset, for experiments that have one: a folder in KeypointNet's layout
-        (``keypointnet``, ``retrieval``, ``unseen``, ``evidence``), a data set of photos
+        (``keypointnet``, ``retrieval``, ``unseen``, ``evidence``, ``tracks``), a data set of photos
         (``photos``), or a COLMAP, Bundler or blind-PnP model (``correspondences``).
     experiment : {"keypointnet", "correspondences", "retrieval", "unseen", "evidence", "photos",
-        "simulate", "demo"}
+        "tracks", "simulate", "demo"}
         Or one that was registered; see `cadalign.evaluation.registry`.
     workers : int, optional
         Processes; -1 for one for each core (the default; for running times it is 1), 0 for none.

@@ -33,6 +33,7 @@ _MODULES = (
     "evidence",
     "photos",
     "estimates",
+    "tracks",
 )
 _REGISTERED: dict[str, Spec] = {}
 

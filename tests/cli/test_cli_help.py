@@ -17,7 +17,7 @@ PATHS = (
     "track",
     *("library build", "library show", "shape learn", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate evidence", "evaluate photos"),
-    *("evaluate correspondences", "evaluate retrieval", "evaluate show"),
+    *("evaluate tracks", "evaluate correspondences", "evaluate retrieval", "evaluate show"),
     *("simulate noise", "simulate points", "simulate outliers", "simulate runtime"),
 )
 

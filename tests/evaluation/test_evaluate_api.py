@@ -24,7 +24,7 @@ def evaluate(*arguments: Any, **options: Any) -> Any:
 
 def test_every_experiment_has_a_specification_with_its_name() -> None:
     names = [options.experiment for options in known_options()]
-    assert names[:9] == [  # those of other tests follow
+    assert names[:10] == [  # those of other tests follow
         "keypointnet",
         "demo",
         "simulate",
@@ -34,6 +34,7 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
         "evidence",
         "photos",
         "estimates",
+        "tracks",
     ]
     for options in known_options():
         spec = spec_named(options.experiment)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from cadalign.evaluation.metrics.trajectories import (
     relative_pose_error,
     rotation_jitter_deg,
 )
+from cadalign.export.trajectories import write_tum
 
 ORIGIN = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
 
@@ -66,3 +69,38 @@ def test_other_frames_than_true_ones_are_refused() -> None:
         absolute_pose_error(est=poses[:3], gt=poses)
     with pytest.raises(InputError, match="est: 4 poses, but 6 are needed"):
         relative_pose_error(est=poses, gt=poses, step=5)
+
+
+@pytest.mark.slow
+def test_pose_errors_are_those_of_evo_on_the_same_files(tmp_path: Path) -> None:
+    """TUM files of a trajectory and its truth, frames matched by their times."""
+    reason = "evo, the reference implementation of trajectory errors, is not installed"
+    evo = pytest.importorskip("evo.core.metrics", reason=reason)
+    from evo.core import sync
+    from evo.core.units import Unit
+    from evo.tools import file_interface
+
+    rng = np.random.default_rng(4)
+    times = np.arange(60) / 30.0
+    gt = screw(np.array([0.05, -0.02, 0.05, 0.1, 0.0, 0.03]), frames=len(times))
+    est = np.array([moved_by(pose, 0.05 * rng.normal(size=6)) for pose in gt])
+    for name, poses in (("est", est), ("gt", gt)):
+        write_tum(tmp_path / f"{name}.tum", times, poses)
+    read = [file_interface.read_tum_trajectory_file(tmp_path / f"{n}.tum") for n in ("gt", "est")]
+    pair = sync.associate_trajectories(*read)
+    parts = (evo.PoseRelation.rotation_angle_deg, evo.PoseRelation.translation_part)
+
+    def rms(metric: object) -> float:
+        metric.process_data(pair)  # type: ignore[attr-defined]
+        return float(metric.get_statistic(evo.StatisticsType.rmse))  # type: ignore[attr-defined]
+
+    absolute = absolute_pose_error(est=est, gt=gt)
+    assert [rms(evo.APE(part)) for part in parts] == pytest.approx(
+        [absolute.rotation_deg, absolute.translation], rel=1e-6
+    )
+    for step in (1, 10):
+        relative = relative_pose_error(est=est, gt=gt, step=step)
+        found = [
+            rms(evo.RPE(part, delta=step, delta_unit=Unit.frames, all_pairs=True)) for part in parts
+        ]
+        assert found == pytest.approx([relative.rotation_deg, relative.translation], rel=1e-6)

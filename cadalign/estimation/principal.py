@@ -146,7 +146,8 @@ def _with_principal_point(
             slopes = np.stack(moved, axis=-1) / difference
             added = slopes @ covariance @ slopes.swapaxes(1, 2)
             stated = replace(stated, points_cam_covariance=stated.points_cam_covariance + added)
-        views.append(replace(view, statistics=stated))
+        basis = stated.basis and replace(stated.basis, principal_sigma=options.principal_sigma)
+        views.append(replace(view, statistics=replace(stated, basis=basis)))
     x, y = np.sqrt(covariance.diagonal()).tolist()
     return replace(
         result,

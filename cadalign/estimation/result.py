@@ -64,18 +64,20 @@ class Result(ResultData):
 
         return contributions_of(self.statistics.basis)
 
-    def sensitivity(self, *, exact: bool = True) -> Sensitivity:
+    def sensitivity(self, *, view: int = 0, exact: bool = True) -> Sensitivity:
         """Derivatives of pose, stretch, shape and focal length by the data, at the optimum.
 
         By every keypoint, its standard deviation and the model's points, by the implicit function
-        theorem; what the noise level was estimated to be is held. Of the keypoints of one view, of
-        an exact or stretched model or of a learned shape.
+        theorem. Held are the estimated noise level, and the points of the model that a mask, photo
+        or depth image was matched with.
 
         Parameters
         ----------
+        view : int
+            Number of the view whose pose is derived, by the keypoints of all views.
         exact : bool
             Take the Hessian of the cost. Otherwise its Gauss-Newton matrix, which leaves out what
-            vanishes with the residuals; a learned shape has none.
+            vanishes with the residuals: of keypoints of one view of an exact model only.
 
         Returns
         -------
@@ -86,7 +88,9 @@ class Result(ResultData):
         Raises
         ------
         InputError
-            If the result was read from a file, or rests on other evidence.
+            If the result was read from a file, has a motion, or minimises no cost.
+        DegenerateError
+            If the evidence beside keypoints of one view leaves unknowns undetermined.
 
         Examples
         --------
@@ -99,9 +103,9 @@ class Result(ResultData):
         >>> result.sensitivity().strongest
         0
         """
-        from cadalign.estimation.uncertainty.sensitivity import sensitivity_of  # rarely asked
+        from cadalign.estimation.uncertainty.joint_sensitivity import sensitivity_of  # rarely asked
 
-        return sensitivity_of(self, exact=exact)
+        return sensitivity_of(self, exact=exact, view=view)
 
     def __str__(self) -> str:
         return _text_of(self)

@@ -65,14 +65,27 @@ def without_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
 
     These are rotations about the symmetry's axes through its center.
     """
-    arm = best.alignment.linear @ best.center
-    left = np.eye(len(covariance))
+    left = _free_turns_removed(len(covariance), best)
+    return np.asarray(left @ covariance @ left.T)
+
+
+def _free_turns_removed(size: int, best: Equal) -> FloatArray:
+    """Projection (size, size) of steps of the unknowns that takes free turns off."""
+    arm, left = best.alignment.linear @ best.center, np.eye(size)
     for axis in best.free:
         direction = best.alignment.rotation @ axis
-        turn, share = np.zeros(len(covariance)), np.zeros(len(covariance))
+        turn, share = np.zeros(size), np.zeros(size)
         turn[:3], turn[3:6], share[:3] = direction, -np.cross(direction, arm), direction
-        left = (np.eye(len(covariance)) - np.outer(turn, share)) @ left
-    return np.asarray(left @ covariance @ left.T)
+        left = (np.eye(size) - np.outer(turn, share)) @ left
+    return left
+
+
+def equal_slopes(
+    given: Alignment, symmetry: Symmetry, *, held: tuple[bool, bool, bool]
+) -> FloatArray:
+    """Derivatives (9, 9) of an alignment's canonical form by itself, without free turns."""
+    best = group_of(symmetry).canonical(given, held=held)
+    return np.asarray(_free_turns_removed(9, best) @ step_to(best, given))
 
 
 def is_same(

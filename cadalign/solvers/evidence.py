@@ -131,6 +131,14 @@ def loss_and_root(loss: int, scale: float, square: float) -> tuple[float, float]
     return scale * scale * np.log1p(ratio), np.sqrt(1.0 / (1.0 + ratio))
 
 
+@inlined
+def fall_of_weight(loss: int, scale: float, root: float, square: float) -> float:
+    """Derivative of the logarithm of the weight's root, over r' dr, of weighted residuals r."""
+    if loss == LINEAR or root == 1.0:
+        return 0.0
+    return -0.5 / square if loss == HUBER else -1.0 / (scale * scale)
+
+
 @fast_sums
 def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray) -> None:
     """Add the rows' inner products to the upper triangle of J' W J and to J' W r."""

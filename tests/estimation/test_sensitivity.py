@@ -9,9 +9,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.problems import LENS, fit_problem, problem_of
 
-from cadalign import Camera, RansacOptions, Result, ShapeModel, View, align, fit
+from cadalign import (
+    Alignment,
+    Camera,
+    FocalPrior,
+    Mesh,
+    Model,
+    RansacOptions,
+    Result,
+    ShapeModel,
+    View,
+    align,
+    fit,
+)
 from cadalign.errors import CadalignError, InputError
 from cadalign.evaluation.simulation.problems import Problem
+from cadalign.render import Scene, cast_geometry
 from cadalign.shapes.examples import Example
 
 pytestmark = pytest.mark.slow
@@ -122,6 +135,11 @@ def test_a_lens_is_honoured() -> None:
     assert np.nanmedian(errors) < 1e-3  # the lens's second derivatives are left out
 
 
+PIN = Camera(640, 480, 900, 900, 319.5, 239.5)
+FISHEYE = Camera(640, 480, 300, 300, 319.5, 239.5, (0.02, -0.01, 0.0, 0.0), lens="fisheye")
+N = 9
+
+
 def learned(n: int) -> tuple[ShapeModel, np.ndarray]:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (n, 3))
@@ -132,55 +150,118 @@ def learned(n: int) -> tuple[ShapeModel, np.ndarray]:
     return ShapeModel.learn(examples), points
 
 
-@pytest.mark.parametrize("loss", ["linear", "cauchy"])
-def test_derivatives_of_a_learned_shape(loss: str) -> None:
-    n, camera = 9, Camera(640, 480, 900, 900, 319.5, 239.5)
-    model, points = learned(n)
+def aligned(model: Any, camera: Camera, **options: Any) -> Any:
+    """An estimate of views' pixels and standard deviations."""
+
+    def estimate(pixels: list[np.ndarray], sigmas: list[np.ndarray]) -> Result:
+        pairs = zip(pixels, sigmas, strict=True)
+        return align(model, [View(camera, seen, sigma=each) for seen, each in pairs], **options)
+
+    return estimate
+
+
+def seen_by(camera: Camera, count: int, seed: int) -> list[np.ndarray]:
+    """Keypoints of one object in views from all around, with half a pixel of noise."""
+    rng = np.random.default_rng(seed)
+    _, points = learned(N)
+    own = points * rng.uniform(0.8, 1.25, 3) + rng.normal(0, 0.02, points.shape)
+    place = [1.5, 0.3, 1.0] if camera.is_wide else [0.1, 0.1, 3.0]
+    views = []
+    for turn in Rotation.random(count, random_state=seed).as_matrix():
+        pixels = camera.project(own @ turn.T + place)
+        views.append(pixels + rng.normal(0, 0.5, pixels.shape))
+    return views
+
+
+def differences_of(
+    estimate: Any, pixels: list[np.ndarray], view: int, step: float, rng: np.random.Generator
+) -> list[float]:
+    """Relative errors of derivatives along random directions of pixels and log sigmas."""
+    sigmas = [np.ones(len(each)) for each in pixels]
+    base = estimate(pixels, sigmas)
+    hardly_settles = base.stats.iterations > 100  # on a ridge, which differences stray along
+    if base.alternatives or base.std.rotation_deg > 5 or hardly_settles:
+        return []
+    found = base.sensitivity(view=view)
+    size = len(found.by_log_sigma)
+
+    def state(pixels: list[np.ndarray], sigmas: list[np.ndarray]) -> np.ndarray:
+        result = estimate(pixels, sigmas)
+        turn = result.poses[view].rotation @ base.poses[view].rotation.T
+        lengths = result.alignment.scale
+        if isinstance(result.model, ShapeModel):
+            lengths = result.bounds[1] - result.bounds[0]
+        own = Rotation.from_matrix(turn).as_rotvec(), result.poses[view].translation
+        whole = np.concatenate([*own, np.log(lengths), [np.log(result.cameras[view].fx)]])[:size]
+        has_shape = found.points_by_points_2d is not None
+        return np.concatenate([whole, result.points_3d.ravel()]) if has_shape else whole
+
+    def along(by_data: np.ndarray, of_points: np.ndarray | None, step: np.ndarray) -> np.ndarray:
+        parts = [by_data] if of_points is None else [by_data, of_points]
+        return np.concatenate([each.reshape(-1, step.size) @ step.ravel() for each in parts])
+
+    towards = [rng.standard_normal(each.shape) for each in pixels]
+    logs = [rng.standard_normal(len(each)) for each in pixels]
+    by_pixels = along(found.by_points_2d, found.points_by_points_2d, np.concatenate(towards))
+    by_logs = along(found.by_log_sigma, found.points_by_log_sigma, np.concatenate(logs))
+    return [
+        relative_error(
+            by_pixels,
+            difference(
+                lambda h: state([p + h * d for p, d in zip(pixels, towards, strict=True)], sigmas),
+                step,
+            ),
+        ),
+        relative_error(
+            by_logs,
+            difference(
+                lambda h: state(
+                    pixels, [s * np.exp(h * d) for s, d in zip(sigmas, logs, strict=True)]
+                ),
+                step,
+            ),
+        ),
+    ]
+
+
+SHAPE, MEAN = learned(N)
+EXACT, SIMILAR = Model(points_3d=MEAN), Model(points_3d=MEAN, shape_sigma=0.03)
+
+
+@pytest.mark.parametrize(
+    ("model", "camera", "views", "options"),
+    [
+        (SHAPE, PIN, 1, {}),
+        (SHAPE, PIN, 1, {"loss": "cauchy"}),
+        (SHAPE, PIN, 1, {"focal": "estimate", "focal_prior": FocalPrior(900, 0.2)}),
+        (SHAPE, PIN, 3, {}),
+        (SHAPE, PIN, 3, {"loss": "cauchy"}),
+        (SIMILAR, PIN, 1, {}),
+        (SIMILAR, LENS, 2, {"focal": "estimate", "loss": "huber"}),
+        (SIMILAR, FISHEYE, 2, {}),
+        (EXACT, PIN, 3, {}),
+        (EXACT, FISHEYE, 1, {}),
+        (EXACT, FISHEYE, 2, {}),
+        (EXACT, PIN, 1, {"principal_sigma": 20.0}),
+        (SHAPE, PIN, 2, {"principal_sigma": 20.0}),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Model | ShapeModel) else None,
+)
+def test_derivatives_of_every_estimate(
+    model: Any, camera: Camera, views: int, options: dict[str, Any]
+) -> None:
     rng, errors = np.random.default_rng(1), []
-    for seed in range(35):
-        turn = Rotation.random(random_state=seed).as_matrix()
-        own = points * rng.uniform(0.8, 1.25, 3) + rng.normal(0, 0.02, (n, 3))
-        seen = camera.project(own @ turn.T + [0.1, 0.1, 3]) + rng.normal(0, 1, (n, 2))
-
-        def state(pixels: np.ndarray, sigma: Any) -> tuple[Result, np.ndarray]:
-            found = align(model, View(camera, pixels, sigma=sigma), loss=loss)
-            return found, found.points_3d.ravel()
-
-        base, _ = state(seen, np.ones(n))
-        if base.alternatives or base.std.rotation_deg > 5:
-            continue
-        found = base.sensitivity()
-        pixels, logs = rng.standard_normal((n, 2)), rng.standard_normal(n)
-
-        def estimate(pixels: np.ndarray, sigma: np.ndarray, base: Result = base) -> np.ndarray:
-            result, shape = state(pixels, sigma)
-            return np.concatenate([unknowns(result, base)[:9], shape])
-
-        by_pixels = np.concatenate(
-            [
-                found.by_points_2d.reshape(9, -1) @ pixels.ravel(),
-                found.points_by_points_2d.reshape(3 * n, -1) @ pixels.ravel(),
-            ]
-        )
-        by_logs = np.concatenate(
-            [found.by_log_sigma @ logs, (found.points_by_log_sigma @ logs).ravel()]
-        )
-        errors.append(
-            [
-                relative_error(
-                    by_pixels,
-                    difference(lambda h: estimate(seen + h * pixels, np.ones(n)), 0.01),  # noqa: B023
-                ),
-                relative_error(
-                    by_logs,
-                    difference(lambda h: estimate(seen, np.exp(h * logs)), 0.01),  # noqa: B023
-                ),
-            ]
-        )
-    assert len(errors) >= 20
-    assert np.isfinite(errors).mean() > 0.9
-    assert np.nanmedian(errors) < 1e-4
-    assert np.nanmax(errors) < 1e-2
+    settles = "principal_sigma" in options  # it does to a thousandth of a standard deviation
+    for seed in range(4 if views > 1 else 8):
+        pixels = seen_by(camera, views, seed)
+        if camera.is_wide or all(camera.contains(each).all() for each in pixels):
+            step, view = 0.1 if settles else 0.02, seed % views
+            errors += [differences_of(aligned(model, camera, **options), pixels, view, step, rng)]
+    errors = [each for each in errors if each]
+    assert len(errors) >= 2
+    assert np.isfinite(errors).mean() > (0.5 if settles else 0.8)
+    assert np.nanmedian(errors) < (3e-3 if settles else 1e-4)
+    assert np.nanmax(errors) < (0.03 if settles else 1e-2)
 
 
 def test_the_mean_of_a_learned_shape_moves_the_estimate_as_its_points_do() -> None:
@@ -223,12 +304,71 @@ def test_a_pixel_of_noise_makes_the_covariance_to_first_order() -> None:
     )
 
 
-def test_what_has_no_evidence_is_refused() -> None:
-    result = Result.from_dict(fit_problem(problem_of(2)).to_dict())
-    with pytest.raises(InputError) as refused:
-        result.sensitivity()
-    assert str(refused.value) == (
-        "sensitivity: only keypoints of one view, of an exact, stretched or learned model, aligned "
-        "by maximum likelihood without a wide lens or unknown principal point, have a sensitivity; "
-        "align these alone, in this program: files do not hold the evidence"
+def test_the_model_s_points_move_estimates_of_several_views() -> None:
+    pixels, step = seen_by(PIN, 2, 3), np.random.default_rng(0).standard_normal((N, 3))
+
+    def state(h: float) -> np.ndarray:
+        moved = Model(points_3d=MEAN + h * step, shape_sigma=0.03)
+        result = aligned(moved, PIN)(pixels, [np.ones(N)] * 2)
+        return np.append(unknowns(result, base)[:6], np.log(result.alignment.scale))
+
+    base = aligned(SIMILAR, PIN)(pixels, [np.ones(N)] * 2)
+    found = base.sensitivity()
+    assert found.views.tolist() == [0] * N + [1] * N
+    np.testing.assert_array_equal(found.by_points_3d[:, :N], found.by_points_3d[:, N:])
+    moved = found.by_points_3d[:, :N].reshape(9, -1) @ step.ravel()
+    assert relative_error(moved, difference(state, 1e-5)) < 1e-4
+    assert str(found).splitlines()[1].startswith("  views[")
+
+
+def test_a_mask_leaves_keypoints_little_influence() -> None:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))])
+    model = Model(points_3d=corners, mesh=Mesh(corners, faces))
+    turn = Rotation.from_euler("xyz", [0.4, 0.5, 0.1]).as_matrix()
+    truth = Alignment(turn, [0.1, 0.0, 4.0], [1.0, 1.2, 0.9])
+    mask = cast_geometry(Scene(model.mesh), PIN, truth).mask
+    pixels = PIN.project(truth.apply(corners)) + np.random.default_rng(0).normal(0, 1, (8, 2))
+    alone = align(model, View(PIN, pixels)).sensitivity()
+    found = align(model, View(PIN, pixels, mask=mask)).sensitivity()
+    assert (found.rotation_deg < 0.5 * alone.rotation_deg).all()
+    moves = found.by_points_2d.reshape(9, -1)  # what keypoints tell is a part of all
+    assert (np.diag(moves @ moves.T) <= 1.05 * np.diag(found.covariance)).all()
+
+
+def test_a_fit_from_a_file_has_its_sensitivity() -> None:
+    result = fit_problem(problem_of(2))
+    read = Result.from_dict(result.to_dict())
+    np.testing.assert_allclose(
+        read.sensitivity().by_points_2d, result.sensitivity().by_points_2d, rtol=1e-4, atol=1e-9
     )
+
+
+def test_what_has_no_evidence_is_refused() -> None:
+    result = aligned(SIMILAR, PIN)(seen_by(PIN, 1, 0), [np.ones(N)])
+    linear = fit(MEAN, seen_by(PIN, 1, 0)[0], PIN, method="aepnp")
+    refusals = [
+        (
+            lambda: Result.from_dict(result.to_dict()).sensitivity(),
+            "sensitivity: the result holds no evidence: it was read from a file; align again",
+        ),
+        (
+            lambda: linear.sensitivity(),
+            "sensitivity: the method aepnp minimises no cost, and has no derivatives; fit with "
+            'method="optimal"',
+        ),
+        (
+            lambda: result.sensitivity(exact=False),
+            "exact: only keypoints of one view of an exact model have a Gauss-Newton sensitivity; "
+            "leave it at True",
+        ),
+        (
+            lambda: result.sensitivity(view=1),
+            "view: 1 is none of the result's 1 views; give 0 to 0",
+        ),
+    ]
+    for call, message in refusals:
+        with pytest.raises(InputError) as refused:
+            call()
+        assert str(refused.value) == message

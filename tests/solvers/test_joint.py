@@ -177,13 +177,14 @@ def test_the_gradient_is_that_of_the_cost(
     poses=st.sampled_from([(0, 0), (0, 1)]),
     focals=st.sampled_from([0, 1]),
     spread=st.sampled_from([0.0, 0.05]),
+    loss=st.sampled_from([LINEAR, HUBER, CAUCHY]),
 )
 def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
-    seed: int, poses: tuple[int, int], focals: int, spread: float
+    seed: int, poses: tuple[int, int], focals: int, spread: float, loss: int
 ) -> None:
     spread *= poses == (0, 0)  # displacements of several poses are modes
     evidence = with_sightings_alone(
-        evidence_of(seed, spread=spread, poses=poses, loss=LINEAR, focals=focals)
+        evidence_of(seed, spread=spread, poses=poses, loss=loss, focals=focals)
     )
     state = state_of(seed, max(poses) + 1, focals)
     state.displacements[:] *= spread > 0

@@ -317,7 +317,8 @@ class Basis:
 
     ``numbers`` are those of its views among all that were given; None where all are used.
     ``turn`` (3, 3) leads from the first view's frame to that of the result, where it is another.
-    ``photos`` numbers the views whose contour is that of a photo.
+    ``photos`` numbers the views whose contour is that of a photo. ``principal_sigma`` [px] is the
+    prior's standard deviation where the principal point was estimated, too.
     """
 
     evidence: Evidence
@@ -325,6 +326,7 @@ class Basis:
     numbers: tuple[int, ...] | None = None
     turn: FloatArray | None = None
     photos: frozenset[int] = frozenset()
+    principal_sigma: float | None = None
 
 
 AnyBasis = Basis | SingleBasis

@@ -25,7 +25,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
 from cadalign.solvers.joint.arrow import Arrow, empty_arrow
-from cadalign.solvers.joint.evidence import Evidence, State, count_poses, unstretched
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, count_poses, unstretched
 from cadalign.solvers.joint.rows import count_equations, exp_of, first_scale, stretched_point
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
 from cadalign.solvers.projection import turn, turn_back
@@ -84,7 +84,7 @@ def joint_room(evidence: Evidence) -> JointEquations:
         first,
         columns,
         np.zeros((6 + border + 4, counts.max())),
-        np.zeros((6, counts.sum())),
+        np.zeros((8, counts.sum())),
         np.zeros((7 + border, 7 + border)),
         np.zeros(1),
         np.zeros((points, 3)),
@@ -211,7 +211,7 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
     by_model, response = np.empty((3, total)), np.empty((modes, total))
     _write_rows(evidence, state, equations, left, by_model, response)
     solve_factor_rows(factor, response)
-    _add_slopes(evidence, state, equations, left, by_model, response)
+    _add_slopes(evidence, state, equations, left, by_model, response, np.empty((3, 4)))
     return volume
 
 
@@ -270,6 +270,7 @@ def _add_slopes(
     left: FloatArray,
     by_model: FloatArray,
     response: FloatArray,
+    moved: FloatArray,
 ) -> None:
     """Add half the derivatives, from the coefficients' ``response`` (K, N) to each equation."""
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
@@ -284,36 +285,35 @@ def _add_slopes(
         p = rig.pose[v]
         motion, group = state.poses[p], evidence.focals.group[v]
         turned = turn(motion, stretched_point(shape, state, scale, i))
-        square = shape.spread[i] ** 2
-        for _ in range(count_equations(sightings, n)):
-            row = by_model[0, column], by_model[1, column], by_model[2, column]
-            moved = square * row[0], square * row[1], square * row[2]
-            for k in range(shape.modes.shape[0]):
-                share, mode = response[k, column], shape.modes[k, i]
-                moved = (
-                    moved[0] + share * mode[0],
-                    moved[1] + share * mode[1],
-                    moved[2] + share * mode[2],
-                )
-            moved = dot(left[i, 0], moved), dot(left[i, 1], moved), dot(left[i, 2], moved)
-            along = dot(row, moved)
+        count = count_equations(sightings, n)
+        _write_responses(shape, i, left[i], by_model, response, column, count, moved)
+        of_depth = count - int(sightings.depths[n, 1] > 0.0)
+        in_image = 0.0
+        for q in range(of_depth):
+            in_image += moved[q, 3]
+        for q in range(count):
             a = seen[0, column], seen[1, column], seen[2, column]
             d = seen[3, column], seen[4, column], seen[5, column]
-            y = turn(motion, (scale[0] * moved[0], scale[1] * moved[1], scale[2] * moved[2]))
-            farther = dot(d, y)
+            back, along = (moved[q, 0], moved[q, 1], moved[q, 2]), moved[q, 3]
+            y = turn(motion, (scale[0] * back[0], scale[1] * back[1], scale[2] * back[2]))
+            # A weight of a loss falls where the residual grows.
+            fall = (in_image if q < of_depth else along) * seen[6, column]
+            shared = fall - dot(d, y)
             h = (
-                -(along * d[0] + farther * a[0]),
-                -(along * d[1] + farther * a[1]),
-                -(along * d[2] + farther * a[2]),
+                shared * a[0] - along * d[0],
+                shared * a[1] - along * d[1],
+                shared * a[2] - along * d[2],
             )
             by_turn, by_row, by_point = cross(turned, h), cross(y, a), turn_back(motion, h)
             for c in range(3):
                 gradient[6 * p + c] += by_turn[c] + by_row[c]
                 gradient[6 * p + 3 + c] += h[c]
-                gradient[first + c] += row[c] * moved[c]
+                gradient[first + c] += by_model[c, column] * back[c]
                 slopes[i, c] += scale[c] * by_point[c]
-            if group >= 0 and (d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0):
-                gradient[start + group] += along
+            if group >= 0:
+                gradient[start + group] += fall * seen[7, column]
+                if d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0:
+                    gradient[start + group] += along
             column += 1
     for i in range(slopes.shape[0]):
         for c in range(3):
@@ -321,3 +321,27 @@ def _add_slopes(
                 gradient[first + c] += slopes[i, c] * unstretched(shape, state, i, c)
                 for k in range(shape.modes.shape[0]):
                     gradient[first + 3 + k] += slopes[i, c] * shape.modes[k, i, c]
+
+
+@borrowing
+def _write_responses(
+    shape: Shape,
+    i: int,
+    left: FloatArray,
+    by_model: FloatArray,
+    response: FloatArray,
+    first: int,
+    count: int,
+    moved: FloatArray,
+) -> None:
+    """Write the responses (q, 4) of point i to its equations, and last what they are along them."""
+    square = shape.spread[i] ** 2
+    for q in range(count):
+        column = first + q
+        row = by_model[0, column], by_model[1, column], by_model[2, column]
+        back = square * row[0], square * row[1], square * row[2]
+        for k in range(shape.modes.shape[0]):
+            share, mode = response[k, column], shape.modes[k, i]
+            back = back[0] + share * mode[0], back[1] + share * mode[1], back[2] + share * mode[2]
+        back = dot(left[0], back), dot(left[1], back), dot(left[2], back)
+        moved[q, 0], moved[q, 1], moved[q, 2], moved[q, 3] = *back, dot(row, back)

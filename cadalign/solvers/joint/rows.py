@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, inlined, kernel
-from cadalign.solvers.evidence import beyond, loss_and_root
+from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root
 from cadalign.solvers.joint.arrow import Arrow, add_row
 from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State, unstretched
 from cadalign.solvers.linalg import Triple
@@ -53,9 +53,10 @@ def write_rows(
 
     The ``chosen`` sightings are of one pose. Rows of ``rows`` (6 + b + 4, C) are the unknowns of
     that pose and of the border, the residual, and the displacement of the point; columns are those
-    of `count_equations`, sighting after sighting. ``seen`` (6, N) receives, from column
+    of `count_equations`, sighting after sighting. ``seen`` (8, N) receives, from column
     ``first_seen`` on, the vector by which the residual changes with the point in the rig's frame,
-    and the camera's z there over the depth (none for equations in depth).
+    the camera's z there over the depth (none for equations in depth), the residual times
+    `fall_of_weight`, and the derivative by the log focal length.
     """
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
     rows[:] = 0.0
@@ -91,6 +92,9 @@ def write_rows(
         counts = True, c > 0.0, weight > 0.0
         slopes = by_u, by_w, (0.0, 0.0, depth_root * weight)
         residuals = root * ru, root * rw, depth_root * rz
+        fall = fall_of_weight(loss, loss_scale, root, root * root * (ru * ru + rw * rw))
+        depth_fall = fall_of_weight(loss, loss_scale, depth_root, depth_root**2 * rz * rz)
+        falls = fall, fall, depth_fall
         by_focal = root * (a * by_log_u + b * by_log_w), root * c * by_log_w, 0.0
         for q in range(3):
             if not counts[q]:
@@ -100,6 +104,8 @@ def write_rows(
             write_motion(turned, by_rig, rows, column)
             if group >= 0:
                 rows[6 + group, column] = by_focal[q]
+            seen[6, first_seen + column] = falls[q] * residuals[q]
+            seen[7, first_seen + column] = by_focal[q] if group >= 0 else 0.0
             for k in range(3):
                 rows[first + k, column] = by_model[k] * point[k] * evidence.scales.free[k]
                 rows[last + 1 + k, column] = by_model[k] * scale[k]

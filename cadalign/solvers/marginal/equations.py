@@ -30,9 +30,10 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.compile import borrowing, fast_sums, inlined, kernel
 from cadalign.solvers.alignment import Equations, room_for, solve_damped
-from cadalign.solvers.constants import HUBER, LINEAR, POSE_SIZE
+from cadalign.solvers.constants import POSE_SIZE
 from cadalign.solvers.evidence import (
     KeypointEvidence,
+    fall_of_weight,
     keypoint_cost,
     loss_and_root,
     score_of_distance,
@@ -215,7 +216,7 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
         own = root * root * (ru * ru + rv * rv)
         square += own
         points[i, 0] = place[2]
-        fall = _fall_of_weight(seen.loss, seen.loss_scale, root, own)
+        fall = fall_of_weight(seen.loss, seen.loss_scale, root, own)
         points[i, 1], points[i, 2] = fall * root * ru, fall * root * rv
         slopes = ray_slopes(place, (root * a, root * b, root * c))
         residuals = root * ru, root * rv
@@ -227,14 +228,6 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
             rows[_RESIDUAL, column] = residuals[q] - dot(by_point, offset)
     equations.sums[0] = square + prior
     return cost + prior
-
-
-@inlined
-def _fall_of_weight(loss: int, scale: float, root: float, square: float) -> float:
-    """Derivative of the logarithm of the weight's root, over r' dr, of weighted residuals r."""
-    if loss == LINEAR or root == 1.0:
-        return 0.0
-    return -0.5 / square if loss == HUBER else -1.0 / (scale * scale)
 
 
 @fast_sums

@@ -24,7 +24,6 @@ from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis
 from cadalign.estimation.uncertainty.sensitivity import Sensitivity, sensitivity_of_keypoints
 from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.estimation.view import View
-from cadalign.estimation.wide_views import facing_view
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import State, points_of
 from cadalign.solvers.joint.search import has_latent
@@ -69,7 +68,8 @@ def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
         known_axis=options.known_axis,
     )
     sigma = result.sigma if options.sigma is None else options.sigma
-    view = facing_view(View(own.camera, own.points_2d, ids=own.ids, sigma=sigma))
+    camera = faced(own.camera, own.points_2d)
+    view = View(camera, own.points_2d, ids=own.ids, sigma=sigma)
     focals = int(options.focal == "estimate")
     evidence = evidence_of(
         prior_of(model),
@@ -77,11 +77,11 @@ def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
         None,
         loss=LOSSES[options.loss],
         loss_scale=options.loss_scale,
-        lenses=Lenses((view.camera,), (focals - 1,), options.focal_prior),
+        lenses=Lenses((camera,), (focals - 1,), options.focal_prior),
     )
     rows = rows_among(result.ids, own.ids, "ids")
     evidence = with_sightings(evidence, own.inliers[np.argsort(rows, kind="stable")])
-    pose = turned_alignment(own.alignment, view.camera.lens_from_camera.T)
+    pose = turned_alignment(own.alignment, camera.lens_from_camera.T)
     state = State(
         np.concatenate([pose.rotation.ravel(), pose.translation])[None],
         np.zeros(focals),

@@ -119,6 +119,12 @@ def _settle(
 
 def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     """Whitened lengths (N,) of all residuals in the image; infinite behind a camera."""
+    across, down = whitened_residuals(evidence, state).T
+    return np.asarray(np.hypot(across, down))
+
+
+def whitened_residuals(evidence: Evidence, state: State) -> FloatArray:
+    """Whitened residuals (N, 2) in the image; infinite behind a camera."""
     sightings = evidence.sightings
     points = points_of(evidence.shape, state)[sightings.point]
     seen = seen_in_cameras(evidence, state, points, sightings.image)
@@ -126,8 +132,8 @@ def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
     error = np.exp(log_ratio) * seen[:, :2] / seen[:, 2:] - sightings.rays
     error -= log_ratio * sightings.slopes
     a, b, c = sightings.whitening.T
-    lengths = np.hypot(a * error[:, 0] + b * error[:, 1], c * error[:, 1])
-    return np.where(seen[:, 2] > 0, lengths, np.inf)
+    whitened = np.column_stack([a * error[:, 0] + b * error[:, 1], c * error[:, 1]])
+    return np.where(seen[:, 2:] > 0, whitened, np.inf)
 
 
 def _projected(evidence: Evidence, state: State) -> FloatArray:

@@ -125,7 +125,8 @@ def test_tracks_of_real_cars(real_data: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "line"),
     [
-        (["--visible", "0"], "--visible: 0 is not a share"),
+        (["--visible", "0"], "--visible: 0 is not positive"),
+        (["--correlation", "1.5"], "--correlation: 1.5 is not between 0 and 1"),
         (["--frames", "2"], "--frames: 2 is less than 3"),
         (["--rate", "0"], "--rate: 0 is not positive"),
         (["--split", "train"], "both are 'train'"),

@@ -116,6 +116,9 @@ class Trajectory:
         The stretch.
     motion : Motion
         Strengths of the acceleration, given or estimated.
+    correlation : float
+        Correlation of the keypoints' errors in successive frames, estimated from residuals. Poses
+        and their uncertainties take it into account.
 
     Examples
     --------
@@ -139,6 +142,7 @@ class Trajectory:
     links: FloatArray
     scale: FloatArray
     motion: Motion
+    correlation: float = 0.0
 
     def __len__(self) -> int:
         return len(self.times)

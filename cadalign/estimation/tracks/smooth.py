@@ -25,6 +25,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.search import Inits, JointProblem, Minimum, Track, find_minima, thresholds
 from cadalign.estimation.tracks.candidates import best_path, candidates_of, filled, velocities_of
+from cadalign.estimation.tracks.correlation import SuccessiveErrors, weakened
 from cadalign.estimation.tracks.frames import Frames
 from cadalign.estimation.tracks.motion import Motion, Trajectory
 from cadalign.estimation.uncertainty.evidence import count_equations
@@ -45,19 +46,24 @@ _FARTHER = 10.0  # than any frame, where the volume of paths is zero
 _LARGEST_CHANGE = 5.0  # factor, of one round
 _PSEUDO_COUNT = 1.0  # residuals of the first strength that count as seen
 _INLIER_ROUNDS = 4
+_CORRELATION_ROUNDS = 3
 _OF_MEDIAN = 1.5  # standard deviation over the median of absolute values
 _LEAST_STRENGTH = 1e-3  # change of the velocity over the whole track, over its size
 _LEAST_SPEED = 1e-6
 
 
 class Smoothed(NamedTuple):
-    """A path, the strength of its motion, and the sightings (N,) that it rests on."""
+    """A path, the strength of its motion, and the sightings (N,) that it rests on.
+
+    The ``correlation`` of errors in successive frames has been taken into account.
+    """
 
     evidence: Evidence
     inliers: BoolArray
     path: Path
     motion: MotionPrior
     iterations: int
+    correlation: float = 0.0
 
 
 def align_track(
@@ -102,15 +108,17 @@ def estimate_track(
     motion: Motion,
     inits: Inits,
     ransac: RansacOptions | None,
+    *,
+    may_correlate: bool = True,
 ) -> EstimatedTrack:
-    """All stages of an estimate."""
+    """All stages of an estimate; errors of successive frames ``may_correlate``."""
     problem, first, iterations, hypotheses = _of_some(problem, frames, inits, ransac)
     evidence = problem.evidence(first.evidence.shape, problem.lenses)
     path = _first_path(problem, evidence, first, frames, may_skip=ransac is not None)
     limits = None
     if ransac is not None:
         limits = thresholds(evidence, problem.lenses, problem.threshold(ransac))
-    found = smoothed(evidence, path, frames.times, motion, limits)
+    found = smoothed(evidence, path, frames.times, motion, limits, may_correlate=may_correlate)
     spent = iterations + found.iterations
     return EstimatedTrack(problem, found, first.component, spent, hypotheses)
 
@@ -169,10 +177,13 @@ def smoothed(
     times: FloatArray,
     motion: Motion,
     limits: FloatArray | None = None,
+    *,
+    may_correlate: bool = True,
 ) -> Smoothed:
     """The smooth path near a first one, with the likeliest strengths where these are not given.
 
     Sightings whose whitened residuals exceed the ``limits`` (N,) are left out, where there are any.
+    Where errors of successive frames ``may_correlate``, it is estimated whether they do.
     """
     seconds = np.diff(times)
     unknown = _first_strength(path, seconds)
@@ -180,16 +191,24 @@ def smoothed(
     inliers = np.ones(len(evidence.sightings.point), dtype=bool)
     used = evidence if limits is None else with_loss(evidence, CAUCHY)
     path, prior, spent = _likeliest(used, path, prior, motion)
-    if limits is None:
-        return Smoothed(evidence, inliers, path, prior, spent)
     for _ in range(_INLIER_ROUNDS):
+        if limits is None:
+            break
         kept = whitened_lengths(evidence, path.state) < limits
         if (kept == inliers).all() and used is not evidence:
             break
         inliers, used = kept, with_sightings(evidence, kept)
         path, prior, more = _likeliest(used, path, prior, motion)
         spent += more
-    return Smoothed(used, inliers, path, prior, spent)
+    correlation, independent = 0.0, used
+    for _ in range(_CORRELATION_ROUNDS if may_correlate else 0):
+        found = SuccessiveErrors.of(used, path.state).correlation
+        if found <= correlation:
+            break
+        correlation, used = found, weakened(independent, found)
+        path, prior, more = _likeliest(used, path, prior, motion)
+        spent += more
+    return Smoothed(used, inliers, path, prior, spent, correlation)
 
 
 def _first_strength(path: Path, seconds: FloatArray) -> FloatArray:
@@ -274,5 +293,6 @@ def _result(
         widening * covariance.links,
         np.exp(path.state.log_scales),
         Motion.of_strength(found.motion.strength),
+        found.correlation,
     )
     return replace(result, trajectory=trajectory)

@@ -18,6 +18,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.search import JointProblem, thresholds
 from cadalign.estimation.tracks.between import moved_by
 from cadalign.estimation.tracks.candidates import candidates_of
+from cadalign.estimation.tracks.correlation import SuccessiveErrors, weakened
 from cadalign.estimation.tracks.frames import Frames
 from cadalign.estimation.tracks.motion import Motion, PoseAt
 from cadalign.estimation.tracks.smooth import Smoothed, estimate_track
@@ -119,6 +120,7 @@ class Tracker:
         self._shape: Shape | None = None
         self._contradicting = 0
         self._is_lost = False
+        self._errors = SuccessiveErrors()
 
     @property
     def is_lost(self) -> bool:
@@ -162,6 +164,10 @@ class Tracker:
             tried += [self._from(window, pose).refined(_ITERATIONS) for pose in self._found(view)]
         _, window = min(tried, key=lambda each: each[0])
         inliers = self._agreement(window)
+        if share.size and inliers.mean() >= _AGREE:
+            last = len(window.times) - 2
+            newest = SuccessiveErrors.of(window.evidence, window.path.state, first=last)
+            self._errors = self._errors.plus(newest)
         self._check_lost(window, inliers)
         again = self._again(view, window) if self._is_lost else None
         if again is not None:
@@ -211,7 +217,14 @@ class Tracker:
     def _estimated(self, views: Sequence[View]) -> tuple[Smoothed, int]:
         frames = Frames.of(views)
         problem = self._problem(views, frames.of_view.tolist())
-        found = estimate_track(problem, frames, self._motion, [None] * len(views), self._ransac)
+        found = estimate_track(
+            problem,
+            frames,
+            self._motion,
+            [None] * len(views),
+            self._ransac,
+            may_correlate=False,  # of few frames that cannot be told
+        )
         return found.smoothed, found.component
 
     def _problem(self, views: Sequence[View], frames: Sequence[int]) -> JointProblem:
@@ -238,6 +251,7 @@ class Tracker:
         assert shape is not None
         problem = self._problem(views, range(len(views)))
         evidence = problem.evidence(shape, problem.lenses)
+        evidence = weakened(evidence, self._errors.correlation)
         return evidence if self._ransac is None else with_loss(evidence, CAUCHY)
 
     def _grown(self, window: Window, view: View) -> Window:

@@ -72,6 +72,8 @@ class TracksOptions(NoiseOption, FunctionOptions):
     """Frames in a second; by default 30, of KITTI 10."""
     visible: float = 0.7
     """Share of the keypoints that a simulated frame shows."""
+    correlation: float = 0.0
+    """Correlation of the noise of a keypoint in successive simulated frames."""
     flipped: float = 0.0
     """Share of the simulated frames whose keypoints are those of the object turned by half;
     methods then expect outliers."""
@@ -88,9 +90,12 @@ class TracksOptions(NoiseOption, FunctionOptions):
         self.check_least(max_models=1, frames=3)
         if self.rate is not None and not 0 < self.rate < np.inf:
             raise InputError(f"{self.rate:g} is not positive", where="rate")
-        for name, low in (("visible", np.nextafter(0, 1)), ("flipped", 0), ("outliers", 0)):
-            if not low <= getattr(self, name) <= 1:
-                raise InputError(f"{getattr(self, name):g} is not a share", where=name)
+        if not self.visible > 0:
+            raise InputError(f"{self.visible:g} is not positive", where="visible")
+        for name in ("visible", "correlation", "flipped", "outliers"):
+            if not 0 <= getattr(self, name) <= 1:
+                what = f"{getattr(self, name):g} is not between 0 and 1"
+                raise InputError(what, where=name)
         self.check_methods(METHODS)
         if self.split == self.train:
             what, fix = f"both are {self.split!r}", "objects must not be among the models"

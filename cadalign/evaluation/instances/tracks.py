@@ -40,7 +40,11 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.runs.work import fingerprint
 from cadalign.evaluation.shape_files import LearnedFiles, learn
-from cadalign.evaluation.simulation.tracks import simulate_track, with_mistakes
+from cadalign.evaluation.simulation.tracks import (
+    simulate_track,
+    with_correlated_errors,
+    with_mistakes,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angles_between, vector_from_rotation
 from cadalign.io.files import read_bytes
@@ -86,6 +90,9 @@ class SimulatedVideo(TrackTask):
             visible=options.visible,
             rate=options.rate or _RATE,
         )
+        if options.correlation:
+            how = {"noise_px": options.noise_px, "correlation": options.correlation}
+            track = with_correlated_errors(track, rng, **how)
         if options.flipped or options.outliers:
             how = {"flipped": options.flipped, "outliers": options.outliers}
             track = with_mistakes(track, rng, **how)

@@ -130,6 +130,26 @@ def _stays(places: FloatArray, camera: Camera) -> bool:
     return bool((np.abs(camera.project(places) - half) < (1 - _MARGIN) * half).all())
 
 
+def with_correlated_errors(
+    track: SimulatedTrack, rng: np.random.Generator, *, noise_px: float, correlation: float
+) -> SimulatedTrack:
+    """The track with errors of each keypoint that are correlated from frame to frame.
+
+    An autoregression of first order takes the place of independent noise, of the same standard
+    deviation ``noise_px``.
+    """
+    rows = {name: row for row, name in enumerate(track.ids)}
+    errors = rng.normal(size=(len(rows), 2))
+    views = []
+    for view, pose in zip(track.views, track.poses, strict=True):
+        fresh = rng.normal(size=errors.shape)
+        errors = correlation * errors + np.sqrt(1 - correlation**2) * fresh
+        seen = [rows[name] for name in view.keypoint_ids]
+        pixels = view.camera.project(pose.apply(track.points_3d[seen]))
+        views.append(replace(view, points_2d=pixels + noise_px * errors[seen]))
+    return replace(track, views=tuple(views))
+
+
 def with_mistakes(
     track: SimulatedTrack,
     rng: np.random.Generator,

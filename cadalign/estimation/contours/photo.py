@@ -12,7 +12,7 @@ from cadalign.arrays import FloatArray
 from cadalign.estimation.contours.descent import Place
 from cadalign.estimation.contours.photo_descent import (
     COARSE,
-    OFFSET,
+    OWN_SIGMAS,
     Approach,
     LineNoise,
     OutlineSupport,
@@ -66,10 +66,10 @@ class PhotoFit(NamedTuple):
         """The result with what is known of the photos."""
         if not self.found:
             return result
-        lacking = OutlineSupport(0.0, 0, 0.0, 0.0, 0.0)
+        lacking = OutlineSupport(0.0, 0, 0.0, 0.0, 0.0, 0.0)
         summaries = []
         for view, support in self.found.items():
-            share, lines, rms, rms_sigmas, _ = support or lacking
+            share, lines, rms, rms_sigmas, *_ = support or lacking
             summaries.append(EvidenceSummary("photo", view, lines, rms_sigmas, rms, "px", share))
         used = frozenset(view for view, support in self.found.items() if support is not None)
         stated = Stated.of(result.statistics)
@@ -97,15 +97,15 @@ class _Candidate(NamedTuple):
         """OutlineSupport of the outline by each photo."""
         is_exact = self.pictured.surface.is_exact
         return [
-            support_of(outline, OFFSET * own, is_exact=is_exact)
-            for outline, own in zip(self.reached.outlines, self.reached.own.tolist(), strict=True)
+            support_of(outline, own, is_exact=is_exact)
+            for outline, own in zip(self.reached.outlines, self.reached.own, strict=True)
         ]
 
     @property
     def rank(self) -> float:
-        """-2 log of its probability, by the other evidence and the photos' colours."""
+        """-2 log of its probability, by the other evidence and by the photos."""
         rest = cost_of_rest(self.pictured, self.reached.state) + self.start.prior_score
-        return rest - 2 * sum(each.contrast for each in self.supports)
+        return rest - 2 * sum(each.contrast + each.agreement for each in self.supports)
 
     @property
     def minimum(self) -> Minimum:
@@ -175,7 +175,7 @@ def _explored(
     for start, state in _starts(minima):
         evidence, state = with_displacement_modes(start.evidence, state)
         pictured = Pictured(evidence, keypoints, list(photos), surface)
-        reached = approach(pictured, Approach(state, np.zeros(len(photos))), COARSE, noises)
+        reached = approach(pictured, Approach(state, np.zeros((len(photos), len(OWN_SIGMAS)))), COARSE, noises)
         if reached is not None:
             near.append(_Candidate(start, pictured, reached))
     finished = []

@@ -46,8 +46,9 @@ _LEAST_REACH = 5.0  # [px]
 _ROUNDS = 3  # of every reach
 _LAST_ROUNDS = 3  # with the noise that is learned
 _ITERATIONS = 4  # of a round, whose outline is not that of its end
-OFFSET = 0.4
-"""Standard deviation [px] of an offset outwards that all of an outline has in common."""
+OWN_SIGMAS = (0.4, 0.3, 0.3)
+"""Standard deviations [px] of what all of an outline has in common: an offset outwards, and, where
+light and blur differ from side to side, shifts to the right and down."""
 _FIRST_CORRELATION = 4.0  # lines
 _LEAST_CORRELATION = 12.0  # lines: pixels and blur displace neighbours alike
 _LEAST_FACTOR = 0.7
@@ -56,6 +57,7 @@ _LEAST_OUTLIER = 2.0  # in standard deviations
 _TOLERANCE = 2.0  # [px], of a line that agrees, and the same relative to the silhouette's size
 _RELATIVE_TOLERANCE = 0.01
 _SIMILAR_TOLERANCE = 0.04  # where the model is only similar to the object
+_STRAY = 0.2  # share of the lines whose places are of other things
 _LINES_OF_PATCH = 5.0  # of which the colours count as independent
 
 
@@ -83,7 +85,7 @@ class Pictured(NamedTuple):
 
 
 class Approach(NamedTuple):
-    """A state, and the coefficients (V,) of the offsets that outlines have in common.
+    """A state, and the coefficients (V, 3) of what each outline has in common.
 
     ``outlines`` are those from which the last step was taken, None where there is none; ``full``
     is the evidence with them, in the state ``room``.
@@ -114,8 +116,7 @@ def finish(pictured: Pictured, start: Approach) -> Approach | None:
     for _ in range(_LAST_ROUNDS):
         if here is None:
             return None
-        offsets = (OFFSET * here.own).tolist()
-        noises = [_noise_of(*each) for each in zip(here.outlines, offsets, strict=True)]
+        noises = [_noise_of(*each) for each in zip(here.outlines, here.own, strict=True)]
         here = _round(pictured, here, _FINE[-1], noises)
     return here
 
@@ -141,13 +142,13 @@ def _round(
         return None
     total, chosen = count_of(rows), np.array(shown)
     full = with_measured(evidence, pictured.keypoints, rows)
-    room = state_with_points(state, pictured.keypoints, total, here.own[chosen])
+    room = state_with_points(state, pictured.keypoints, total, here.own[chosen].ravel())
     cost, room, _, _ = refine_joint(full, _ITERATIONS, room)
     if not cost < np.inf:
         return None
-    bare, moved = state_without_points(room, pictured.keypoints, total, len(rows))
-    own = np.zeros(len(chosen))
-    own[chosen] = moved
+    bare, moved = state_without_points(room, pictured.keypoints, total, here.own[chosen].size)
+    own = np.zeros_like(here.own)
+    own[chosen] = moved.reshape(-1, len(OWN_SIGMAS))
     return Approach(bare, own, tuple(outlines), full, room)
 
 
@@ -174,28 +175,35 @@ def _rows(
         places=outline.places[told],
         weights=1 / (noise.factor * outline.sigmas[told] * root),
         loss_scale=_LOSS_SCALE / root,
-        own=(OFFSET,),
+        own=OWN_SIGMAS,
         cameras=(given, camera),
     )
 
 
-def _noise_of(outline: Outline | None, offset: float) -> LineNoise:
-    """The noise that the residuals of an outline show, beside the offset [px] of all of it."""
+def _noise_of(outline: Outline | None, own: FloatArray) -> LineNoise:
+    """The noise that the residuals of an outline show, beside what all of it has in common."""
     if outline is None:
         return LineNoise()
-    residuals, told = outline.in_sigmas(offset), outline.is_told
+    residuals, told = outline.in_sigmas(_common(outline, own)), outline.is_told
     factor = max(trimmed_deviation(residuals[told], _LEAST_OUTLIER), _LEAST_FACTOR)
     influence = residuals / (1 + (residuals / (_LOSS_SCALE * factor)) ** 2)
     length = correlation_length(outline.silhouette.contour, influence, told)
     return LineNoise(factor, max(length, _LEAST_CORRELATION))
 
 
+def _common(outline: Outline, own: FloatArray) -> FloatArray:
+    """Places (S,) [px] outwards to which the coefficients ``own`` (3,) take an outline."""
+    offset, *shift = own * OWN_SIGMAS
+    return np.asarray(offset + outline.silhouette.contour.normals @ shift)
+
+
 class OutlineSupport(NamedTuple):
     """Agreement of a photo with an outline.
 
     The ``share`` of it that was found within the tolerance, the number of ``lines``, their
-    root mean square distance ``rms`` [px] and ``rms_sigmas``, and the ``contrast`` of the colours:
-    the log likelihood that they give the silhouette, over none [nats].
+    root mean square distance ``rms`` [px] and ``rms_sigmas``. The log likelihoods [nats] are those
+    that the colours give the silhouette, ``contrast``, over one anywhere, and that the lines' places
+    give the outline, ``agreement``, over places anywhere on the lines.
     """
 
     share: float
@@ -203,24 +211,37 @@ class OutlineSupport(NamedTuple):
     rms: float
     rms_sigmas: float
     contrast: float
+    agreement: float
 
 
-def support_of(outline: Outline | None, offset: float, *, is_exact: bool) -> OutlineSupport:
-    """The support of an outline, which all lies outwards by an ``offset`` [px]."""
+def support_of(outline: Outline | None, own: FloatArray, *, is_exact: bool) -> OutlineSupport:
+    """The support of an outline beside what all of it has in common, ``own`` (3,) as `Approach`."""
     if outline is None:
-        return OutlineSupport(0.0, 0, 0.0, 0.0, 0.0)
+        return OutlineSupport(0.0, 0, 0.0, 0.0, 0.0, 0.0)
     relative = _RELATIVE_TOLERANCE if is_exact else _SIMILAR_TOLERANCE
     tolerance = max(_TOLERANCE, relative * outline.silhouette.size)
-    distances = outline.places - offset
+    common = _common(outline, own)
+    distances = outline.places - common
     near: BoolArray = outline.is_told & (np.abs(distances) < tolerance)
     count = int(near.sum())
     patches = len(near) / _LINES_OF_PATCH
     contrast = 2 * patches * outline.contrast
+    agreement = _agreement(outline, own)
     if not count:
-        return OutlineSupport(0.0, 0, 0.0, 0.0, contrast)
+        return OutlineSupport(0.0, 0, 0.0, 0.0, contrast, agreement)
     rms = float(np.sqrt((distances[near] ** 2).mean()))
-    rms_sigmas = float(np.sqrt((outline.in_sigmas(offset)[near] ** 2).mean()))
-    return OutlineSupport(count / len(near), count, rms, rms_sigmas, contrast)
+    rms_sigmas = float(np.sqrt((outline.in_sigmas(common)[near] ** 2).mean()))
+    return OutlineSupport(count / len(near), count, rms, rms_sigmas, contrast, agreement)
+
+
+def _agreement(outline: Outline, own: FloatArray) -> float:
+    """Log likelihood [nats] of the lines' places, some of which are other things'."""
+    factor, correlation = _noise_of(outline, own)
+    residuals, told = outline.in_sigmas(_common(outline, own)) / factor, outline.is_told
+    sigmas = factor * np.where(told, outline.sigmas, 1.0)
+    density = np.exp(-(residuals**2) / 2) / np.sqrt(2 * np.pi) / sigmas
+    gains = np.log((1 - _STRAY) * density * 2 * outline.reach + _STRAY)
+    return float(gains[told].sum() / correlation)
 
 
 def cost_of_rest(pictured: Pictured, state: State) -> float:

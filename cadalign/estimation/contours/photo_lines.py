@@ -133,19 +133,21 @@ def _box_in_image(
 class Outline(NamedTuple):
     """Evidence of a photo about a predicted outline.
 
-    ``places`` (S,) [px] are outwards from the silhouette's contour, with their standard deviations
-    ``sigmas`` (S,), infinite where nothing is told; ``contrast`` is that of `Regions`.
+    ``places`` (S,) [px] are outwards from the silhouette's contour, by ``reach`` at most, with their
+    standard deviations ``sigmas`` (S,), infinite where nothing is told; ``contrast`` is that of
+    `Regions`.
     """
 
     silhouette: Silhouette
     places: FloatArray
     sigmas: FloatArray
     contrast: float
+    reach: float
 
-    def in_sigmas(self, offset: float) -> FloatArray:
-        """Places (S,) beside an offset [px], in standard deviations; 0 where nothing is told."""
+    def in_sigmas(self, common: FloatArray) -> FloatArray:
+        """Places (S,) beside ``common`` ones [px], in standard deviations; 0 where none is told."""
         safe = np.where(self.is_told, self.sigmas, 1.0)
-        return np.where(self.is_told, (self.places - offset) / safe, 0.0)
+        return np.where(self.is_told, (self.places - common) / safe, 0.0)
 
     @property
     def is_told(self) -> BoolArray:
@@ -170,7 +172,7 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
         edges = edges_of(colors.astype(np.float64), valid, step)
     found = crossings_of(regions.odds[bins_of(colors)], valid, edges)
     sigmas = step * np.sqrt(found.variances)
-    return Outline(silhouette, step * found.places, sigmas, regions.contrast)
+    return Outline(silhouette, step * found.places, sigmas, regions.contrast, reach)
 
 
 def _colors_beside(

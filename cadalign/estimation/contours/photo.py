@@ -49,6 +49,7 @@ _MOST_TURN = np.radians(40.0)
 _SAME_TURN = np.radians(1.0)
 _LEAST_SUPPORT = 0.5  # share of the outline that must be found
 _GOOD_SUPPORT = 0.75  # below which a warning says so
+_MOST_RMS = 1.75  # of the lines found, in standard deviations, above which a warning says so
 _LEAST_PROBABILITY = 1e-3  # of such a rise of the other residuals by chance
 
 
@@ -158,12 +159,16 @@ def fit_photos(
 
 
 def _weak(found: dict[int, OutlineSupport]) -> list[str]:
-    """Warnings about photos that show only a part of the outline."""
-    return [
-        f"views[{view}].image shows only {100 * each.share:.0f} % of the model's outline"
-        for view, each in found.items()
-        if each.share < _GOOD_SUPPORT
-    ]
+    """Warnings about photos that show only a part of the outline, or another thing's."""
+    warnings = []
+    for view, each in found.items():
+        where = f"views[{view}].image"
+        if each.share < _GOOD_SUPPORT:
+            warnings.append(f"{where} shows only {100 * each.share:.0f} % of the model's outline")
+        elif each.rms_sigmas > _MOST_RMS:
+            off = f"{each.rms_sigmas:.1f} standard deviations off the model's outline"
+            warnings.append(f"{where}: edges lie {off}: some may be another object's")
+    return warnings
 
 
 def _explored(

@@ -9,7 +9,7 @@ ones count with the noise that the residuals show.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -52,6 +52,8 @@ light and blur differ from side to side, shifts to the right and down."""
 _FIRST_CORRELATION = 4.0  # lines
 _LEAST_CORRELATION = 12.0  # lines: pixels and blur displace neighbours alike
 _LEAST_FACTOR = 0.7
+_LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
+_LEAST_INFORMATION = 1e-12  # about an unknown, relative
 _LOSS_SCALE = 2.4  # in standard deviations
 _LEAST_OUTLIER = 2.0  # in standard deviations
 _TOLERANCE = 2.0  # [px], of a line that agrees, and the same relative to the silhouette's size
@@ -116,9 +118,9 @@ def finish(pictured: Pictured, start: Approach) -> Approach | None:
     for _ in range(_LAST_ROUNDS):
         if here is None:
             return None
-        noises = [_noise_of(*each) for each in zip(here.outlines, here.own, strict=True)]
+        noises = [*map(_noise_of, here.outlines, here.own)]
         here = _round(pictured, here, _FINE[-1], noises)
-    return here
+    return None if here is None else _widened(pictured, here, noises)
 
 
 def _round(
@@ -189,6 +191,33 @@ def _noise_of(outline: Outline | None, own: FloatArray) -> LineNoise:
     influence = residuals / (1 + (residuals / (_LOSS_SCALE * factor)) ** 2)
     length = correlation_length(outline.silhouette.contour, influence, told)
     return LineNoise(factor, max(length, _LEAST_CORRELATION))
+
+
+def _widened(pictured: Pictured, here: Approach, noises: list[LineNoise]) -> Approach:
+    """The same, with the noise of lines as large as it is if unknowns fitted a part of it.
+
+    Their residuals have as many degrees of freedom less as the lines determine unknowns.
+    """
+    full, room = cast(Evidence, here.full), cast(State, here.room)
+    is_line = np.arange(len(full.sightings.point)) >= len(pictured.evidence.sightings.point)
+    whitening = full.sightings.whitening
+    rest = _with_whitening(full, np.where(is_line[:, None], 0.0, whitening))
+    (_, whole), (_, without) = information_of(full, room), information_of(rest, room)
+    sizes = np.sqrt(np.maximum(whole.diagonal(), 1e-300))
+    scaled = whole / np.outer(sizes, sizes) + _LEAST_INFORMATION * np.eye(len(sizes))
+    lines = (whole - without) / np.outer(sizes, sizes)
+    fitted = float(np.trace(np.linalg.solve(scaled, lines)))
+    count = sum(
+        float(outline.is_told.sum()) / noise.correlation
+        for outline, noise in zip(here.outlines, noises, strict=True)
+        if outline is not None
+    )
+    factor = np.sqrt(max(1 - fitted / max(count, 1.0), _LEAST_FREEDOM))
+    return here._replace(full=_with_whitening(full, np.where(is_line[:, None], factor, 1.0) * whitening))
+
+
+def _with_whitening(evidence: Evidence, whitening: FloatArray) -> Evidence:
+    return evidence._replace(sightings=evidence.sightings._replace(whitening=whitening))
 
 
 def _common(outline: Outline, own: FloatArray) -> FloatArray:

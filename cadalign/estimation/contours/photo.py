@@ -180,7 +180,9 @@ def _explored(
     for start, state in _starts(minima):
         evidence, state = with_displacement_modes(start.evidence, state)
         pictured = Pictured(evidence, keypoints, list(photos), surface)
-        reached = approach(pictured, Approach(state, np.zeros((len(photos), len(OWN_SIGMAS)))), COARSE, noises)
+        reached = approach(
+            pictured, Approach(state, np.zeros((len(photos), len(OWN_SIGMAS)))), COARSE, noises
+        )
         if reached is not None:
             near.append(_Candidate(start, pictured, reached))
     finished = []

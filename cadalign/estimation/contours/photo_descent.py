@@ -213,7 +213,9 @@ def _widened(pictured: Pictured, here: Approach, noises: list[LineNoise]) -> App
         if outline is not None
     )
     factor = np.sqrt(max(1 - fitted / max(count, 1.0), _LEAST_FREEDOM))
-    return here._replace(full=_with_whitening(full, np.where(is_line[:, None], factor, 1.0) * whitening))
+    return here._replace(
+        full=_with_whitening(full, np.where(is_line[:, None], factor, 1.0) * whitening)
+    )
 
 
 def _with_whitening(evidence: Evidence, whitening: FloatArray) -> Evidence:
@@ -231,8 +233,8 @@ class OutlineSupport(NamedTuple):
 
     The ``share`` of it that was found within the tolerance, the number of ``lines``, their
     root mean square distance ``rms`` [px] and ``rms_sigmas``. The log likelihoods [nats] are those
-    that the colours give the silhouette, ``contrast``, over one anywhere, and that the lines' places
-    give the outline, ``agreement``, over places anywhere on the lines.
+    that the colours give the silhouette, ``contrast``, over one anywhere, and that the lines'
+    places give the outline, ``agreement``, over places anywhere on the lines.
     """
 
     share: float

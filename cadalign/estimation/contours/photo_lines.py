@@ -133,8 +133,8 @@ def _box_in_image(
 class Outline(NamedTuple):
     """Evidence of a photo about a predicted outline.
 
-    ``places`` (S,) [px] are outwards from the silhouette's contour, by ``reach`` at most, with their
-    standard deviations ``sigmas`` (S,), infinite where nothing is told; ``contrast`` is that of
+    ``places`` (S,) [px] are outwards from the silhouette's contour, by ``reach`` at most; their
+    standard deviations ``sigmas`` (S,) are infinite where nothing is told; ``contrast`` is that of
     `Regions`.
     """
 
@@ -145,7 +145,7 @@ class Outline(NamedTuple):
     reach: float
 
     def in_sigmas(self, common: FloatArray) -> FloatArray:
-        """Places (S,) beside ``common`` ones [px], in standard deviations; 0 where none is told."""
+        """Places (S,) beside ``common`` ones, in standard deviations; 0 where none is told."""
         safe = np.where(self.is_told, self.sigmas, 1.0)
         return np.where(self.is_told, (self.places - common) / safe, 0.0)
 

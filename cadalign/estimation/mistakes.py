@@ -127,7 +127,7 @@ def find_in_all(
 
 def name_likely(tried: Tried, best: Explained) -> str:
     """Clauses of the mistakes that are as likely as the best; first those of an upright object."""
-    likely = [(m.clause, each) for m, each in tried if each.score < best.score + _AS_LIKELY]
+    likely = [(m.clause, each) for m, each in tried if each.score <= best.score + _AS_LIKELY]
     upright = [clause for clause, each in likely if each.up > _UPRIGHT]
     others = [clause for clause, each in likely if each.up <= _UPRIGHT]
     named = _listed(upright or others)

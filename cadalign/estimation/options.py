@@ -292,7 +292,8 @@ def pixel_information(sigma: Any, count: int) -> FloatArray:
         deviations = as_floats(sigma, name="sigma", shape=shape)
         if not (deviations > 0).all():
             raise InputError("has values that are not positive", where="sigma", fix=SIGMA_HELP)
-        weights = np.broadcast_to(1.0 / deviations**2, (count,))
+        with np.errstate(over="ignore", divide="ignore"):  # of a tiny sigma: infinite
+            weights = np.broadcast_to((1.0 / deviations) ** 2, (count,))
         return np.asarray(weights[:, None, None] * np.eye(2))
     covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))
     definite = (np.linalg.eigvalsh(covariances)[:, 0] > 0) & (

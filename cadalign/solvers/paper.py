@@ -61,9 +61,11 @@ def aepnp_paper(
     system[1::2, :, 2] = -v[:, None] * weights
     matrix = system.reshape(2 * count, 12)
     squares = matrix.T @ matrix
-    if not np.isfinite(squares).all():
+    size = np.abs(squares).max()
+    if not np.isfinite(size):
         raise out_of_range_error()
-    _, vectors = np.linalg.eigh(squares)
+    # Of norm 1: LAPACK does not converge where the squares of the entries overflow.
+    _, vectors = np.linalg.eigh(squares / size)
     control_points = vectors[:, 0].reshape(4, 3)
     if (weights @ control_points[:, 2]).sum() < 0:
         control_points = -control_points

@@ -150,16 +150,15 @@ class KeypointStatistics(FittedKeypoints):
     def evidence(self) -> tuple[EvidenceSummary, ...]:
         """Agreement of the keypoints that the estimate rests on."""
         residuals = self.residuals[self.inliers]
-        squares = (residuals * residuals).sum()
+        count = max(len(residuals), 1)
+        rms = float(np.sqrt((residuals * residuals).sum() / count))
         sigma = self.chosen_sigma
         if np.ndim(sigma) == 0:
-            unit = 1.0 if sigma is None else float(sigma)
-            whitened = squares / unit / unit  # the square of a huge sigma overflows
+            in_sigmas = rms / np.sqrt(2.0) / (1.0 if sigma is None else float(sigma))
         else:
             information = pixel_information(sigma, len(self.residuals))[self.inliers]
             whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
-        count = max(len(residuals), 1)
-        in_sigmas, rms = np.sqrt([whitened / (2 * count), squares / count]).tolist()
+            in_sigmas = float(np.sqrt(whitened / (2 * count)))
         return (EvidenceSummary("keypoints", 0, len(residuals), in_sigmas, rms, "px"),)
 
 

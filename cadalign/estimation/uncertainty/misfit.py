@@ -189,7 +189,7 @@ def find_misfit(result: FittedKeypoints) -> Misfit | None:
         return None
     try:
         tested = Tested.of(result)
-    except InputError:  # a depth that rounds to zero has no projection
+    except (InputError, np.linalg.LinAlgError):  # a depth, or a weight, that rounds to zero
         return None
     free_scale = contradicting_scale(tested)
     if free_scale is not None:

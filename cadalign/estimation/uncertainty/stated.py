@@ -154,7 +154,9 @@ class KeypointStatistics(FittedKeypoints):
         rms = float(np.sqrt((residuals * residuals).sum() / count))
         sigma = self.chosen_sigma
         if np.ndim(sigma) == 0:
-            in_sigmas = rms / np.sqrt(2.0) / (1.0 if sigma is None else float(sigma))
+            unit = 1.0 if sigma is None else float(sigma)
+            with np.errstate(over="ignore"):  # of the least positive number
+                in_sigmas = float(np.nan_to_num(np.divide(rms / np.sqrt(2.0), unit)))
         else:
             information = pixel_information(sigma, len(self.residuals))[self.inliers]
             whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)

@@ -217,8 +217,10 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
             fix=f"known are {', '.join(known)}" if known else None,
         )
     if text.startswith("Invalid enum value"):
-        allowed = ", ".join(map(repr, _type_at(kind, path).values))
-        return DataError(f"{quote(value)} is not one of {allowed}", where=where or None)
+        # A field that takes words or a record has no single list of words.
+        allowed = ", ".join(map(repr, getattr(_type_at(kind, path), "values", ())))
+        problem = f"is not one of {allowed}" if allowed else "is none of the known words"
+        return DataError(f"{quote(value)} {problem}", where=where or None)
     return DataError(f"{quote(value)} is not {_wanted(text)}", where=where or None)
 
 

@@ -48,7 +48,7 @@ from cadalign.datasets.photos.photo import (
     first_existing,
 )
 from cadalign.datasets.photos.placed import PlacedObject, converted
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -69,6 +69,7 @@ _CAMERAS = "scene_camera.json"
 _INFO = "scene_gt_info.json"
 _CAMERA = "camera.json"
 _COLOR_FOLDERS = ("rgb", "gray")
+_MOST_DIGITS = 18
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif")
 _WRITTEN_SCENE = Path("test", "000001")
 
@@ -229,8 +230,8 @@ def _read_scene(folder: Path) -> _Scene:
 
 
 def _image(folder: Path, kinds: tuple[str, ...], key: str) -> Path | None:
-    if not key.isdecimal():
-        raise DataError(f"{key!r} is not the number of an image", where=str(folder / TRUTH))
+    if not key.isdecimal() or len(key) > _MOST_DIGITS:
+        raise DataError(f"{quote(key)} is not the number of an image", where=str(folder / TRUTH))
     name = f"{int(key):06d}"
     return first_existing(folder / kind / f"{name}{end}" for kind in kinds for end in _IMAGES)
 

@@ -48,6 +48,7 @@ ANNOTATIONS = "Annotations"
 DETECTED = "annot"
 _OBSERVATIONS = "observations"
 # MATLAB counts pixels from 1.
+_MOST_VERTICES = 2**31
 _FIRST_PIXEL = 1.0
 # The focal length, in pixels, that annotations without one were made with.
 _VIEWPORT = 3000.0
@@ -217,7 +218,8 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
     if distance == 0:
         return Truth()
     azimuth, elevation, theta = (
-        np.radians(viewpoint.number(name)) for name in ("azimuth", "elevation", "theta")
+        np.radians(np.fmod(viewpoint.number(name), 360.0))
+        for name in ("azimuth", "elevation", "theta")
     )
     focal = viewpoint.number("focal", default=1.0) * viewpoint.number("viewport", _VIEWPORT)
     center = distance * np.array(
@@ -264,6 +266,8 @@ class PascalCad:
         where = f"{self.path}: model {self.index}"
         with in_file(where):
             vertices, faces = found.array("vertices", 3), found.array("faces", 3)
+            if not (np.abs(faces) < _MOST_VERTICES).all():
+                raise DataError("`faces` has entries that are no numbers of vertices", where=where)
             return Mesh(vertices, faces.astype(np.int64) - 1, source=where)
 
     def load_keypoints(self) -> NamedPoints | None:

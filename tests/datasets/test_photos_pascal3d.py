@@ -161,6 +161,15 @@ def test_cad_files_are_checked_when_they_are_read(root):
         type(model)(root / "CAD" / "x.mat", "chair", 1).load_mesh()
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf, 1e30])
+def test_faces_are_numbers_of_vertices(root, number):
+    model = Pascal3D(root)[0].objects[0].model.source
+    cad = {"vertices": POINTS, "faces": np.array([[1.0, 2, number]])}
+    savemat(root / "CAD" / "x.mat", {"chair": np.array([cad], dtype=object)})
+    with pytest.raises(DataError, match="faces"):
+        type(model)(root / "CAD" / "x.mat", "chair", 1).load_mesh()
+
+
 def test_damaged_files_are_told(root):
     assert_damage_is_told(root)
 

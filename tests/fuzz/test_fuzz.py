@@ -62,3 +62,16 @@ def test_failures_name_their_seed(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_prior_beside_keypoints_that_determine_nothing_leaves_a_covariance() -> None:
     """Of one stretch in a photo whose keypoints lie anywhere; its variances were negative."""
     fits.run_case(draw_case(1182))
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [
+        ("fit", 1001377),  # a word where words or a record may stand
+        ("BOP test/000001/scene_gt.json", 1012924),  # a number of an image of 5,000 digits
+        ("PASCAL3D+ CAD/chair.mat", 1000002),  # a triangle's corner that is not finite
+        ("PASCAL3D+ Annotations/chair_pascal/1.mat", 1008358),  # an angle of 1e300 degrees
+    ],
+)
+def test_files_that_once_failed(name: str, seed: int, tmp_path: Path) -> None:
+    mutations.MutatedFiles(readers.FORMATS[name], tmp_path).run(seed)

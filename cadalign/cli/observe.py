@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -27,6 +27,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.images import photo_size, write_image
 from cadalign.io.observation import Observation, with_lens
+from cadalign.io.observed_image import ObservedImage
 
 # Arguments of the library's functions, and their names on the command line.
 _FLAGS = {"image": "--image", "number": "--object", "sigma_from_scores": "--sigma"}
@@ -67,9 +68,14 @@ class Observe(CameraOptions, EvidenceOptions):
     every: bool = False
     """Write an observation of every object of every photo, instead of one; --image is then the
     photos' folder."""
+    tracks: bool = False
+    """With --every, write one observation of each track, whose views are its photos: its pose is
+    another one in each, its stretch is the same. Masks are left out."""
 
     def run(self) -> int:
         """Write the observation, or those of all objects; returns the exit code."""
+        if self.tracks and not self.every:
+            raise InputError("given without --every", where="--tracks", fix="give both")
         objects = read_image_keypoints(self.keypoints)
         model = ModelKeypoints.load(self.model_keypoints)
         if self.every:
@@ -89,8 +95,28 @@ class Observe(CameraOptions, EvidenceOptions):
         self, found: ImageKeypoints, model: ModelKeypoints, image: Path | None, out: Path
     ) -> Observation:
         """Write the observation of one object in a photo."""
+        observation = self._joined(found, model, image)
+        make_folder(out.parent)
+        drawn = None if "mask" in self.given else self._write_mask(observation, found, out)
+        observation = self.add_to(observation, mask=drawn)
+        observation.save(out)
+        return observation
+
+    def observe_track(
+        self, found: Sequence[ImageKeypoints], model: ModelKeypoints, out: Path
+    ) -> None:
+        """Write the observation of one object in several photos of a folder."""
+        views = [self._joined(each, model, _photo(each, self.image)) for each in found]
+        first, *others = [self.add_to(each) for each in views]
+        names = [each.name for each in fields(ObservedImage)]
+        images = [ObservedImage(**{name: getattr(each, name) for name in names}) for each in others]
+        replace(first, others=tuple(images), object_name=found[0].track).save(out)
+
+    def _joined(
+        self, found: ImageKeypoints, model: ModelKeypoints, image: Path | None
+    ) -> Observation:
         with named_as_flags(self, others=_FLAGS):
-            observation = join_keypoints(
+            return join_keypoints(
                 found,
                 model,
                 self._camera(found, image),
@@ -99,11 +125,6 @@ class Observe(CameraOptions, EvidenceOptions):
                 ignore_unknown=self.ignore_unknown,
                 sigma_from_scores=self.sigma if self.weigh else None,
             )
-        make_folder(out.parent)
-        drawn = None if "mask" in self.given else self._write_mask(observation, found, out)
-        observation = self.add_to(observation, mask=drawn)
-        observation.save(out)
-        return observation
 
     def _write_mask(
         self, observation: Observation, found: ImageKeypoints, out: Path
@@ -164,23 +185,29 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
     make_folder(folder)
     console = new_console()
     failed = 0
+    groups = _by_track(objects) if command.tracks else [[each] for each in objects]
+    names = _slugs([each[0].track for each in groups]) if command.tracks else _names(objects)
     shown = track(
-        list(zip(objects, _names(objects), strict=True)),
+        list(zip(groups, names, strict=True)),
         "observing",
         console=console,
         transient=True,
         disable=not console.is_terminal,
     )
     for found, name in shown:
+        out = folder / f"{name}.json"
         try:
-            photo = _photo(found, command.image)
-            command.observe(found, model, photo, folder / f"{name}.json")
+            if command.tracks:
+                command.observe_track(found, model, out)
+            else:
+                command.observe(found[0], model, _photo(found[0], command.image), out)
         except CadalignError as error:
             failed += 1
             console.print(f"left out: {name}: {error}", markup=False)
-    text = f"{len(objects) - failed} of {len(objects)} objects: {folder}"
+    kind = "tracks" if command.tracks else "objects"
+    text = f"{len(groups) - failed} of {len(groups)} {kind}: {folder}"
     new_console(stderr=False).print(text, markup=False)
-    if failed == len(objects):
+    if failed == len(groups):
         return 1
     return 3 if failed else 0
 
@@ -193,9 +220,22 @@ def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:
     return path if path.exists() else None
 
 
+def _by_track(objects: Sequence[ImageKeypoints]) -> list[list[ImageKeypoints]]:
+    """The objects of each track; those without are one."""
+    tracks: dict[str | None, list[ImageKeypoints]] = {}
+    for each in objects:
+        tracks.setdefault(each.track, []).append(each)
+    return list(tracks.values())
+
+
 def _names(objects: Sequence[ImageKeypoints]) -> list[str]:
     """File names of objects: the photo's, numbered where it has several."""
-    stems = [re.sub(r"[^\w.-]+", "_", Path(found.image or "").stem) or "photo" for found in objects]
+    return _slugs([Path(found.image or "").stem or "photo" for found in objects])
+
+
+def _slugs(texts: Sequence[str | None]) -> list[str]:
+    """File names of texts, numbered where several are the same."""
+    stems = [re.sub(r"[^\w.-]+", "_", text or "track") for text in texts]
     counts, seen = Counter(stems), Counter[str]()
     names = []
     for stem in stems:

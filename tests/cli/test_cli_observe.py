@@ -360,3 +360,36 @@ def test_malformed_mask_is_refused(masked: Path, capsys: pytest.CaptureFixture[s
     assert line.startswith(
         f"{masked / 'found.json'}: [0]: segmentation.counts: the runs have 3 pixels, "
     )
+
+
+def test_the_photos_of_a_track_are_views_of_one_observation(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One stretch, and a pose for each photo; keypoints of other tracks are other observations."""
+    rng = np.random.default_rng(7)
+    lines = ["image,track,name,u,v"]
+    poses = [Alignment(random_rotation(rng), [0.1, -0.2, 4.0], ALIGNMENT.scale) for _ in range(3)]
+    for number, (track, pose) in enumerate(zip(("1", "1", "car b"), poses, strict=True)):
+        pixels = TRUE.project(pose.apply(POINTS_3D)) + rng.normal(scale=0.3, size=(24, 2))
+        rows = zip(NAMES, pixels, strict=True)
+        lines += [f"{number}.jpg,{track},{name},{u},{v}" for name, (u, v) in rows]
+    (folder / "found.csv").write_text("\n".join(lines))
+    (folder / "camera.json").write_text(json.dumps(TRUE.to_dict()))
+    command = observing(folder, "--every", "--tracks", "--camera", str(folder / "camera.json"))
+    command[1] = str(folder / "found.csv")
+    assert main(command) == 0
+    out = folder / "found_observations"
+    assert "2 of 2 tracks" in capsys.readouterr().out
+    assert sorted(path.name for path in out.iterdir()) == ["1.json", "car_b.json"]
+    observation = Observation.load(out / "1.json")
+    assert [len(view.points_2d) for view in observation.views] == [24, 24]
+    assert main(["fit", str(out / "1.json"), "--no-picture"]) == 0
+    result = Result.load(out / "1_fit" / "fit.json")
+    for view, pose in zip(result.views, poses, strict=False):
+        np.testing.assert_allclose(view.alignment.scale, pose.scale, rtol=0.03)
+        np.testing.assert_allclose(view.alignment.rotation, pose.rotation, atol=0.02)
+
+
+def test_tracks_are_for_all_objects(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refusal_line(capsys, *observing(folder, "--tracks"))
+    assert "--tracks: given without --every; give both" in line

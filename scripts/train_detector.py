@@ -8,7 +8,8 @@ the mean shape, rigid, with stretch, and through the alignment of the learned sh
 Monte-Carlo loss over the posterior. All are judged on renders of models that they have not seen, by
 `cadalign.align` with the learned shape and sigmas from the spread of the heat maps. Writes
 detector/table.json, the keypoints of some images in the folder seen, car.shape and detector.noise,
-which `cadalign fit` takes.
+which `cadalign fit` takes, network.pt, and confusion.png: which keypoints the last network takes
+for others.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 import cadalign
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import ImageKeypoints, sample_models
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.io.files import write_json
@@ -129,10 +131,14 @@ def stretched_mean(in_camera: Any, rotation: Any, mean: Any) -> PoseBatch:
 
 
 def judged(
-    detector: KeypointDetector, views: RenderedViews, shape: cadalign.ShapeModel
+    detector: KeypointDetector,
+    views: RenderedViews,
+    shape: cadalign.ShapeModel,
+    mirrored: IntArray,
 ) -> dict[str, float]:
     """Errors on views: keypoints, rotation, box, flips of the object, coverage of the sigmas."""
     pixels, sigma = detector.predict(views)
+    nearest = nearest_keypoints(pixels, views.points_2d)
     lengths = np.linalg.norm(pixels - views.points_2d, axis=2)
     turns, ious = [], []
     for b in range(len(views)):
@@ -144,6 +150,7 @@ def judged(
     return {
         "keypoints, px": float(np.median(lengths)),
         "within 2.45 sigma, %": 100 * float((lengths < 2.4477 * sigma).mean()),
+        "left as right, %": 100 * float((nearest == mirrored).mean()),
         "rotation, deg": float(np.median(turns)),
         "90 %": float(np.percentile(turns, 90)),
         "flipped, %": 100 * float(np.mean(np.array(turns) > _FLIPPED)),
@@ -151,10 +158,58 @@ def judged(
     }
 
 
+def mirror_images(mean: FloatArray) -> IntArray:
+    """Numbers (k,) of keypoints (k, 3) on the other side; -1 of those amid the object."""
+    gaps = np.linalg.norm(mean[:, None] * [-1, 1, 1] - mean, axis=2)
+    partner = gaps.argmin(axis=1)
+    return np.where(partner == np.arange(len(mean)), -1, partner)
+
+
+def nearest_keypoints(pixels: FloatArray, true: FloatArray) -> IntArray:
+    """Numbers (V, k) of the true keypoints (V, k, 2) that are nearest to the found ones."""
+    gaps = np.linalg.norm(pixels[:, :, None] - true[:, None], axis=3)
+    return np.asarray(gaps.argmin(axis=2))
+
+
+def draw_confusion(
+    path: Path, detector: KeypointDetector, views: RenderedViews, mirrored: IntArray
+) -> None:
+    """Draw which true keypoints the found ones lie at, and the views with most exchanged sides."""
+    from matplotlib.figure import Figure
+
+    pixels, _ = detector.predict(views)
+    nearest = nearest_keypoints(pixels, views.points_2d)
+    count = len(mirrored)
+    shares = np.stack([(nearest == k).mean(axis=0) for k in range(count)], axis=1)
+    figure = Figure(figsize=(13, 6), layout="constrained")
+    left, right = figure.subfigures(1, 2, width_ratios=[1, 1.1])
+    axes = left.subplots()
+    shown = axes.imshow(100 * shares, cmap="Blues", vmin=0, vmax=100)
+    known = np.flatnonzero(mirrored >= 0)
+    axes.plot(mirrored[known], known, "s", mfc="none", mec="tab:red", ms=10, label="other side")
+    axes.set(xlabel="nearest true keypoint", ylabel="found keypoint", xticks=range(count))
+    axes.set(yticks=range(count), xticklabels=views.ids, yticklabels=views.ids)
+    axes.set_title("Share of views [%]")
+    axes.legend(loc="upper right", fontsize=8)
+    left.colorbar(shown, ax=axes, shrink=0.8)
+    worst = np.argsort(-(nearest == mirrored).sum(axis=1), kind="stable")[:6]
+    for axes, view in zip(right.subplots(2, 3).ravel(), worst, strict=True):
+        axes.imshow(views.images[view])
+        for found, true in zip(pixels[view], views.points_2d[view], strict=True):
+            axes.plot(*np.transpose([true, found]), color="white", lw=0.8)
+        axes.plot(*views.points_2d[view].T, "o", color="tab:green", ms=4, label="true")
+        axes.plot(*pixels[view].T, "x", color="tab:red", ms=4, label="found")
+        axes.set_title(f"{(nearest[view] == mirrored).sum()} exchanged sides", fontsize=9)
+        axes.set_axis_off()
+    right.axes[0].legend(loc="lower left", fontsize=7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
+
+
 def main(options: TrainOptions) -> None:
     """Train, fine-tune in all ways, and write the table."""
     torch.set_num_threads(options.threads)
-    begun = time.perf_counter()
+    begun, spent = time.perf_counter(), time.process_time()
     models = list(sample_models(per_category=options.models, categories=[options.category]))
     common = set.intersection(*({k.semantic_id for k in each.keypoints} for each in models))
     ids = tuple(sorted(common))
@@ -169,9 +224,10 @@ def main(options: TrainOptions) -> None:
     )
     print(f"{len(ids)} keypoints, views rendered: {time.perf_counter() - begun:.0f} s", flush=True)
     first = KeypointDetector.untrained(len(ids), seed=options.seed)
-    rows = {"untrained": judged(first, held_out, shape)}
+    mirrored = mirror_images(np.array(shape.components[0].mean[: len(ids)]))
+    rows = {"untrained": judged(first, held_out, shape, mirrored)}
     train(first, views, steps=options.steps, batch=options.batch, seed=options.seed)
-    rows["trained"] = judged(first.calibrated(spare), held_out, shape)
+    rows["trained"] = judged(first.calibrated(spare), held_out, shape, mirrored)
     print(f"trained: {time.perf_counter() - begun:.0f} s", flush=True)
     last = first
     for name, pose_loss in pose_losses(views, shape).items():
@@ -187,9 +243,11 @@ def main(options: TrainOptions) -> None:
             seed=options.seed + 1,
         )
         last = last.calibrated(spare)
-        rows[f"+ {name}"] = judged(last, held_out, shape)
+        rows[f"+ {name}"] = judged(last, held_out, shape, mirrored)
         print(f"{name}: {time.perf_counter() - begun:.0f} s", flush=True)
+    print(f"{time.process_time() - spent:.0f} s of processor time", flush=True)
     show(rows)
+    draw_confusion(options.out / "confusion.png", last, held_out, mirrored)
     write(options.out, rows, last, spare, held_out, shape)
 
 
@@ -214,6 +272,7 @@ def write(
     """Write the table, and keypoints with their noise and shape for `cadalign fit`."""
     (folder / "seen").mkdir(parents=True, exist_ok=True)
     write_json(folder / "table.json", rows)
+    torch.save(detector.network.state_dict(), folder / "network.pt")
     shape.save(folder / f"{shape.category}.shape")
     pixels, sigma = detector.predict(spare)
     seen = [

@@ -21,6 +21,7 @@ from cadalign.io.video import frame_numbers
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Columns, Row
 
+_MOST_FRAMES = 100_000  # of a track, those without a detection included
 COLUMNS: Columns = (
     *(("track", str), ("frame", int), ("image", str), ("time", float)),
     *((name, float) for name in ("tx", "ty", "tz", "qw", "qx", "qy", "qz")),
@@ -74,7 +75,8 @@ def tracks_of(
     Raises
     ------
     DataError
-        If two objects of one frame have the same track, or the keypoints are none of the model's.
+        If two objects of one frame have the same track, the keypoints are none of the model's, or
+        frames are too far apart to have numbers.
     InputError
         If no camera is known.
     """
@@ -96,6 +98,10 @@ def tracks_of(
         if known is None:
             raise InputError("tracks need one", where="camera", fix="give its file")
         frames = range(min(own), max(own) + 1)
+        if len(frames) > _MOST_FRAMES:
+            what = f"track {quote(name)} goes from frame {frames[0]} to {frames[-1]}"
+            fix = "name images by the numbers of their frames, not by times"
+            raise DataError(what, where=own[frames[0]].source, fix=fix)
         views = tuple(
             _view(own.get(k), known, ids, sigma=sigma, min_score=min_score, time=k / rate)
             for k in frames

@@ -188,3 +188,17 @@ def test_two_objects_of_one_track_in_an_image_are_refused(
     given = command(folder)
     given[1] = str(tmp_path / "found.json")
     assert "a second object of track '3' in image 'frame_0000.png'" in refusal_line(capsys, *given)
+
+
+def test_times_are_no_numbers_of_frames(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = json.loads((video[0] / "found.json").read_text())
+    for k, image in enumerate(found["images"]):
+        image["file_name"] = f"{1403636579763555584 + 50_000_000 * k}.png"
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    given = command(video[0])
+    given[1] = str(tmp_path / "found.json")
+    line = refusal_line(capsys, *given)
+    assert "track '3' goes from frame 1403636579763555584 to " in line
+    assert "name images by the numbers of their frames, not by times" in line

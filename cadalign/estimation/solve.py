@@ -356,10 +356,9 @@ def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
 
 
 def _solve_baseline(problems: Problems, options: FitOptions, points: FloatArray) -> Solutions:
-    if options.method == "epnp":
-        from cadalign.solvers.opencv import epnp as solver  # takes longer to import than the rest
-    else:
-        from cadalign.solvers.paper import aepnp_paper as solver
+    from cadalign.solvers.baselines import aepnp_paper, epnp
+
+    solver = epnp if options.method == "epnp" else aepnp_paper
     rays, errors = _rays(problems)
     poses = np.zeros((len(problems), 1, POSE_SIZE))
     for b in range(len(problems)):

@@ -205,7 +205,7 @@ def method_dict(name: str) -> dict[str, Any]:
 
 
 def line_dict(key: str, label: str, color: str) -> dict[str, Any]:
-    """What stands for a method on the page, drawn as solid lines of a colour (#rrggbb)."""
+    """Mark of a method on the page, drawn as solid lines of a colour (#rrggbb)."""
     return {
         "key": key,
         "label": label,

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 from cadalign.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from cadalign.solvers.baselines import aepnp_paper, epnp
     from cadalign.solvers.linear import aepnp
     from cadalign.solvers.minimal import ap4p
-    from cadalign.solvers.opencv import epnp
-    from cadalign.solvers.paper import aepnp_paper
 
 __all__ = ["aepnp", "aepnp_paper", "ap4p", "epnp"]
 

@@ -127,7 +127,7 @@ class _Parts(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Where the equations are evaluated; the principal point is ``shift`` (2,) off [px]."""
+    """Place of the equations' evaluation; the principal point is ``shift`` (2,) off [px]."""
 
     evidence: Evidence
     row: FloatArray

@@ -215,7 +215,7 @@ def _align_all(
     if is_mask_alone(model, views, inits):
         from cadalign.estimation.contours.proposals import minima_of_mask  # with OpenCV and embree
 
-        minima, iterations, hypotheses, mistake = minima_of_mask(problem, cast(Model, model))
+        minima, iterations, hypotheses, mistake = minima_of_mask(problem, model)
     else:
         problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
         mistake = joint_mistake(problem, minima[0], ransac) if minima else None

@@ -108,14 +108,15 @@ def with_box(
     """Evidence and state whose box has those faces that outermost keypoints determine at these.
 
     Such a face varies with its keypoint. The box remains the linear one where measured distances
-    determine it.
+    determine it, and without keypoints.
     """
     shape = evidence.shape
-    if len(evidence.offsets.value) or not len(shape.modes):
+    rows = np.unique(evidence.sightings.point)
+    rows = rows[rows < keypoints]
+    if len(evidence.offsets.value) or not len(shape.modes) or not len(rows):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
-    rows = np.unique(evidence.sightings.point)
-    bounds, own = placed_box(points, rows[rows < keypoints], margins)
+    bounds, own = placed_box(points, rows, margins)
     axes = np.arange(3)
     mean, modes = shape.mean.copy(), shape.modes.copy()
     displacements = state.displacements.copy()

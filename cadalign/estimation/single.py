@@ -56,8 +56,8 @@ def is_single(model: object, views: Sequence[View]) -> bool:
 
 
 def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignment | None]) -> bool:
-    """True where nothing but the mask of one view tells the pose of an exact model with a mesh."""
-    if not isinstance(model, Model) or model.shape_sigma is not None or model.mesh is None:
+    """True where nothing but the mask of one view tells the pose of a model with a mesh."""
+    if isinstance(model, Model) and model.mesh is None:
         return False
     view = views[0]
     is_alone = len(views) == 1 and inits[0] is None and not len(view.keypoint_ids)

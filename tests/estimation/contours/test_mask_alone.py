@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Mesh, Model, Symmetry, View, align
-from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.silhouettes import atlas_of, resembling_poses
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
@@ -93,11 +92,23 @@ class TestOwnModel:
         assert min(errors) < 1.0
 
 
-def test_a_similar_model_needs_a_start() -> None:
-    truth = posed(0)
-    model = Model(points_3d=body().vertices, mesh=body(), shape_sigma=0.05)
-    with pytest.raises(DegenerateError, match="give at least 3 keypoints in one view, or `init`"):
-        align(model, View(CAMERA, mask=mask_of(body(), truth)))
+class TestSimilarModel:
+    wide = Mesh(body().vertices * [1.0, 1.05, 0.95], body().faces)
+    model = Model(points_3d=wide.vertices, mesh=wide, shape_sigma=0.03)
+
+    def test_is_proposed(self) -> None:
+        truth = posed(1)
+        found = align(self.model, View(CAMERA, mask=mask_of(body(), truth)))
+        poses = [found.alignment, *(each.alignment for each in found.alternatives)]
+        assert min(rotation_error(est=each, gt=truth) for each in poses) < 6.0
+        assert any("is a proposal" in text for text in found.warnings)
+
+    def test_from_a_start(self) -> None:
+        truth = posed(1)
+        turn = rotation_from_vector(np.array([0.1, 0.05, -0.1]))
+        start = Alignment(turn @ truth.rotation, truth.translation, np.ones(3))
+        found = align(self.model, View(CAMERA, mask=mask_of(body(), truth)), init=start)
+        assert rotation_error(est=found.alignment, gt=truth) < 6.0
 
 
 class TestSilhouettes:

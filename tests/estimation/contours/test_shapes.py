@@ -12,7 +12,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import InputError
 from cadalign.geometry.box import Box
 from cadalign.metrics import box_iou_up_to_scale
-from cadalign.render import Scene, cast_geometry, sample_view
+from cadalign.render import Scene, Viewpoint, cast_geometry, sample_view
 from cadalign.shapes.examples import Example, examples_of
 from cadalign.shapes.warp import linear_warp, warp_mesh
 
@@ -124,3 +124,34 @@ def test_a_linear_warp_is_that_of_the_mesh(sample_root: Path) -> None:
     step = np.random.default_rng(1).normal(0, 0.01, points.shape)
     moved = warp.apply(target + step, bounds) - warp.apply(target, bounds)
     assert np.allclose(moved, warp.derivative(step, np.zeros((2, 3))), atol=1e-12)
+
+
+class TestLearnedWithoutAnnotatedMask:
+    def shown(self, model: AnnotatedModel, seed: int) -> tuple[Viewpoint, np.ndarray]:
+        scene = Scene(model.load_mesh())
+        rng = np.random.default_rng(seed)
+        shown = sample_view(scene, model.keypoints.xyz, CAMERA, rng=rng, min_visible=6, roll=10.0)
+        return shown, cast_geometry(scene, CAMERA, shown.cam_from_model).mask
+
+    def test_a_mask_alone_gives_proposals(self, bottles: tuple[AnnotatedModel, ...]) -> None:
+        shown, mask = self.shown(bottles[1], 1)
+        found = align(learned(bottles[4:]), View(CAMERA, mask=mask))
+        poses = [found.alignment, *(each.alignment for each in found.alternatives)]
+        axes = np.array([pose.rotation[:, 1] for pose in poses])
+        cosines = np.abs(axes @ shown.cam_from_model.rotation[:, 1])
+        assert np.degrees(np.arccos(min(cosines.max(), 1.0))) < 8.0  # upright or upside down
+        assert any("is a proposal" in text for text in found.warnings)
+
+    def test_a_photo_counts_beside_clicks(self, bottles: tuple[AnnotatedModel, ...]) -> None:
+        shown, mask = self.shown(bottles[0], 0)
+        points, ids = bottles[0].keypoints.xyz, bottles[0].keypoints.semantic_ids
+        rng = np.random.default_rng(0)
+        clicks = CAMERA.project(shown.cam_from_model.apply(points[shown.visible]))
+        clicks += rng.normal(0, 4, clicks.shape)
+        colors = np.where(mask[:, :, None], [190, 60, 50], [70, 120, 90])
+        photo = np.clip(colors + rng.normal(0, 6, colors.shape), 0, 255).astype(np.uint8)
+        view = View(CAMERA, clicks, ids=ids[shown.visible].tolist(), sigma=4.0, image=photo)
+        found = align(learned(bottles[4:8]), view)
+        (summary,) = [each for each in found.evidence if each.kind == "photo"]
+        assert summary.share is not None
+        assert summary.share > 0.5

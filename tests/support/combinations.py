@@ -406,13 +406,6 @@ def requests() -> list[Request]:
             lambda: align(learned, _seen([0, 1])),
         ),
         Request(
-            "a mask alone of a shape that is not exact, no `init`",
-            "proportions and pose explain an outline alike",
-            "views: no pose has the keypoints in front of the camera; "
-            "give at least 3 keypoints in one view, or `init`, and check which is which",
-            lambda: align(similar, View(CAMERA, mask=mask)),
-        ),
-        Request(
             "three keypoints of an exact model whose stretch is estimated",
             "8 unknowns, 6 equations",
             "points_3d: 3 keypoints are too few for 8 unknowns; "

@@ -90,8 +90,8 @@ class PhotosOptions(FunctionOptions, KeypointOptions):
     methods: tuple[str, ...] = ()
     """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
     keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
-    rigid+mask or similar+depth+gravity; and truth. By default the first five, shape where there is
-    one, and the evidence that the data have."""
+    rigid+mask, rigid+image (the photo itself) or similar+depth+gravity; and truth. By default the
+    first five, shape where there is one, and the evidence that the data have but the image."""
     shape: tuple[Path, ...] = ()
     """Files of `cadalign shape learn`, each for its category."""
     similar_sigma: float = 0.04

@@ -25,6 +25,7 @@ from cadalign.evaluation.photos.protocols import (
     DEPTH,
     EPNP,
     GRAVITY,
+    IMAGE,
     MASK,
     PRIOR,
     RIGID,
@@ -50,6 +51,7 @@ from cadalign.shapes.model import ShapeModel
 
 ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
+_OUTLINED = frozenset({MASK, IMAGE})  # evidence about the model's outline, which wants a mesh
 _RIM = 2  # width of a mask's rim [px]
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
@@ -243,7 +245,7 @@ def estimate_object(method: str, instance: PhotoInstance) -> PhotoEstimate:
         return _of_model(found.alignment, sighting)
     if base == SHAPE:
         return _of_shape(sighting, instance.shapes, evidence)
-    model = _model(base, sighting, instance.similar_sigma, with_mesh=MASK in evidence)
+    model = _model(base, sighting, instance.similar_sigma, with_mesh=bool(_OUTLINED & evidence))
     result = align(model, _view(sighting, evidence))
     return _of_model(result.alignment, sighting, result)
 
@@ -337,6 +339,10 @@ def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(No
         if photo.up is None:
             raise LeftOutError("the direction of gravity is not known")
         given |= {"up": photo.up, "up_sigma_deg": _UP_SIGMA_DEG}
+    if IMAGE in evidence:
+        if photo.image is None:
+            raise LeftOutError("the image is not there")
+        given["image"] = photo.read_image()
     names = tuple(np.array(sighting.names)[rows].tolist())
     pixels = sighting.points_2d[rows]
     return View(sighting.camera, pixels, ids=names, sigma=sighting.sigma, **given)
@@ -358,7 +364,7 @@ def _of_shape(
     shape = next((each for each in shapes if each.category == category), None)
     if shape is None:
         raise LeftOutError(f"there is no shape model of {category}")
-    if MASK in evidence:
+    if _OUTLINED & frozenset(evidence):
         raise LeftOutError("a shape model has no mesh for the mask")
     if GRAVITY in evidence and shape.up_axis is None:
         raise LeftOutError("the shape model has no up axis for gravity")

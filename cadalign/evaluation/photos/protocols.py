@@ -29,8 +29,8 @@ SIMULATED = "simulated"
 EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
 TRUTH = "truth"
 BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
-MASK, DEPTH, GRAVITY = "mask", "depth", "gravity"
-EVIDENCE = (MASK, DEPTH, GRAVITY)
+MASK, DEPTH, GRAVITY, IMAGE = "mask", "depth", "gravity", "image"
+EVIDENCE = (MASK, DEPTH, GRAVITY, IMAGE)
 
 
 def parts_of(method: str) -> tuple[str, frozenset[str]]:

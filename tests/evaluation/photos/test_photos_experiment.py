@@ -168,6 +168,11 @@ class TestMethods:
         assert error["rigid+mask"] < error["rigid"]
         assert all(row["status"] == "ok" for row in found.results.to_pylist())
 
+    def test_a_photo_is_evidence(self, tmp_path: Path) -> None:
+        root = write_bop(tmp_path / "data")
+        found = done(root, tmp_path / "run", methods=("rigid", "rigid+image"), max_photos=1)
+        assert {row["status"] for row in found.results.to_pylist()} == {"ok"}
+
     def test_what_an_object_lacks_is_left_out(self, tmp_path: Path) -> None:
         root = write_bop(tmp_path / "data", depth=False)
         (root / "test/000001/mask_visib/000001_000000.png").unlink()

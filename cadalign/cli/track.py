@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from cadalign.shapes.model import ShapeModel
 
 _RATE = 30.0
+_KITTI_RATE = 10.0  # Geiger et al., "Vision meets Robotics: The KITTI Dataset", 2013
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class TrackCommand(CameraOptions):
     """Folder to write to; by default <detections>_tracks beside the detections."""
     rate: float | None = None
     """Frames in a second; an image's frame is the last number in its name. By default the video's,
-    or 30."""
+    or 30, or the 10 of KITTI's cars."""
     sigma: float = 2.0
     """Standard deviation of the keypoints [px], where the file has none."""
     min_score: float = 0.1
@@ -80,7 +81,8 @@ class TrackCommand(CameraOptions):
             for name, value in (("rate", self.rate), ("sigma", self.sigma)):
                 if value is not None and not value > 0:
                     raise InputError(f"{value:g} is not positive", where=name)
-            rate = self.rate or (video.rate if video else None) or _RATE
+            usual = _RATE if self.shape else _KITTI_RATE
+            rate = self.rate or (video.rate if video else None) or usual
             tracks = tracks_of(
                 objects,
                 self._camera(objects, video),

@@ -81,8 +81,7 @@ class TrackCommand(CameraOptions):
             for name, value in (("rate", self.rate), ("sigma", self.sigma)):
                 if value is not None and not value > 0:
                     raise InputError(f"{value:g} is not positive", where=name)
-            usual = _RATE if self.shape else _KITTI_RATE
-            rate = self.rate or (video.rate if video else None) or usual
+            rate = self._rate(video)
             tracks = tracks_of(
                 objects,
                 self._camera(objects, video),
@@ -102,6 +101,11 @@ class TrackCommand(CameraOptions):
         if not found:
             return NOTHING_WORKED
         return SOME_FAILED if failures else SUCCESS
+
+    def _rate(self, video: Video | None) -> float:
+        """Frames in a second: as given, the video's, or what is usual for the detections."""
+        usual = _RATE if self.shape else _KITTI_RATE
+        return self.rate or (video.rate if video else None) or usual
 
     def _read_shape(self) -> ShapeModel:
         from cadalign.datasets.photos.kitti_keypoints import car_shape
@@ -191,10 +195,9 @@ class TrackCommand(CameraOptions):
             failures=failures,
         )
         if video is not None:
-            rate = self.rate or video.rate or _RATE
             with waiting("drawing"):
                 drawn = draw_video(video, found, first=self.first_frame)
-                write_movie(folder / "overlay.mp4", drawn, fps=rate)
+                write_movie(folder / "overlay.mp4", drawn, fps=self._rate(video))
 
     def _settings(self) -> dict[str, str]:
         given = {

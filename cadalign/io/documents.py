@@ -210,17 +210,15 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
     if field and field[1] == "missing required":
         return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])
     if field:
-        known = sorted(each.encode_name for each in getattr(_type_at(kind, path), "fields", ()))
+        known = sorted(each.encode_name for each in _parts_at(kind, path, "fields"))
         return DataError(
             f"unknown field {quote(field[2])}",
             where=where or "top level",
             fix=f"known are {', '.join(known)}" if known else None,
         )
     if text.startswith("Invalid enum value"):
-        # A field that takes words or a record has no single list of words.
-        allowed = ", ".join(map(repr, getattr(_type_at(kind, path), "values", ())))
-        problem = f"is not one of {allowed}" if allowed else "is none of the known words"
-        return DataError(f"{quote(value)} {problem}", where=where or None)
+        allowed = ", ".join(map(repr, _parts_at(kind, path, "values")))
+        return DataError(f"{quote(value)} is not one of {allowed}", where=where or None)
     return DataError(f"{quote(value)} is not {_wanted(text)}", where=where or None)
 
 
@@ -250,8 +248,8 @@ def _wanted(text: str) -> str:
     return "a positive number" if bound[0] == " > 0.0" else f"{words} {bound[1]} {bound[2]}"
 
 
-def _type_at(kind: Any, path: str | None) -> Any:
-    """The declared type at a path; None if the path is a part of a hostile field name."""
+def _parts_at(kind: Any, path: str | None, name: str) -> list[Any]:
+    """The fields or values of the types declared at a path; none within a hostile field name."""
     kind = msgspec.inspect.type_info(kind)
     for step in _STEP.finditer((path or "$")[1:]):
         kind = _without_none(kind)
@@ -260,7 +258,8 @@ def _type_at(kind: Any, path: str | None) -> Any:
             kind = types.get(step["name"])
         else:
             kind = getattr(kind, "value_type" if step["row"] == "..." else "item_type", None)
-    return _without_none(kind)
+    kinds = kind.types if isinstance(kind, msgspec.inspect.UnionType) else (kind,)
+    return [part for each in kinds for part in getattr(each, name, ())]
 
 
 def _without_none(kind: Any) -> Any:

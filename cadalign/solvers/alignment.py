@@ -21,7 +21,7 @@ from cadalign.solvers.evidence import (
     keypoint_cost,
     scale_prior_cost,
 )
-from cadalign.solvers.linalg import cholesky, copy_into, solve_cholesky
+from cadalign.solvers.linalg import cholesky, copy_into, expected_decrease, solve_cholesky
 from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
 from cadalign.solvers.unknowns import hold_fixed, move_pose, uncenter
 
@@ -123,10 +123,7 @@ def solve_damped(equations: Equations, unknowns: int, damping: float, step: Floa
     if not cholesky(factor, unknowns, 0.0):
         return np.nan
     solve_cholesky(factor, unknowns, step)
-    expected = 0.0
-    for k in range(unknowns):
-        expected -= gradient[k] * step[k]
-    return expected
+    return expected_decrease(gradient, step, unknowns)
 
 
 @inlined

@@ -10,6 +10,7 @@ from cadalign.compile import fast_sums, inlined, kernel
 Triple = tuple[float, float, float]
 
 _COLUMNS = 32
+_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
 
 
 @inlined
@@ -145,6 +146,34 @@ def copy_into(target: FloatArray, source: FloatArray) -> None:
     """Copy a vector; ``target[:] = source`` makes Numba compile text for its error message."""
     for k in range(target.shape[0]):
         target[k] = source[k]
+
+
+@inlined
+def expected_decrease(gradient: FloatArray, step: FloatArray, size: int) -> float:
+    """The decrease of the cost that a Gauss-Newton step predicts."""
+    expected = 0.0
+    for k in range(size):
+        expected -= gradient[k] * step[k]
+    return expected
+
+
+@kernel
+def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
+    """Add damping to the diagonals of the blocks (P, k, k) and of what they share (b, b).
+
+    The floor on it holds unknowns without evidence where they are.
+    """
+    least = 1e-300
+    for p in range(blocks.shape[0]):
+        for k in range(blocks.shape[1]):
+            least = max(least, _LEAST_INFORMATION * blocks[p, k, k])
+    for k in range(border.shape[0]):
+        least = max(least, _LEAST_INFORMATION * border[k, k])
+    for p in range(blocks.shape[0]):
+        for k in range(blocks.shape[1]):
+            blocks[p, k, k] += damping * blocks[p, k, k] + least
+    for k in range(border.shape[0]):
+        border[k, k] += damping * border[k, k] + least
 
 
 @kernel

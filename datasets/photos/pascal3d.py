@@ -47,8 +47,8 @@ from cadalign.io.images import photo_size
 ANNOTATIONS = "Annotations"
 DETECTED = "annot"
 _OBSERVATIONS = "observations"
-# MATLAB counts pixels from 1.
 _MOST_VERTICES = 2**31
+# MATLAB counts pixels from 1.
 _FIRST_PIXEL = 1.0
 # The focal length, in pixels, that annotations without one were made with.
 _VIEWPORT = 3000.0

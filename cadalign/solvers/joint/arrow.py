@@ -14,7 +14,6 @@ from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
 from cadalign.solvers.linalg import factorize, invert_factor, solve_factor
 
-_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
 _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
 
@@ -123,22 +122,6 @@ def hold(arrow: Arrow, k: int) -> None:
     for m in range(arrow.border.shape[0]):
         arrow.border[k, m] = arrow.border[m, k] = 0.0
     arrow.border[k, k] = 1.0
-
-
-@kernel
-def damp(arrow: Arrow, damping: float) -> None:
-    """Add damping to the diagonal, and what holds unknowns without evidence where they are."""
-    least = 1e-300
-    for p in range(arrow.blocks.shape[0]):
-        for k in range(6):
-            least = max(least, _LEAST_INFORMATION * arrow.blocks[p, k, k])
-    for k in range(arrow.border.shape[0]):
-        least = max(least, _LEAST_INFORMATION * arrow.border[k, k])
-    for p in range(arrow.blocks.shape[0]):
-        for k in range(6):
-            arrow.blocks[p, k, k] += damping * arrow.blocks[p, k, k] + least
-    for k in range(arrow.border.shape[0]):
-        arrow.border[k, k] += damping * arrow.border[k, k] + least
 
 
 @kernel

@@ -20,7 +20,6 @@ from cadalign.solvers.joint.arrow import (
     add_products,
     clear,
     copy_arrow,
-    damp,
     decide_on_undetermined,
     factorize_arrow,
     hold,
@@ -46,6 +45,7 @@ from cadalign.solvers.joint.rows import (
     stretched_point,
     write_rows,
 )
+from cadalign.solvers.linalg import damp, expected_decrease
 from cadalign.solvers.projection import shift, turn
 from cadalign.solvers.search import (
     are_same,
@@ -144,14 +144,11 @@ def joint_cost(system: Joint, row: FloatArray) -> float:
 def _solve(system: Joint, equations: JointEquations, damping: float, step: FloatArray) -> float:
     factor = equations.factor
     copy_arrow(equations.arrow, factor)
-    damp(factor, damping)
+    damp(factor.blocks, factor.border, damping)
     if not factorize_arrow(factor):
         return np.nan
     solve_arrow(factor, equations.gradient, step)
-    expected = 0.0
-    for k in range(step.shape[0]):
-        expected -= equations.gradient[k] * step[k]
-    return expected
+    return expected_decrease(equations.gradient, step, len(step))
 
 
 @move.of(Joint)

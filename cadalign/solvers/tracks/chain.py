@@ -18,7 +18,6 @@ from cadalign.solvers.linalg import factorize, invert_factor, solve_factor
 
 STATE = 12
 """Unknowns of a frame: rotation, translation, angular and linear velocity."""
-_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
 
 
 class Chain(NamedTuple):
@@ -61,22 +60,6 @@ def copy_chain(source: Chain, target: Chain) -> None:
     target.later.ravel()[:] = source.later.ravel()
     target.border.ravel()[:] = source.border.ravel()
     target.gradient[:] = source.gradient
-
-
-@kernel
-def damp_chain(chain: Chain, damping: float) -> None:
-    """Add damping to the diagonal, and what holds unknowns without evidence where they are."""
-    least = 1e-300
-    for p in range(chain.frames.shape[0]):
-        for k in range(STATE):
-            least = max(least, _LEAST_INFORMATION * chain.frames[p, k, k])
-    for k in range(chain.border.shape[0]):
-        least = max(least, _LEAST_INFORMATION * chain.border[k, k])
-    for p in range(chain.frames.shape[0]):
-        for k in range(STATE):
-            chain.frames[p, k, k] += damping * chain.frames[p, k, k] + least
-    for k in range(chain.border.shape[0]):
-        chain.border[k, k] += damping * chain.border[k, k] + least
 
 
 @fast_sums

@@ -25,13 +25,13 @@ from cadalign.solvers.joint.reduction import (
 )
 from cadalign.solvers.joint.search import has_latent
 from cadalign.solvers.joint.system import Joint, evaluate_joint, move_joint
+from cadalign.solvers.linalg import damp, expected_decrease
 from cadalign.solvers.search import evaluate, move, refine, room_of, solve
 from cadalign.solvers.tracks.chain import (
     STATE,
     Chain,
     clear_chain,
     copy_chain,
-    damp_chain,
     empty_chain,
     factorize_chain,
     invert_chain,
@@ -196,14 +196,11 @@ def _add_anchor(anchor: Anchor, state: State, velocity: FloatArray, chain: Chain
 def _solve(system: Moving, equations: MovingEquations, damping: float, step: FloatArray) -> float:
     factor = equations.factor
     copy_chain(equations.chain, factor)
-    damp_chain(factor, damping)
+    damp(factor.frames, factor.border, damping)
     if not factorize_chain(factor):
         return np.nan
     solve_chain(factor, equations.gradient, step)
-    expected = 0.0
-    for k in range(step.shape[0]):
-        expected -= equations.gradient[k] * step[k]
-    return expected
+    return expected_decrease(equations.gradient, step, len(step))
 
 
 @move.of(Moving)

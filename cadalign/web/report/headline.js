@@ -59,17 +59,17 @@ export function headline(report) {
     { id: "results", "aria-labelledby": "results-title" },
     h("h2", { id: "results-title" }, "Results"),
     tables(report, given),
-    h(
-      "p",
-      { class: "note" },
-      h("b", { class: "best" }, "Bold on a tinted field"),
-      ` is the best of its ${given.group ?? "category"}. `,
-      given.note,
-    ),
+    h("p", { class: "note" }, given.rows.some(({ best }) => best?.length) && legend(given), given.note),
     reasons(report, given.failures ?? [], "failed"),
     reasons(report, given.skipped ?? [], "skipped"),
   );
 }
+
+/** The meaning of the marked cells. */
+const legend = ({ group }) => [
+  h("b", { class: "best" }, "Bold on a tinted field"),
+  ` is the best of its ${group ?? "category"}. `,
+];
 
 const PHONE = 700; // pixels: below, a table is scrolled, its first column staying in view
 

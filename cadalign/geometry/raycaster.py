@@ -100,7 +100,7 @@ class RayCaster:
 
     def covered(self, origin: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
         """Find the rays (n, 3) from one point that hit anything, (n,) bool."""
-        return np.asarray(self.first_faces(origin, directions) >= 0)
+        return self._engine.blocked(*self._rays(origin, directions), np.inf)
 
     def blocked(
         self, origins: FloatArray, directions: FloatArray, *, reach: float
@@ -118,6 +118,12 @@ class RayCaster:
         self, origin: FloatArray, directions: FloatArray, *, start: FloatArray | None = None
     ) -> FaceArray:
         """Find the first triangle on each ray as `first_hits` does, without its distance."""
+        return self._engine.first_faces(*self._rays(origin, directions, start))
+
+    def _rays(
+        self, origin: FloatArray, directions: FloatArray, start: FloatArray | None = None
+    ) -> tuple[SingleArray, SingleArray]:
+        """Origins and directions (n, 3) of rays for the engine, in units of the mesh's radius."""
         origin = (origin - self._center) / self._radius
         length = np.sqrt(np.einsum("nk,nk->n", directions, directions))
         unit = directions / length[:, None]
@@ -131,9 +137,7 @@ class RayCaster:
                 begin = np.maximum(begin, start * length / self._radius)
             origins = origin + begin[:, None] * unit
         unit += _NUDGE
-        return self._engine.first_faces(
-            origins.astype(np.float32, copy=False), unit.astype(np.float32)
-        )
+        return origins.astype(np.float32, copy=False), unit.astype(np.float32)
 
     def distances(self, origin: FloatArray, directions: FloatArray, face: FaceArray) -> FloatArray:
         """Measure how far rays (n, 3) from one point go to their triangles (n,); see `first_hits`.

@@ -25,7 +25,8 @@ _PRECISION = 0.01  # [px], of a rim
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
 _REACH = 2.0  # [px], between a rim and the contour that is extracted from its silhouette
 _STEP = 0.25
-_BAND = 9  # [px], about the rims, that smoothing depends on
+_BAND = 7  # [px], about the rims, that smoothing depends on
+_MARGIN = 8  # [px], about the rims: their reach, and that of smoothing
 _LEAST_COSINE = 0.3  # between rim and contour
 
 
@@ -140,16 +141,19 @@ def across_rims(contour: Contour, rims: Rims) -> FloatArray:
 
 
 class MaskImage(NamedTuple):
-    """A mask (h, w) of probabilities, and the image whose level line is its contour."""
+    """A mask (h, w) of probabilities, and where each sample of its contour lies on it, (S,) [px].
+
+    These ``crossings`` are distances along the samples' normals, NaN where there is none.
+    """
 
     inside: Image
-    level: Image
+    crossings: FloatArray
 
 
-def mask_image(mask: FloatArray | BoolArray) -> MaskImage:
-    """A mask with its smoothed image."""
+def mask_image(mask: FloatArray | BoolArray, contour: Contour) -> MaskImage:
+    """A mask with the places of its contour's samples."""
     inside = np.ascontiguousarray(mask, dtype=np.float32)
-    return MaskImage(inside, smoothed(inside))
+    return MaskImage(inside, _crossings(smoothed(inside), contour, np.zeros(len(contour.points))))
 
 
 def extraction_bias(
@@ -169,8 +173,9 @@ def extraction_bias(
     if not len(rows):
         return bias
     some, offsets = contour.taken(rows), rims.offset[rows]
-    rendered = smoothed(_rendered(caster, camera, pose, mask, some, offsets))
-    own = _crossings(rendered, some, offsets) - _crossings(mask.level, some, np.zeros(len(rows)))
+    corner, rendered = _rendered(caster, camera, pose, mask, some, offsets)
+    placed = some._replace(points=some.points - corner)
+    own = _crossings(smoothed(rendered), placed, offsets) - mask.crossings[rows]
     bias[rows] = np.nan_to_num(offsets - own)
     return np.where(np.abs(bias) < _REACH, bias, 0.0)
 
@@ -182,21 +187,25 @@ def _rendered(
     mask: MaskImage,
     contour: Contour,
     offsets: FloatArray,
-) -> Image:
-    """The model's silhouette (h, w) near its rims, the mask elsewhere."""
+) -> tuple[IntArray, Image]:
+    """The model's silhouette near its rims, the mask about them; first the corner (2,) of it."""
     height, width = mask.inside.shape
     places = np.rint(contour.points + offsets[:, None] * contour.normals).astype(int)
-    columns, rows = np.clip(places, 0, [width - 1, height - 1]).T
-    near = np.zeros((height, width), dtype=np.uint8)
+    places = np.clip(places, 0, [width - 1, height - 1])
+    corner = np.maximum(places.min(axis=0) - _MARGIN, 0)
+    right, bottom = places.max(axis=0) + _MARGIN + 1
+    rendered = mask.inside[corner[1] : bottom, corner[0] : right].copy()
+    columns, rows = (places - corner).T
+    near = np.zeros(rendered.shape, dtype=np.uint8)
     near[rows, columns] = 1
     near = np.asarray(cv2.dilate(near, np.ones((_BAND, _BAND), np.uint8)), dtype=np.uint8)
     columns, rows = cv2.findNonZero(near).reshape(-1, 2).T  # five times as fast as NumPy
-    rays, valid = camera.normalize_where_valid(np.stack([columns, rows], axis=1).astype(float))
+    pixels = np.stack([columns, rows], axis=1) + corner
+    rays, valid = camera.normalize_where_valid(pixels.astype(float))
     origin, model_from_ray = model_rays(pose)
     directions = rays @ model_from_ray[:, :2].T + model_from_ray[:, 2]
-    rendered = mask.inside.copy()
     rendered[rows, columns] = caster.covered(origin, directions) & valid
-    return rendered
+    return corner, rendered
 
 
 def _crossings(level: Image, contour: Contour, offsets: FloatArray) -> FloatArray:

@@ -170,9 +170,8 @@ def contour_view(image: int, view: View, where: str, camera: Camera | None = Non
     contour = mask_contour(mask, where)
     rays, valid = camera.normalize_where_valid(contour.points)
     slopes = np.array([[camera.fx], [camera.fy]]) * camera.distortion_jacobian(rays[valid])
-    return ViewContour(
-        image, camera, contour.taken(valid), slopes, view.mask_sigma, mask_image(mask)
-    )
+    contour = contour.taken(valid)
+    return ViewContour(image, camera, contour, slopes, view.mask_sigma, mask_image(mask, contour))
 
 
 def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:

@@ -89,13 +89,13 @@ def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observa
     visible = visible_keypoints(scene, seen.keypoints.xyz, CAMERA, pose)
     in_photo = seen.keypoints.xyz[visible]
     shared, rows, model_rows = np.intersect1d(
-        seen.keypoints.semantic_ids[visible], model.keypoints.semantic_ids, return_indices=True
+        seen.keypoints.ids[visible], model.keypoints.ids, return_indices=True
     )
     return Observation(
         points_3d=model.keypoints.xyz[model_rows],
         points_2d=CAMERA.project(pose.apply(in_photo[rows])),
         camera=CAMERA,
-        semantic_ids=shared,
+        ids=shared,
         image=photo,
         model=model.mesh_path,
         fit_options={"sigma": None},  # two chairs agree less well than pixels do

@@ -275,10 +275,8 @@ def write(
     torch.save(detector.network.state_dict(), folder / "network.pt")
     shape.save(folder / f"{shape.category}.shape")
     pixels, sigma = detector.predict(spare)
-    seen = [
-        ImageKeypoints(p, 1 / s, semantic_ids=spare.ids) for p, s in zip(pixels, sigma, strict=True)
-    ]
-    true = [ImageKeypoints(p, semantic_ids=spare.ids) for p in spare.points_2d]
+    seen = [ImageKeypoints(p, 1 / s, ids=spare.ids) for p, s in zip(pixels, sigma, strict=True)]
+    true = [ImageKeypoints(p, ids=spare.ids) for p in spare.points_2d]
     noise = cadalign.calibrate_detector(seen, true)
     noise.save(folder / "detector.noise")
     print(noise)
@@ -288,7 +286,7 @@ def write(
             "camera": views.camera.to_dict(),
             "shape": f"../{shape.category}.shape",
             "keypoints": [
-                {"semantic_id": name, "uv": uv, "confidence": 1 / s}
+                {"semantic_id": name, "uv": uv, "score": 1 / s}
                 for name, uv, s in zip(views.ids, p.tolist(), sigmas.tolist(), strict=True)
             ],
         }

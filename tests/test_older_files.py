@@ -213,9 +213,9 @@ def test_observation_of_a_detector() -> None:
     folder, observation = FOLDER / "observations", observed("detected.json")
     assert observation.camera.distortion == (-0.2, 0.05, 0.001, -0.002)
     np.testing.assert_allclose(observation.sigma, np.linspace(0.3, 1.0, 12))
-    np.testing.assert_allclose(observation.confidences, np.linspace(0.2, 0.97, 12))
-    assert observation.semantic_ids is not None
-    assert observation.semantic_ids.tolist() == list(range(3, 15))
+    np.testing.assert_allclose(observation.scores, np.linspace(0.2, 0.97, 12))
+    assert observation.ids is not None
+    assert observation.ids.tolist() == list(range(3, 15))
     assert observation.names == tuple(f"point {row}" for row in range(12))
     assert (observation.image, observation.model) == (folder / "photo.png", folder / "box.obj")
     assert observation.object_name == "crate"
@@ -347,7 +347,7 @@ def test_library() -> None:
             model = library[category, f"{category}_{number}"]
             xyz = POINTS + rng.normal(0, 0.05, POINTS.shape)
             np.testing.assert_allclose(model.xyz, xyz, atol=1e-6)
-            assert model.semantic_ids.tolist() == list(range(12))
+            assert model.ids.tolist() == list(range(12))
             np.testing.assert_allclose(model.bounds, [[-0.5, -0.4, -0.3], [0.5, 0.4, 0.3]])
             mesh = Path("/models/box.obj") if number == 0 else None
             assert model.mesh_path == mesh

@@ -24,7 +24,7 @@ class Pair:
     uv: Pixel | None = None  # the photo half [px]
     keypoint: int | None = None  # the model half: a semantic id
     sigma: float | None = None  # of ``uv`` [px], if the observation file gives one
-    confidence: float | None = None  # in the observation file
+    score: float | None = None  # in the observation file
     depth: float | None = None  # in the observation file [model units]
 
     @property

@@ -32,11 +32,8 @@ from cadalign.estimation.result import Result
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import (
     Document,
-    Labelled,
-    NotNegative,
     PathText,
     Point2,
-    Positive,
     convert,
     in_file,
     path_from,
@@ -47,6 +44,7 @@ from cadalign.io.documents import (
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
+from cadalign.io.observation_file import SeenKeypoint
 from cadalign.io.observed_image import ObservedImage
 
 logger = logging.getLogger("cadalign")
@@ -58,15 +56,13 @@ _OF_THE_OBJECT = (
 )  # fields that are not of one image
 
 
-class _Half(Labelled, kw_only=True):
+class _Half(SeenKeypoint, kw_only=True):
     """Pair with only the photo half or the model half, or both of which are of no use to a fit."""
 
     uv: Point2 | None = None
-    sigma: Positive | None = None
-    confidence: NotNegative | None = None
-    depth: Positive | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.uv is None and self.semantic_id is None:
             raise InputError("uv and semantic_id are both missing", fix="give one of them")
 
@@ -295,7 +291,7 @@ def _written_half(pair: Pair) -> dict[str, Any]:
         "semantic_id": pair.keypoint,
         "uv": None if pair.uv is None else list(pair.uv),
         "sigma": pair.sigma,
-        "confidence": pair.confidence,
+        "score": pair.score,
         "depth": pair.depth,
     }
     return {name: value for name, value in fields.items() if value is not None}
@@ -315,7 +311,7 @@ def _with_halves(
         if half.uv is None and keypoint is None:
             continue
         number = document.next_number
-        pair = Pair(number, half.uv, keypoint, half.sigma, half.confidence, half.depth)
+        pair = Pair(number, half.uv, keypoint, half.sigma, half.score, half.depth)
         document = document.append(pair)
     return document
 
@@ -324,7 +320,7 @@ def _document_of(
     observation: ObservedImage, registry: KeypointRegistry, tolerance: float
 ) -> AnnotationDocument:
     document = AnnotationDocument()
-    ids, names = observation.semantic_ids, observation.names
+    ids, names = observation.ids, observation.names
     for row, (xyz, uv) in enumerate(
         zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)
     ):
@@ -338,7 +334,7 @@ def _document_of(
             uv=tuple(uv),
             keypoint=_registered(point, registry, tolerance, document.keypoints),
             sigma=_entry(observation.sigma, row),
-            confidence=_entry(observation.confidences, row),
+            score=_entry(observation.scores, row),
             depth=_entry(observation.depths, row),
         )
         document = document.append(pair)

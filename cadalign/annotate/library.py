@@ -61,11 +61,9 @@ class ModelChoice:
         )
 
     @cached_property
-    def semantic_ids(self) -> frozenset[int]:
+    def ids(self) -> frozenset[int]:
         """Semantic ids of the models' keypoints."""
-        return frozenset(
-            number for model in self._models() for number in model.semantic_ids.tolist()
-        )
+        return frozenset(number for model in self._models() for number in model.ids.tolist())
 
     def model(self, key: ModelKey) -> LibraryModel:
         """Find a model that can be chosen; raises InputError if there is none with a mesh."""
@@ -86,8 +84,8 @@ class ModelChoice:
         """Semantic ids that are the library's on a mesh: all of them on one of another source."""
         key = self.key_of(mesh)
         if key is None:
-            return self.semantic_ids
-        return frozenset(self.library[key].semantic_ids.tolist())
+            return self.ids
+        return frozenset(self.library[key].ids.tolist())
 
     def keypoints_of(self, mesh: Path) -> tuple[ModelKeypoint, ...]:
         """The keypoints that the library has for a mesh file; none for another file."""
@@ -97,9 +95,7 @@ class ModelChoice:
         model = self.library[key]
         return tuple(
             ModelKeypoint(f"keypoint {number}", (x, y, z), number)
-            for number, (x, y, z) in zip(
-                model.semantic_ids.tolist(), model.xyz.tolist(), strict=True
-            )
+            for number, (x, y, z) in zip(model.ids.tolist(), model.xyz.tolist(), strict=True)
         )
 
     def first_model(self, observations: Iterable[Path]) -> Path:
@@ -111,7 +107,7 @@ class ModelChoice:
         having = [model for model in self._models() if model.mesh_path is not None]
         if not having:
             raise InputError("none of its models has a mesh", where="--library")
-        best = max(having, key=lambda model: len(model.semantic_ids))  # the first of several
+        best = max(having, key=lambda model: len(model.ids))  # the first of several
         assert best.mesh_path is not None
         return best.mesh_path
 

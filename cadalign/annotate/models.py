@@ -59,9 +59,9 @@ class KeypointRegistry:
     def __contains__(self, semantic_id: object) -> bool:
         return semantic_id in self._points
 
-    def xyz(self, semantic_ids: Iterable[int]) -> FloatArray:
+    def xyz(self, ids: Iterable[int]) -> FloatArray:
         """Positions (k, 3) of some keypoints [model units]."""
-        return np.array([self[number].xyz for number in semantic_ids], dtype=float).reshape(-1, 3)
+        return np.array([self[number].xyz for number in ids], dtype=float).reshape(-1, 3)
 
     def add(self, point: ModelKeypoint) -> int:
         """Add a point and return its semantic id; missing ids and names are assigned."""
@@ -180,8 +180,8 @@ def _proposals(
     wanted: list[int | None]
     if found.names is not None:
         wanted = [by_name.get(name) for name in found.names]
-    elif found.semantic_ids is not None:
-        wanted = [number if number in registry else None for number in found.semantic_ids]
+    elif found.ids is not None:
+        wanted = [number if number in registry else None for number in found.ids]
     else:
         numbers = sorted(number for number, _ in registry)
         wanted = list(numbers) if len(numbers) == count else [None] * count
@@ -249,7 +249,7 @@ class Models:
         self._choice = choice
         self._reserved = frozenset(() if shape is None else shape.reserved)
         if choice is not None:
-            self._reserved |= choice.semantic_ids
+            self._reserved |= choice.ids
         self._models: dict[int, OpenedModel] = {}
         for path in paths:
             self.number_of(path)

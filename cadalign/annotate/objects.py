@@ -267,9 +267,9 @@ class Observer:
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=state.intrinsics.to_write(document.focal) if to_write else state.camera,
             sigma=filled(pair.sigma for pair in pairs),
-            semantic_ids=np.array(keypoints, dtype=np.int64),
+            ids=np.array(keypoints, dtype=np.int64),
             names=tuple(registry[keypoint].name for keypoint in keypoints),
-            confidences=filled(pair.confidence for pair in pairs),
+            scores=filled(pair.score for pair in pairs),
             image=state.files.image,
             depths=np.array(depths) if np.isfinite(depths).any() else None,
         )

@@ -67,7 +67,7 @@ class _Known:
     """The pairs that the library knows: (n, 2) [px], n semantic ids, (n,) [px]."""
 
     points_2d: FloatArray
-    semantic_ids: list[int]
+    ids: list[int]
     sigma: FloatArray | float
 
 
@@ -85,8 +85,8 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
         if choice is None:
             return answer | {"note": "The session has no library: start it with --library."}
         marked = _marked(state, choice)
-        others = len(state.document.complete_pairs) - len(marked.semantic_ids)
-        missing = _LEAST_PAIRS - len(marked.semantic_ids)
+        others = len(state.document.complete_pairs) - len(marked.ids)
+        missing = _LEAST_PAIRS - len(marked.ids)
         if missing > 0:
             return answer | {"note": _too_few(missing, others)}
         camera = _camera(session, state)
@@ -96,14 +96,14 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
     try:
         matches = choice.library.retrieve(
             marked.points_2d,
-            marked.semantic_ids,
+            marked.ids,
             camera,
             sigma=marked.sigma,
             category=choice.category,
         )
     except CadalignError as error:
         return answer | {"note": str(error)}
-    note = f"Ranked by {len(marked.semantic_ids)} pairs of named keypoints."
+    note = f"Ranked by {len(marked.ids)} pairs of named keypoints."
     if others:
         note += f" {others} of other points don't count."
     if not known:

@@ -152,7 +152,7 @@ def _fingerprint(tasks: Sequence[ModelTask]) -> str:
         known: list[Any] = [task.category, task.model_id, task.reason]
         if task.model is not None:
             keypoints, path = task.model.keypoints, task.model.mesh_path
-            known += [keypoints.semantic_ids.tolist(), task.model.symmetries, path]
+            known += [keypoints.ids.tolist(), task.model.symmetries, path]
             digest.update(keypoints.xyz.tobytes())
             if path is not None and path.is_file():
                 known.append(path.stat().st_mtime_ns)

@@ -129,7 +129,7 @@ def _view(
     """A frame as a view, without keypoints where the object was not detected."""
     if seen is None:
         return View(camera, time=time)
-    given: Sequence[object] | None = seen.names if seen.names is not None else seen.semantic_ids
+    given: Sequence[object] | None = seen.names if seen.names is not None else seen.ids
     if given is None:
         if len(seen) != len(ids):
             what = f"{len(seen)} keypoints without names, but the model has {len(ids)}"

@@ -6,7 +6,7 @@ the modules of their names.
 
 from typing import TYPE_CHECKING
 
-from cadalign.lazy import lazy_names
+from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch

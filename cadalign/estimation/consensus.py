@@ -65,7 +65,7 @@ class RobustSearch:
     problems: Problems
     options: FitOptions
     ransac: RansacOptions
-    confidences: npt.ArrayLike | None
+    scores: npt.ArrayLike | None
 
     @property
     def area(self) -> float:
@@ -170,9 +170,9 @@ def find_consensus(search: RobustSearch) -> Consensus:
             where="minimal",
             fix="leave it at 'ap4p'",
         )
-    by_confidence = order_of_confidence(search.confidences, count)
+    by_score = order_of_scores(search.scores, count)
     order = np.random.default_rng(ransac.seed).permutation(count)
-    ranked = np.arange(count) if by_confidence is None else np.argsort(order)[by_confidence]
+    ranked = np.arange(count) if by_score is None else np.argsort(order)[by_score]
     facing = faced(camera, problems.points_2d)
     views = _views(problems.points_2d[order], facing, options)
     exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
@@ -199,7 +199,7 @@ def find_consensus(search: RobustSearch) -> Consensus:
             success_prob=float(ransac.success_prob),
             seed=int(ransac.seed),
             exhaustive=exhaustive,
-            guided=by_confidence is not None,
+            guided=by_score is not None,
             optimize=ransac.refine,
             estimate_focal=options.focal == "estimate",
         ),
@@ -234,17 +234,15 @@ def _views(points_2d: FloatArray, camera: Camera, options: FitOptions) -> Views:
     return Views(np.array([camera.fx]), rays[None], whitening_of(1.0, rays, camera)[None])
 
 
-def order_of_confidence(
-    confidences: npt.ArrayLike | None, count: int
-) -> npt.NDArray[np.intp] | None:
-    """The order of falling confidence; None where there are none, or all are alike."""
-    if confidences is None:
+def order_of_scores(scores: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:
+    """The order of falling scores; None where there are none, or all are alike."""
+    if scores is None:
         return None
-    values = as_floats(confidences, name="confidences", shape=(count,))
+    values = as_floats(scores, name="scores", shape=(count,))
     if (values < 0).any():
         raise InputError(
-            f"keypoint {int(np.argmax(values < 0))} has the confidence {values.min():g}",
-            where="confidences",
+            f"keypoint {int(np.argmax(values < 0))} has the score {values.min():g}",
+            where="scores",
             fix="give numbers that are not negative",
         )
     return np.argsort(-values, kind="stable") if np.ptp(values) > 0 else None

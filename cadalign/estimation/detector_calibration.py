@@ -108,7 +108,7 @@ class _DetectorErrors:
         for number, (seen, true) in enumerate(zip(predictions, truth, strict=True)):
             kept, places = _pairs(seen, true, number)
             size = size_of(seen.points_2d[kept]) if len(kept) else 1.0
-            labels = seen.names or seen.semantic_ids or (None,) * len(seen)
+            labels = seen.names or seen.ids or (None,) * len(seen)
             own = np.zeros(len(true)) if true.sigma is None else true.sigma
             columns[0].extend(seen.points_2d[kept] - true.points_2d[places])
             columns[1].extend([number] * len(kept))
@@ -242,7 +242,7 @@ def _pairs(seen: ImageKeypoints, true: ImageKeypoints, number: int) -> tuple[Int
     """Rows of the same keypoints in a prediction and its truth, found in both."""
     found = np.ones(len(seen), dtype=bool) if seen.scores is None else seen.scores > 0
     known = np.ones(len(true), dtype=bool) if true.scores is None else true.scores > 0
-    for name in ("names", "semantic_ids"):
+    for name in ("names", "ids"):
         ours, theirs = getattr(seen, name), getattr(true, name)
         if ours is not None and theirs is not None:
             place = {label: row for row, label in enumerate(theirs) if known[row]}

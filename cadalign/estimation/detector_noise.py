@@ -109,7 +109,7 @@ class DetectorNoise:
         if len(knots) > 1:
             if scores is None:
                 what = "the detector's noise depends on the scores, which are missing"
-                raise InputError(what, where="scores", fix="give the keypoints' confidences")
+                raise InputError(what, where="scores", fix="give the keypoints' scores")
             given = as_floats(scores, name="scores", shape=(len(points),))
             found = np.exp(np.interp(given, knots, np.log(sigmas)))
         if ids is not None:
@@ -198,11 +198,11 @@ def with_noise(observation: Observation, path: Path) -> Observation:
     noise = opened_noise(path)
 
     def sigma_of(image: ObservedImage) -> FloatArray:
-        ids = image.names if image.names is not None else image.semantic_ids
+        ids = image.names if image.names is not None else image.ids
         known = (
             None if ids is None else [each if isinstance(each, str) else int(each) for each in ids]
         )
-        return noise.sigma(image.points_2d, scores=image.confidences, ids=known)
+        return noise.sigma(image.points_2d, scores=image.scores, ids=known)
 
     others = tuple(replace(image, sigma=sigma_of(image)) for image in observation.others)
     options = {name: each for name, each in observation.fit_options.items() if name != "sigma"}

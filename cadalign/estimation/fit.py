@@ -23,11 +23,13 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.solve import solve, solve_one
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.names import renamed
 
 if TYPE_CHECKING:
     from cadalign.estimation.results import Results
 
 
+@renamed(confidences="scores")
 @np.errstate(all="ignore")  # what is not finite is refused
 def fit(
     points_3d: npt.ArrayLike,
@@ -45,7 +47,7 @@ def fit(
     focal_prior: PriorOption = USUAL,
     principal_sigma: float | None = None,
     ransac: RansacOptions | None = None,
-    confidences: npt.ArrayLike | None = None,
+    scores: npt.ArrayLike | None = None,
     symmetry: Symmetry | None = None,
 ) -> Result:
     """Estimate rotation, translation and stretch of a model from its keypoints in one image.
@@ -97,7 +99,7 @@ def fit(
     ransac : RansacOptions, optional
         Search for the alignment with the most inliers, and fit to these: for keypoints with
         outliers. ``result.inliers`` marks the inliers.
-    confidences : (n,) float, optional
+    scores : (n,) float, optional
         Confidences of the keypoints, for ``ransac``: samples are drawn from the highest first.
     symmetry : Symmetry, optional
         Motions that take the model to itself. Of the alignments that are equal under it, the result
@@ -156,12 +158,13 @@ def fit(
     except (TypeError, ValueError):  # an array as sigma has no hash
         options = FitOptions(method, _copied(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
-    _check_ransac(ransac, confidences)
+    _check_ransac(ransac, scores)
     if symmetry is not None:
         _check_symmetry(symmetry)
-    return _fit_one(problems, options, ransac, confidences, symmetry, start)
+    return _fit_one(problems, options, ransac, scores, symmetry, start)
 
 
+@renamed(confidences="scores")
 @np.errstate(all="ignore")
 def fit_batch(
     points_3d: Sequence[npt.ArrayLike] | FloatArray,
@@ -179,7 +182,7 @@ def fit_batch(
     focal_prior: PriorOption = USUAL,
     principal_sigma: float | None = None,
     ransac: RansacOptions | None = None,
-    confidences: Sequence[npt.ArrayLike] | None = None,
+    scores: Sequence[npt.ArrayLike] | None = None,
     symmetry: Symmetry | None = None,
     workers: int = 1,
 ) -> Results:
@@ -199,7 +202,7 @@ def fit_batch(
         As for `fit`; every problem has a focal length of its own.
     principal_sigma, ransac
         As for `fit`.
-    confidences : sequence of B (n_b,) float, optional
+    scores : sequence of B (n_b,) float, optional
         As for `fit`, for each problem.
     symmetry : Symmetry, optional
         As for `fit`, of all models.
@@ -241,9 +244,9 @@ def fit_batch(
     sigmas: Sequence[Sigma] | None = None
     if per_problem:
         sigmas = list(each_of(sigma, "sigma", len(problems), "values"))
-    _check_ransac(ransac, confidences)
-    if confidences is not None:
-        confidences = each_of(confidences, "confidences", len(problems), "sets")
+    _check_ransac(ransac, scores)
+    if scores is not None:
+        scores = each_of(scores, "scores", len(problems), "sets")
     if symmetry is not None:
         _check_symmetry(symmetry)
     bounds = np.linspace(0, len(problems), worker_count(workers) + 1).astype(int).tolist()
@@ -264,7 +267,7 @@ def fit_batch(
             solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
             seconds = (time.perf_counter() - start) / max(len(some), 1)
             return SolvedTable(some, solutions, options, own, symmetry, seconds).results
-        trusted = None if confidences is None else confidences[part[0] : part[1]]
+        trusted = None if scores is None else scores[part[0] : part[1]]
         fits = _fits(some, options, ransac, own, trusted, symmetry)
         return Results.of(
             fits, counts=some.counts, unknowns=10 if options.focal == "estimate" else 9
@@ -292,14 +295,14 @@ def _check_symmetry(symmetry: object) -> None:
     check_symmetry(symmetry)
 
 
-def _check_ransac(ransac: object, confidences: object) -> None:
+def _check_ransac(ransac: object, scores: object) -> None:
     if ransac is not None and not isinstance(ransac, RansacOptions):
         what = f"expected a cadalign.RansacOptions, got {type(ransac).__name__}"
         raise InputError(what, where="ransac")
-    if ransac is None and confidences is not None:
+    if ransac is None and scores is not None:
         raise InputError(
             "given without ransac",
-            where="confidences",
+            where="scores",
             fix="give ransac=RansacOptions(...), or the keypoints' sigma instead",
         )
 
@@ -309,14 +312,14 @@ def _fits(
     options: FitOptions,
     ransac: RansacOptions | None,
     sigmas: Sequence[Sigma] | None,
-    confidences: Sequence[npt.ArrayLike] | None,
+    scores: Sequence[npt.ArrayLike] | None,
     symmetry: Symmetry | None,
 ) -> list[Result | CadalignError]:
     """Fits of all problems, one by one; an error takes the place of a result."""
     fits: list[Result | CadalignError] = []
     for b in range(len(problems)):
         own = options if sigmas is None else replace(options, sigma=sigmas[b])
-        trusted = None if confidences is None else confidences[b]
+        trusted = None if scores is None else scores[b]
         start, one = time.perf_counter(), problems.part(b, b + 1)
         try:
             fits.append(_fit_one(one, own, ransac, trusted, symmetry, start))
@@ -329,7 +332,7 @@ def _fit_one(
     problems: Problems,
     options: FitOptions,
     ransac: RansacOptions | None,
-    confidences: npt.ArrayLike | None,
+    scores: npt.ArrayLike | None,
     symmetry: Symmetry | None,
     start: float,
 ) -> Result:
@@ -343,7 +346,7 @@ def _fit_one(
 
         def fit_at(shift: FloatArray) -> Result:
             moved = pack_one(problems.points_3d, problems.points_2d, shifted(camera, shift))
-            return _fit_one(moved, known, ransac, confidences, symmetry, start)
+            return _fit_one(moved, known, ransac, scores, symmetry, start)
 
         return estimate_with_principal_point(fit_at, options, [options.sigma])
     if ransac is None:
@@ -355,7 +358,7 @@ def _fit_one(
 
         is_noise_known = options.sigma is not None or ransac.max_reproj_error is not None
         search = fit_robustly if is_noise_known else fit_similar_robustly
-        result = search(problems, options, ransac, confidences, start)
+        result = search(problems, options, ransac, scores, start)
     return result if symmetry is None else canonical_result(result, symmetry)
 
 

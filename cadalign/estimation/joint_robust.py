@@ -43,12 +43,12 @@ class JointConsensus(NamedTuple):
 def robust_starts(
     evidence: Evidence,
     ransac: RansacOptions,
-    confidences: Sequence[FloatArray | None],
+    scores: Sequence[FloatArray | None],
     init: Start | None = None,
 ) -> Starts:
     """Starts for keypoints with outliers: poses under a robust loss, and those of small samples.
 
-    ``confidences`` (n_v,) are those of every view's keypoints.
+    ``scores`` (n_v,) are those of every view's keypoints.
     """
     starts = starts_of(with_loss(evidence, CAUCHY), init)
     if evidence.rig.pose.max() > 0:
@@ -57,7 +57,7 @@ def robust_starts(
         [
             in_rig(pose, camera)
             for view, camera in enumerate(evidence.rig.cam_from_rig)
-            for pose in _hypotheses(evidence, view, ransac, confidences[view])
+            for pose in _hypotheses(evidence, view, ransac, scores[view])
         ]
     ).reshape(-1, 12)
     count, focals = len(samples), starts.log_focals.shape[1]
@@ -158,14 +158,14 @@ def with_sightings(evidence: Evidence, kept: BoolArray) -> Evidence:
 
 
 def _hypotheses(
-    evidence: Evidence, view: int, ransac: RansacOptions, confidences: FloatArray | None
+    evidence: Evidence, view: int, ransac: RansacOptions, scores: FloatArray | None
 ) -> FloatArray:
     """Camera poses (S, 12) from small samples of one view's keypoints, the best supported first."""
     given = rays_in(evidence, view)
     count, size = len(given.points), SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
     if count < size:
         return np.empty((0, 12))
-    draws = _draws(count, size, ransac, confidences)
+    draws = _draws(count, size, ransac, scores)
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
     chosen = draws.ravel()
@@ -186,13 +186,11 @@ def _hypotheses(
     return poses[np.argsort(scores)][:_REFINED, :12]
 
 
-def _draws(
-    count: int, size: int, ransac: RansacOptions, confidences: FloatArray | None
-) -> IntArray:
+def _draws(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
     """Samples (S, size) of keypoints: all where these are few, otherwise drawn at random.
 
     So many that one without outliers is among them with the wanted probability, if half of the
-    keypoints are inliers. With confidences every other sample is drawn by these.
+    keypoints are inliers. With scores every other sample is drawn by these.
     """
     without = math.log(1 - ransac.success_prob) / math.log1p(-(_INLIER_RATIO**size))
     wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
@@ -200,8 +198,8 @@ def _draws(
         return np.array(list(combinations(range(count), size)))
     rng = np.random.default_rng(ransac.seed)
     weights = None
-    if confidences is not None and confidences.sum() > 0:
-        weights = confidences + _LEAST_CONFIDENCE * confidences.max()
+    if scores is not None and scores.sum() > 0:
+        weights = scores + _LEAST_CONFIDENCE * scores.max()
         weights = weights / weights.sum()
     draws = [
         rng.choice(count, size, replace=False, p=weights if k % 2 else None) for k in range(wanted)

@@ -51,7 +51,7 @@ class ObservationFit:
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     noise: Path | None = None
     """File of a detector's noise, from `cadalign.calibrate_detector`: standard deviations of the
-    keypoints by their confidences and names, in the place of the file's."""
+    keypoints by their scores and names, in the place of the file's."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object. Its
     proportions are similar, too: --scale-prior-sigma is 0.2, unless the file or a flag says
@@ -335,7 +335,7 @@ class ObservationFit:
             observation.camera,
             **vars(options),
             ransac=self.ransac if self.robust else None,
-            confidences=observation.confidences if self.robust else None,
+            scores=observation.scores if self.robust else None,
             symmetry=observation.symmetry,
         )
 

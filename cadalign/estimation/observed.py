@@ -117,7 +117,7 @@ def shape_ids(image: ObservedImage, shape: ShapeModel) -> tuple[KeypointId, ...]
         return ()
     named = isinstance(shape.ids[0], str)
     field, kind = ("name", "names") if named else ("semantic_id", "semantic ids")
-    given = image.names if named else image.semantic_ids
+    given = image.names if named else image.ids
     if given is None:
         raise InputError(
             f"the keypoints have no {field}",
@@ -136,7 +136,7 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
     numbers, in several images those of equal ``xyz``.
     """
     shown = [image for image in images if len(image.points_2d)]
-    for field in ("semantic_ids", "names"):
+    for field in ("ids", "names"):
         columns = [getattr(image, field) for image in shown]
         if all(column is not None and len(set(column)) == len(column) for column in columns):
             of_all = [getattr(image, field) if len(image.points_2d) else () for image in images]
@@ -166,7 +166,7 @@ def _view(
         image.points_2d,
         ids=ids,
         sigma=sigma,
-        confidences=image.confidences,
+        scores=image.scores,
         image=photo,
         **as_arguments(evidence),
     )

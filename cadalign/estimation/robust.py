@@ -49,7 +49,7 @@ def fit_robustly(
     problems: Problems,
     options: FitOptions,
     ransac: RansacOptions,
-    confidences: npt.ArrayLike | None,
+    scores: npt.ArrayLike | None,
     start: float,
 ) -> Result:
     """Fit the only problem to the keypoints that support its best alignment.
@@ -67,7 +67,7 @@ def fit_robustly(
     given = replace(  # the caller may go on to change theirs
         problems, points_3d=problems.points_3d.copy(), points_2d=problems.points_2d.copy()
     )
-    trusted = None if confidences is None else np.array(confidences)
+    trusted = None if scores is None else np.array(scores)
     search = RobustSearch(given, options, ransac, trusted)
     best, refined = _found(search), None
     # As many samples would find the support that a corrected mistake gives, which is more.
@@ -146,7 +146,7 @@ def fit_similar_robustly(
     problems: Problems,
     options: FitOptions,
     ransac: RansacOptions,
-    confidences: npt.ArrayLike | None,
+    scores: npt.ArrayLike | None,
     start: float,
 ) -> Result:
     """Fit the only problem, whose keypoints' standard deviation is to be estimated.
@@ -161,7 +161,7 @@ def fit_similar_robustly(
     while threshold == _FIRST or threshold <= _WIDEST * extent:
         chosen = replace(ransac, max_reproj_error=threshold)
         try:
-            found = fit_robustly(problems, options, chosen, confidences, start)
+            found = fit_robustly(problems, options, chosen, scores, start)
         except (NoConsensusError, DegenerateError) as error:
             refusal = refusal or error
         else:

@@ -177,7 +177,7 @@ def _starts(
         if ransac is None:
             starts = starts_of(evidence, first)
         else:
-            trusted = [cast("FloatArray | None", view.confidences) for view in problem.views]
+            trusted = [cast("FloatArray | None", view.scores) for view in problem.views]
             starts = robust_starts(evidence, ransac, trusted, first)
         if lenses.count:
             one = starts.poses.shape[1] == 1

@@ -83,7 +83,7 @@ def align_plain(
         view.camera,
         **{**chosen, "sigma": view.sigma},
         ransac=ransac,
-        confidences=view.confidences if ransac is not None else None,
+        scores=view.scores if ransac is not None else None,
     )
     found = replace(
         found,

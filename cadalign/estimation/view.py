@@ -28,6 +28,7 @@ from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import DeclaredEvidence
 from cadalign.io.images import ByteImage, read_grey, read_photo
+from cadalign.names import renamed
 
 if TYPE_CHECKING:
     from cadalign.estimation.detector_noise import DetectorNoise
@@ -37,6 +38,7 @@ _SYMMETRY_TOLERANCE = 1e-9
 _DEFAULTS = {"depth_sigma": 0.01, "up_sigma_deg": 1.0, "camera_height_sigma": 0.02}
 
 
+@renamed(confidences="scores")
 @dataclass(frozen=True, eq=False)
 class View(DeclaredEvidence):
     """Evidence of one image about an object.
@@ -52,11 +54,11 @@ class View(DeclaredEvidence):
     sigma : float, (n,) float, (n, 2, 2) float, or None
         Standard deviation of the keypoints, of each, or covariance of each [px]. None estimates one
         for all views that have none, by its likelihood under a weak prior about 2 px.
-    confidences : (n,) float, optional
+    scores : (n,) float, optional
         Confidences of the keypoints, for a robust search and ``noise``.
     noise : DetectorNoise, optional
         Calibrated noise of the detector that found the keypoints, all that it found of the object:
-        ``sigma`` becomes what it says of their confidences and ids.
+        ``sigma`` becomes what it says of their scores and ids.
     time : float, optional
         When the image was taken [s], for an estimate with a motion: views of one time share a pose.
     depth : (n,) or (h, w) float, or path, optional
@@ -115,7 +117,7 @@ class View(DeclaredEvidence):
     points_2d: npt.ArrayLike = ()
     ids: Sequence[Hashable] | None = None
     sigma: Sigma | None = 1.0
-    confidences: npt.ArrayLike | None = None
+    scores: npt.ArrayLike | None = None
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
     noise: InitVar[DetectorNoise | None] = field(default=None, kw_only=True)
     time: float | None = field(default=None, kw_only=True)
@@ -136,7 +138,7 @@ class View(DeclaredEvidence):
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
         if noise is not None:
             known = None if self.is_numbered else self.keypoint_ids
-            sigma = noise.sigma(points, scores=self.confidences, ids=known)
+            sigma = noise.sigma(points, scores=self.scores, ids=known)
             object.__setattr__(self, "sigma", sigma)
         if self.time is not None and not (is_number(self.time) and np.isfinite(self.time)):
             raise InputError(f"{quote(self.time)} is not a finite number", where="time")

@@ -154,7 +154,7 @@ def _explaining(prior: ShapePrior, view: View, camera: Camera, result: Result) -
         view.points_2d,
         ids=view.ids,
         sigma=view.sigma,
-        confidences=view.confidences,
+        scores=view.scores,
         up=view.up,
         up_sigma_deg=view.up_sigma_deg,
     )

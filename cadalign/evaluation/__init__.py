@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from cadalign.lazy import lazy_names
+from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.evaluation.api import evaluate, simulate

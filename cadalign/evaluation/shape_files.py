@@ -153,9 +153,7 @@ def learn(
 
 def _hash_of_models(models: Sequence[AnnotatedModel]) -> str:
     keypoints = ((each.model_id, each.keypoints) for each in models)
-    return fingerprint(
-        *(part for name, k in keypoints for part in (f"{name}\0", k.xyz, k.semantic_ids))
-    )
+    return fingerprint(*(part for name, k in keypoints for part in (f"{name}\0", k.xyz, k.ids)))
 
 
 def _is_readable(file: Path) -> bool:

@@ -7,7 +7,7 @@ The file of one image holds one object::
                  "params": [935.0, 935.0, 320.0, 240.0]},
       "keypoints": [
         {"xyz": [0.11, 0.42, -0.08], "uv": [351.2, 204.9], "sigma": 1.0, "semantic_id": 3,
-         "name": "back, top left", "confidence": 0.93},
+         "name": "back, top left", "score": 0.93},
         ...
       ],
       "image": "photo.png",
@@ -22,9 +22,9 @@ says so. ``pixel_origin`` says where pixel (0, 0) lies: ``"center"`` of the top-
 ``"corner"`` of the image, half a pixel away. In ``camera`` it is that of the principal point, by
 default ``"corner"`` for COLMAP's ``params`` and ``"center"`` for a ``matrix``; beside ``keypoints``
 it is that of ``uv``, by default ``"center"``. `Observation.save` states both.
-``sigma`` [px], ``semantic_id``, ``name`` and ``confidence`` (a detector's score, not negative) are
-optional, each given for all keypoints or for none. ``image`` and ``model`` are optional paths,
-relative to the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
+``sigma`` [px], ``semantic_id``, ``name`` and ``score`` (a detector's, not negative) are optional,
+each given for all keypoints or for none. ``image`` and ``model`` are optional paths, relative to
+the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
 ``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis``, ``focal`` and
 ``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``"usual"`` for that of usual lenses,
@@ -101,15 +101,17 @@ from cadalign.io.observation_file import (
     write_image_fields,
 )
 from cadalign.io.observed_image import ObservedImage
+from cadalign.names import renamed
 
 
+@renamed(semantic_ids="ids", confidences="scores")
 @dataclass(frozen=True, eq=False)
 class Observation(ObservedImage):
     """An object in one image, or in several: this is the first one.
 
     Parameters
     ----------
-    points_3d, points_2d, camera, sigma, semantic_ids, names, confidences, image, depths, evidence
+    points_3d, points_2d, camera, sigma, ids, names, scores, image, depths, evidence
         Camera of the first image, as for `ObservedImage`.
     model : Path, optional
         The CAD model.

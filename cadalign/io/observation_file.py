@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of
@@ -40,15 +40,27 @@ from cadalign.io.observed_image import ObservedImage
 Declared = TypeVar("Declared", bound=Document)
 
 
-class KeypointFields(Labelled, kw_only=True):
+class SeenKeypoint(Labelled, kw_only=True):
+    """What a photo says of a keypoint."""
+
+    sigma: Positive | None = None
+    score: NotNegative | None = None
+    confidence: NotNegative | None = None  # the earlier name of the score
+    depth: Positive | None = None
+
+    def __post_init__(self) -> None:
+        if self.confidence is not None and self.score is not None:
+            raise InputError("given beside score, its present name", where="confidence")
+        if self.confidence is not None:
+            self.score = self.confidence
+
+
+class KeypointFields(SeenKeypoint, kw_only=True):
     """One entry of ``keypoints``."""
 
     xyz: Point3
     uv: Point2
-    sigma: Positive | None = None
     name: Text | None = None
-    confidence: NotNegative | None = None
-    depth: Positive | None = None
 
 
 class FocalPriorFields(Document, omit_defaults=True):
@@ -207,9 +219,9 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
         points_2d=points_2d - shift_of(read.pixel_origin),
         camera=camera,
         sigma=_column(read.keypoints, "sigma"),
-        semantic_ids=None if ids is None else np.array(ids, dtype=np.int64),
+        ids=None if ids is None else np.array(ids, dtype=np.int64),
         names=None if names is None else tuple(names),
-        confidences=_column(read.keypoints, "confidence"),
+        scores=_column(read.keypoints, "score"),
         image=None if read.image is None else path_from(read.image, folder),
         depths=_depths(read.keypoints),
         evidence=ImageEvidence(**as_arguments(evidence)),
@@ -254,9 +266,9 @@ def write_image_fields(
     ]
     for name, values in (
         ("sigma", image.sigma),
-        ("semantic_id", image.semantic_ids),
+        ("semantic_id", image.ids),
         ("name", image.names),
-        ("confidence", image.confidences),
+        ("score", image.scores),
         ("depth", image.depths),
     ):
         if values is not None:

@@ -11,8 +11,10 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import ImageEvidence
+from cadalign.names import renamed
 
 
+@renamed(semantic_ids="ids", confidences="scores")
 @dataclass(frozen=True, eq=False)
 class ObservedImage:
     """Keypoints of the object in one image, and further evidence of the image.
@@ -26,12 +28,12 @@ class ObservedImage:
     camera : Camera
     sigma : (n,) float, optional
         Standard deviation of each image point [px].
-    semantic_ids : (n,) int, optional
+    ids : (n,) int, optional
         Meaning of each keypoint; the same number on all models of a category.
     names : tuple of n str, optional
         Name of each keypoint.
-    confidences : (n,) float, optional
-        Trust in each keypoint, for the ``confidences`` of `cadalign.fit`.
+    scores : (n,) float, optional
+        Trust in each keypoint, for the ``scores`` of `cadalign.fit`.
     image : Path, optional
         The photo.
     depths : (n,) float, optional
@@ -49,9 +51,9 @@ class ObservedImage:
     points_2d: FloatArray
     camera: Camera
     sigma: FloatArray | None = None
-    semantic_ids: IntArray | None = None
+    ids: IntArray | None = None
     names: tuple[str, ...] | None = None
-    confidences: FloatArray | None = None
+    scores: FloatArray | None = None
     image: Path | None = None
     depths: FloatArray | None = field(default=None, kw_only=True)
     evidence: ImageEvidence = field(default_factory=ImageEvidence, kw_only=True)
@@ -61,7 +63,7 @@ class ObservedImage:
         points_2d = as_floats(self.points_2d, name="points_2d", shape=(len(points_3d), 2))
         object.__setattr__(self, "points_3d", points_3d)
         object.__setattr__(self, "points_2d", points_2d)
-        for name in ("sigma", "confidences"):
+        for name in ("sigma", "scores"):
             if (value := getattr(self, name)) is not None:
                 checked = as_floats(value, name=name, shape=(len(points_3d),))
                 object.__setattr__(self, name, checked)

@@ -176,7 +176,7 @@ def _stacked(table: ModelTable, category: str) -> tuple[FloatArray, BoolArray]:
     rows = table.rows_of(category)
     offsets = table.offsets[rows.start : rows.stop + 1]
     own = slice(int(offsets[0]), int(offsets[-1]))
-    ids, column = np.unique(table.semantic_ids[own], return_inverse=True)
+    ids, column = np.unique(table.ids[own], return_inverse=True)
     model = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     points = np.zeros((len(offsets) - 1, len(ids), 3))
     has = np.zeros(points.shape[:2], dtype=bool)

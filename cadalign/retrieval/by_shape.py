@@ -211,7 +211,7 @@ def camera_by_shape(
 def _no_shape() -> InputError:
     return InputError(
         f"no shape model has {_LEAST_KEYPOINTS} of the keypoints",
-        where="semantic_ids",
+        where="ids",
         fix="check them, or rank without shape",
     )
 
@@ -330,7 +330,7 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     offsets = table.offsets[rows.start : rows.stop + 1]
     own = slice(int(offsets[0]), int(offsets[-1]))
     row_of = {label: row for row, label in enumerate(shape.ids)}
-    ids, number = np.unique(table.semantic_ids[own], return_inverse=True)
+    ids, number = np.unique(table.ids[own], return_inverse=True)
     row = np.array([row_of.get(label, -1) for label in ids.tolist()], dtype=np.int64)[number]
     model = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     stacked = np.full((len(offsets) - 1, len(shape.ids) + BOX_ROWS, 3), np.nan)

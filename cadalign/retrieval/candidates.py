@@ -38,14 +38,14 @@ class Observed:
 
 
 def observe(
-    points_2d: npt.ArrayLike, semantic_ids: npt.ArrayLike, camera: Camera, options: RetrievalOptions
+    points_2d: npt.ArrayLike, ids: npt.ArrayLike, camera: Camera, options: RetrievalOptions
 ) -> Observed:
     """Check an image's keypoints and prepare them for the kernels."""
     if not isinstance(camera, Camera):
         raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
     require_perspective(camera, "retrieval")
     pixels = as_points(points_2d, name="points_2d", dimension=2)
-    ids = check_semantic_ids(semantic_ids, len(pixels), where="semantic_ids")
+    ids = check_semantic_ids(ids, len(pixels), where="ids")
     order = np.argsort(ids)
     pixels, ids = pixels[order], ids[order]
     covariances = _covariances(options, pixels, order)
@@ -112,7 +112,7 @@ def gather_candidates(
     if not kept.any():
         raise DegenerateError(
             f"no model shares more than {shared.max()} keypoints with the image",
-            where="semantic_ids",
+            where="ids",
             fix=f"at least {LEAST_SHARED} are needed to align a model",
         )
     # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
@@ -173,13 +173,13 @@ def _check_known(table: ModelTable, ids: IntArray, chosen: IntArray, category: s
         known = table.known_ids
     else:
         own = slice(int(table.offsets[chosen[0]]), int(table.offsets[chosen[-1] + 1]))
-        known = np.unique(table.semantic_ids[own])
+        known = np.unique(table.ids[own])
     unknown = np.setdiff1d(ids, known)
     if len(unknown):
         where = "the library" if category is None else f"the category {category!r}"
         raise InputError(
             f"no model of {where} has a keypoint with the semantic id {unknown[0]}",
-            where="semantic_ids",
+            where="ids",
             fix=f"known are {_ranges(known)}",
         )
 
@@ -198,7 +198,7 @@ def _candidates(
     spans = np.repeat(np.stack([first, last, first], axis=1), labelings, axis=0)
     mirrored = table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
     spans[:, 2] = np.where(number > 0, len(table.xyz) + mirrored, spans[:, 0])
-    candidates = Candidates(table.xyz, table.semantic_ids, table.places, spans)
+    candidates = Candidates(table.xyz, table.ids, table.places, spans)
     return models, candidates, np.repeat(labelings, labelings)
 
 

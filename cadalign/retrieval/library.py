@@ -14,6 +14,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
+from cadalign.names import renamed
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_by_category
 from cadalign.retrieval.candidates import gather_candidates, observe
@@ -160,10 +161,11 @@ class Library:
         """Hash of the library's content, as text."""
         return fingerprint(self._table)
 
+    @renamed(semantic_ids="ids")
     def retrieve(
         self,
         points_2d: npt.ArrayLike,
-        semantic_ids: npt.ArrayLike,
+        ids: npt.ArrayLike,
         camera: Camera,
         *,
         shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
@@ -241,7 +243,7 @@ class Library:
                     where="camera",
                     fix="rank by shape=, which estimates it, or give it: camera.with_focal(...)",
                 )
-            observed = observe(points_2d, semantic_ids, camera, chosen)
+            observed = observe(points_2d, ids, camera, chosen)
             candidates = gather_candidates(self._table, observed, chosen, exclude, workers)
             ranking = rank(candidates, observed, chosen, workers)
             absent = none_probability(self._table, candidates, observed, ranking, chosen)
@@ -252,9 +254,9 @@ class Library:
             plain = replace(chosen, shape_sigma=0.0, category=category)
             if isinstance(camera, Camera) and not camera.focal_known:
                 some = camera.with_focal(max(camera.width, camera.height))  # which rays need
-                observed = observe(points_2d, semantic_ids, some, plain)
+                observed = observe(points_2d, ids, some, plain)
                 camera = camera_by_shape(observed, chosen, shapes, focal_prior)
-            observed = observe(points_2d, semantic_ids, camera, plain)
+            observed = observe(points_2d, ids, camera, plain)
             candidates = gather_candidates(self._table, observed, plain, exclude, workers)
             ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
             absent = None

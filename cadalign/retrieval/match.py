@@ -20,6 +20,7 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
+from cadalign.names import renamed
 from cadalign.notebook.html import card, draw_picture
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ METHOD = "retrieve"
 """Method of a match's result."""
 
 
+@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class Match:
     """A model of the library, posed and stretched to explain an image's keypoints.
@@ -50,7 +52,7 @@ class Match:
         Box of the model in the camera frame.
     bounds : (2, 3) float
         Lowest and highest coordinates in the model's frame.
-    semantic_ids : (n,) int
+    ids : (n,) int
         Ids of the shared keypoints.
     points_3d : (n, 3) float
         Shared keypoints on the model.
@@ -81,7 +83,7 @@ class Match:
     score: float
     box: Box
     bounds: FloatArray
-    semantic_ids: IntArray
+    ids: IntArray
     points_3d: FloatArray
     points_2d: FloatArray
     residuals: FloatArray
@@ -95,7 +97,7 @@ class Match:
     @property
     def shared(self) -> int:
         """Number of keypoints that model and image share."""
-        return len(self.semantic_ids)
+        return len(self.ids)
 
     def __repr__(self) -> str:
         stretch = ", ".join(f"{value:.3g}" for value in self.alignment.scale)
@@ -142,7 +144,7 @@ class Match:
         """
         if self.camera is None:
             raise InputError("the match has no camera", where="camera", fix="retrieve it again")
-        ids, none = tuple(self.semantic_ids.tolist()), Stated(None)
+        ids, none = tuple(self.ids.tolist()), Stated(None)
         inliers = np.ones(self.shared, dtype=bool)
         seen = (self.camera, self.alignment, ids, self.points_2d, self.residuals, inliers, none)
         return Result(
@@ -151,19 +153,19 @@ class Match:
 
     def observation(self, seen: Observation) -> Observation:
         """The keypoints of an observation that the model has, paired with the model's."""
-        assert seen.semantic_ids is not None
-        kept = np.flatnonzero(np.isin(seen.semantic_ids, self.semantic_ids))
-        ids = seen.semantic_ids[kept]
+        assert seen.ids is not None
+        kept = np.flatnonzero(np.isin(seen.ids, self.ids))
+        ids = seen.ids[kept]
         own: dict[str, Any] = {
             name: None if values is None else values[kept]
-            for name in ("sigma", "confidences", "depths")
+            for name in ("sigma", "scores", "depths")
             for values in (getattr(seen, name),)
         }
         return replace(
             seen,
-            points_3d=self.points_3d[np.searchsorted(self.semantic_ids, ids)],
+            points_3d=self.points_3d[np.searchsorted(self.ids, ids)],
             points_2d=seen.points_2d[kept],
-            semantic_ids=ids,
+            ids=ids,
             names=seen.names and tuple(seen.names[row] for row in kept.tolist()),
             camera=self.camera or seen.camera,
             model=self.mesh_path,
@@ -210,7 +212,7 @@ class Match:
                 "rotation": self.box.rotation.tolist(),
                 "extents": self.box.extents.tolist(),
             },
-            "semantic_ids": self.semantic_ids.tolist(),
+            "semantic_ids": self.ids.tolist(),
             "residuals": self.residuals.tolist(),
             "missing_ids": list(self.missing_ids),
             "mirrored": self.mirrored,

@@ -19,6 +19,7 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_onl
 from cadalign.datasets import AnnotatedModel, Circle, RotationalSymmetry, Symmetries, load_mesh
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.names import renamed
 from cadalign.retrieval.labelings import mirrored_labelings
 
 ModelKey = tuple[str, str]
@@ -39,6 +40,7 @@ SCHEMA = pa.schema(
 )
 
 
+@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class LibraryModel:
     """One model of a library.
@@ -48,7 +50,7 @@ class LibraryModel:
     category, model_id : str
     xyz : (k, 3) float
         Keypoints [model units].
-    semantic_ids : (k,) int
+    ids : (k,) int
         Semantic ids, valid for all models of the category.
     bounds : (2, 3) float
         Lowest and highest coordinates of the mesh; of the keypoints without a mesh.
@@ -65,7 +67,7 @@ class LibraryModel:
     category: str
     model_id: str
     xyz: FloatArray
-    semantic_ids: IntArray
+    ids: IntArray
     bounds: FloatArray
     symmetries: Symmetries = field(default_factory=lambda: _no_symmetries())
     mesh_path: Path | None = None
@@ -74,8 +76,8 @@ class LibraryModel:
         where = f"{self.category}, model {self.model_id}"
         xyz = as_points(self.xyz, name=f"{where}, xyz", dimension=3)
         bounds = as_floats(self.bounds, name=f"{where}, bounds", shape=(2, 3))
-        ids = check_semantic_ids(self.semantic_ids, len(xyz), where=f"{where}, semantic_ids")
-        for name, value in (("xyz", xyz), ("bounds", bounds), ("semantic_ids", ids)):
+        ids = check_semantic_ids(self.ids, len(xyz), where=f"{where}, ids")
+        for name, value in (("xyz", xyz), ("bounds", bounds), ("ids", ids)):
             object.__setattr__(self, name, read_only(value))
 
     @classmethod
@@ -93,7 +95,7 @@ class LibraryModel:
             category=model.category,
             model_id=model.model_id,
             xyz=xyz,
-            semantic_ids=model.keypoints.semantic_ids,
+            ids=model.keypoints.ids,
             bounds=bounds,
             symmetries=model.symmetries,
             mesh_path=None if path is None else path.absolute(),
@@ -180,7 +182,7 @@ class ModelTable:
         return _numbers(self._column("keypoints").flatten().flatten()).reshape(-1, 3)
 
     @cached_property
-    def semantic_ids(self) -> IntArray:
+    def ids(self) -> IntArray:
         """Semantic ids of `xyz`, (k,) int."""
         return _numbers(self._column("semantic_ids").flatten())
 
@@ -204,7 +206,7 @@ class ModelTable:
     @cached_property
     def known_ids(self) -> IntArray:
         """Semantic ids of all models, ascending."""
-        return np.unique(self.semantic_ids)
+        return np.unique(self.ids)
 
     def rows_of(self, category: str) -> slice:
         """Rows of a category's models."""
@@ -225,7 +227,7 @@ class ModelTable:
             category=category,
             model_id=model_id,
             xyz=self.xyz[own],
-            semantic_ids=self.semantic_ids[own],
+            ids=self.ids[own],
             bounds=self.bounds[row],
             symmetries=_symmetries_from(
                 self.table["symmetries"][row].as_py(), own.stop - own.start
@@ -258,7 +260,7 @@ def read_annotated(model: AnnotatedModel) -> tuple[LibraryModel, str]:
 
 def row_of(model: LibraryModel) -> dict[str, Any]:
     """Convert a model to a row of the table, its keypoints in the order of their ids."""
-    order = np.argsort(model.semantic_ids)
+    order = np.argsort(model.ids)
     place = np.argsort(order)
     symmetries = model.symmetries
     reflections = [(int(place[a]), int(place[b])) for a, b in symmetries.reflections]
@@ -280,7 +282,7 @@ def row_of(model: LibraryModel) -> dict[str, Any]:
         "mesh": None if model.mesh_path is None else str(model.mesh_path),
         "bounds": model.bounds.ravel().tolist(),
         "keypoints": xyz.tolist(),
-        "semantic_ids": model.semantic_ids[order].tolist(),
+        "semantic_ids": model.ids[order].tolist(),
         "labelings": [row for labeling in labelings for row in labeling.tolist()],
         "symmetries": json.dumps({"reflections": reflections, "rotations": rotations}),
     }

@@ -138,11 +138,11 @@ def read_query(path: Path) -> Observation:
 
 
 def _semantic_ids(query: Observation, where: str) -> IntArray:
-    if query.semantic_ids is None:
+    if query.ids is None:
         fix = "give each the id of the library's models for it"
         with in_file(where):
             raise DataError("the keypoints have no semantic_id", fix=fix)
-    return query.semantic_ids
+    return query.ids
 
 
 def read_mask(path: Path, camera: Camera) -> BoolArray:

@@ -235,7 +235,7 @@ def make_matches(
                 score=float(ranking.scores[place]),
                 box=Box.from_model(model.bounds, alignment),
                 bounds=model.bounds,
-                semantic_ids=observed.query.ids[rows],
+                ids=observed.query.ids[rows],
                 points_3d=points_3d,
                 points_2d=observed.points_2d[rows],
                 residuals=residuals,

@@ -29,7 +29,7 @@ def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
     """
     if est.category != gt.category:
         raise InputError(f"the categories {est.category!r} and {gt.category!r} differ", where="est")
-    _, mine, theirs = np.intersect1d(est.semantic_ids, gt.semantic_ids, return_indices=True)
+    _, mine, theirs = np.intersect1d(est.ids, gt.ids, return_indices=True)
     return float(distances(est.xyz[None, mine], gt.xyz[theirs])[0])
 
 

@@ -63,7 +63,7 @@ class AnnotatedKeypoints(Protocol):
     @property
     def xyz(self) -> FloatArray: ...
     @property
-    def semantic_ids(self) -> IntArray: ...
+    def ids(self) -> IntArray: ...
 
 
 class DatasetModel(Protocol):
@@ -100,7 +100,7 @@ def examples_of(
             except DataError as error:
                 logger.warning("its bounding box is taken as unknown: %s", error)
         path = None if model.mesh_path is None else model.mesh_path.absolute()
-        ids = [int(label) for label in model.keypoints.semantic_ids]
+        ids = [int(label) for label in model.keypoints.ids]
         examples.append(Example(model.model_id, ids, model.keypoints.xyz, bounds, path))
         on_progress(len(examples), len(models))
     return examples

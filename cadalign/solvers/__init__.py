@@ -6,7 +6,7 @@
 
 from typing import TYPE_CHECKING
 
-from cadalign.lazy import lazy_names
+from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.solvers.baselines import aepnp_paper, epnp

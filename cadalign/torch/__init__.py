@@ -6,7 +6,7 @@ on the processor; gradients are those of the optimum, by the implicit function t
 
 from typing import TYPE_CHECKING
 
-from cadalign.lazy import lazy_names
+from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.torch.fits import fit

@@ -15,11 +15,13 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.io.observation import Observation
+from cadalign.names import renamed
 
 VISIBILITY_SCORES = (0.0, 0.5, 1.0)
 """Scores by COCO's visibility flag: not labelled, labelled but hidden, visible."""
 
 
+@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class ImageKeypoints:
     """The keypoints of one object in one image."""
@@ -31,7 +33,7 @@ class ImageKeypoints:
     are scores of 0 (not labelled), 0.5 (hidden) and 1 (visible)."""
     names: tuple[str, ...] | None = None
     """(k,), what each keypoint is called."""
-    semantic_ids: tuple[int, ...] | None = None
+    ids: tuple[int, ...] | None = None
     """(k,), what each keypoint means."""
     sigma: FloatArray | None = None
     """(k,), standard deviation of each [px]."""
@@ -67,10 +69,10 @@ class ImageKeypoints:
                 row = int(np.argmax(bad))
                 reason = f"keypoint {row} has the value {value[row]:g}, which is {what}"
                 raise DataError(reason, where=where)
-        for name in ("names", "semantic_ids"):
+        for name in ("names", "ids"):
             values = getattr(self, name)
             if values is not None and len(values) != len(points):
-                what = f"{len(points)} keypoints but {len(values)} {name.replace('_', ' ')}"
+                what = f"{len(points)} keypoints but {len(values)} {name}"
                 raise DataError(what, where=self.source)
 
     def __len__(self) -> int:
@@ -155,7 +157,7 @@ def join_keypoints(
         Leave out keypoints that the model does not have, instead of refusing them.
     sigma_from_scores : float, optional
         Take the scores as weights: the standard deviation of a keypoint is this [px] over its
-        score. Without it they become the observation's ``confidences``, which a robust fit draws
+        score. Without it they become the observation's ``scores``, which a robust fit draws
         its samples by.
 
     Returns
@@ -199,7 +201,7 @@ def join_keypoints(
             fix=f"the model has {_some(model.names)}",
         )
     rows, columns = [row for row, _ in pairs], [place for _, place in pairs]
-    ids = [model.semantic_ids[place] for place in columns]
+    ids = [model.ids[place] for place in columns]
     scores = None if found.scores is None else found.scores[rows]
     sigma = None if found.sigma is None else found.sigma[rows]
     if sigma_from_scores is not None:
@@ -211,9 +213,9 @@ def join_keypoints(
         points_2d=found.points_2d[rows],
         camera=camera,
         sigma=sigma,
-        semantic_ids=None if None in ids else np.array(ids, dtype=np.int64),
+        ids=None if None in ids else np.array(ids, dtype=np.int64),
         names=tuple(model.names[place] for place in columns),
-        confidences=scores if sigma_from_scores is None else None,
+        scores=scores if sigma_from_scores is None else None,
         image=image,
         model=model.model,
     )
@@ -224,9 +226,9 @@ def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
     if found.names is not None:
         rows = {_plain(name): row for row, name in enumerate(model.names)}
         return [rows.get(_plain(name)) for name in found.names]
-    if found.semantic_ids is not None:
-        by_id = {number: row for row, number in enumerate(model.semantic_ids)}
-        return [by_id.get(number) for number in found.semantic_ids]
+    if found.ids is not None:
+        by_id = {number: row for row, number in enumerate(model.ids)}
+        return [by_id.get(number) for number in found.ids]
     if len(found) != len(model):
         raise DataError(
             f"{len(found)} keypoints without names, but the model has {len(model)}",
@@ -239,7 +241,7 @@ def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
 def _label(found: ImageKeypoints, row: int) -> str | int:
     if found.names is not None:
         return found.names[row]
-    return row if found.semantic_ids is None else found.semantic_ids[row]
+    return row if found.ids is None else found.ids[row]
 
 
 def _plain(name: str) -> str:

@@ -135,7 +135,7 @@ def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageK
         points_2d=np.column_stack([columns["u"], columns["v"]]),
         scores=None if scores is None else np.array(scores),
         names=None if names is None else tuple(names),
-        semantic_ids=None if ids is None or names is not None else tuple(map(int, ids)),
+        ids=None if ids is None or names is not None else tuple(map(int, ids)),
         sigma=None if sigma is None else np.array(sigma),
         image=image,
         source=str(path) if image is None else f"{path}, {image}",

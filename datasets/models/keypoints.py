@@ -26,6 +26,7 @@ from cadalign.io.documents import (
     require_unique,
 )
 from cadalign.io.files import damaged
+from cadalign.names import renamed
 
 _FIX = "repair or remove this model's annotation"
 # Real barycentric coordinates sum to 0.999 ... 1.001.
@@ -33,13 +34,14 @@ _SUM_TOLERANCE = 0.01
 _NO_POINT = -1
 
 
+@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class Keypoints:
     """The annotated points of a model, in the order of the annotation file."""
 
     xyz: FloatArray
     """(k, 3), positions [model units]."""
-    semantic_ids: IntArray
+    ids: IntArray
     """(k,), which keypoint of its category each one is; no id occurs twice."""
     face_index: IntArray
     """(k,), the face that each one lies on, numbered as in the mesh file."""
@@ -55,7 +57,7 @@ class Keypoints:
         return len(self.xyz)
 
     def __repr__(self) -> str:
-        return f"Keypoints(semantic_ids={self.semantic_ids.tolist()})"
+        return f"Keypoints(ids={self.ids.tolist()})"
 
     def on_mesh(self, mesh: Mesh) -> FloatArray:
         """The same points rebuilt from faces and barycentric coordinates, (k, 3) float.
@@ -245,7 +247,7 @@ def _keypoints(entries: list[_Keypoint]) -> Keypoints:
     colors = np.array([entry.rgb or grey for entry in entries]) / 255
     return Keypoints(
         xyz=_frozen([entry.xyz for entry in entries]),
-        semantic_ids=_frozen([entry.semantic_id for entry in entries]),
+        ids=_frozen([entry.semantic_id for entry in entries]),
         face_index=_frozen([entry.mesh_info.face_index for entry in entries]),
         barycentric=_frozen(weights / weights.sum(axis=1, keepdims=True)),
         point_index=_frozen(

@@ -34,6 +34,7 @@ from cadalign.io.documents import (
 )
 from cadalign.io.files import write_json
 from cadalign.io.meshes.load import load_mesh
+from cadalign.names import renamed
 
 FORMAT = "cadalign model keypoints"
 VERSION = 1
@@ -88,6 +89,7 @@ class ModelKeypoint:
     """(3,), where on that face: weights of its corners in file order, of sum 1."""
 
 
+@renamed(semantic_ids="ids")
 @dataclass(frozen=True)
 class ModelKeypoints:
     """The named keypoints of a model.
@@ -128,7 +130,7 @@ class ModelKeypoints:
         return tuple(keypoint.name for keypoint in self.keypoints)
 
     @property
-    def semantic_ids(self) -> tuple[int | None, ...]:
+    def ids(self) -> tuple[int | None, ...]:
         """The keypoints' numbers within the category."""
         return tuple(keypoint.semantic_id for keypoint in self.keypoints)
 
@@ -157,7 +159,7 @@ class ModelKeypoints:
         cls, annotated: Keypoints, model: Path | None, names: Mapping[int, str]
     ) -> ModelKeypoints:
         rows = zip(
-            annotated.semantic_ids.tolist(),
+            annotated.ids.tolist(),
             annotated.xyz.tolist(),
             annotated.face_index.tolist(),
             annotated.barycentric.tolist(),

@@ -56,7 +56,7 @@ rng = np.random.default_rng(0)
 visible = visible_keypoints(scene, seen.keypoints.xyz, camera, true_pose)
 pixels = camera.project(true_pose.apply(seen.keypoints.xyz)) + rng.normal(0, 1, (len(visible), 2))
 ids, in_photo, on_model = np.intersect1d(
-    seen.keypoints.semantic_ids[visible], model.keypoints.semantic_ids, return_indices=True
+    seen.keypoints.ids[visible], model.keypoints.ids, return_indices=True
 )
 points_2d = pixels[visible][in_photo]
 points_3d = model.keypoints.xyz[on_model]

@@ -40,7 +40,7 @@ chair = dataset.subset(categories=["chair"], split="test")["chair"][0]
 camera = cadalign.Camera.from_fov(640, 480, fov_x=35.0)
 scene = Scene(chair.load_mesh())
 true_pose = pose_in_view(scene, camera, Angles(azimuth=35.0, elevation=15.0))
-xyz, ids = chair.keypoints.xyz, chair.keypoints.semantic_ids
+xyz, ids = chair.keypoints.xyz, chair.keypoints.ids
 visible = visible_keypoints(scene, xyz, camera, true_pose)
 rng = np.random.default_rng(1)
 points_2d = camera.project(true_pose.apply(xyz))[visible] + rng.normal(0, 1, (visible.sum(), 2))
@@ -68,9 +68,7 @@ print(f"rotation {rotation_error:.2f} deg off, box IoU {overlap:.2f}")
 # The same with another chair as the model, stretched: what the shape model is worth here.
 
 other = dataset.subset(categories=["chair"], split="train")["chair"][0]
-shared, rows, other_rows = np.intersect1d(
-    ids[visible], other.keypoints.semantic_ids, return_indices=True
-)
+shared, rows, other_rows = np.intersect1d(ids[visible], other.keypoints.ids, return_indices=True)
 stretched = cadalign.fit(other.keypoints.xyz[other_rows], points_2d[rows], camera, sigma=None)
 stretched_box = Box.from_model(other.load_mesh().bounds, stretched.alignment)
 rotation_error = cadalign.metrics.rotation_error(est=stretched.alignment, gt=true_pose)

@@ -48,7 +48,7 @@ def photographed(azimuth: float) -> tuple[cadalign.Alignment, np.ndarray, np.nda
 
 truth, pixels, visible = photographed(30.0)
 true_box = cadalign.Box.from_model(scene.bounds, truth)
-ids = bottle.keypoints.semantic_ids
+ids = bottle.keypoints.ids
 model = cadalign.Model(points_3d=bottle.keypoints.xyz, ids=ids, mesh=mesh)
 
 

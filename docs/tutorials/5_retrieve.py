@@ -53,7 +53,7 @@ rng = np.random.default_rng(0)
 pixels = camera.project(truth.apply(wanted.keypoints.xyz))[visible]
 pixels += rng.normal(0, 1, pixels.shape)
 
-matches = library.retrieve(pixels, wanted.keypoints.semantic_ids[visible], camera)
+matches = library.retrieve(pixels, wanted.keypoints.ids[visible], camera)
 print(f"wanted: {wanted.model_id}")
 for match in matches[:3]:
     print(match)

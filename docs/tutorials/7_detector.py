@@ -60,7 +60,7 @@ found = {
 # --------------------------
 #
 # `ModelKeypoints` names the model's points; keypoints are paired by name. Scores become
-# confidences, which the robust estimator draws its samples by. On the command line: ``cadalign
+# scores, which the robust estimator draws its samples by. On the command line: ``cadalign
 # observe found.json car.keypoints.json --image 0.jpg``.
 
 observations = [
@@ -78,7 +78,7 @@ for observation, truth in zip(observations, truths, strict=True):
         observation.points_3d,
         observation.points_2d,
         camera,
-        confidences=observation.confidences,
+        scores=observation.scores,
         ransac=cadalign.RansacOptions(),
     )
     turn = cadalign.metrics.rotation_error(est=result.alignment, gt=truth)

@@ -93,8 +93,8 @@ class PhotoLenses:
         tasks = UnseenTasks(dataset, options)
         for place in range(0, len(tasks), -(-len(tasks) // self.objects)):
             one = observe_object(tasks[place], options)
-            known = np.isin(one.semantic_ids, shape.ids)
-            points, ids = one.xyz[one.rows][known], one.semantic_ids[known]
+            known = np.isin(one.ids, shape.ids)
+            points, ids = one.xyz[one.rows][known], one.ids[known]
             if len(ids) < 6:
                 continue
             rng = instance_rng(seed, f"{category}/{place}")

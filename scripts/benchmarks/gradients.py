@@ -229,8 +229,8 @@ def yaw_of_view(
     assert seen.names is not None
     kept = np.flatnonzero(seen.scores > 0)
     ids = [seen.names[row] for row in kept]
-    confidences = seen.scores[kept]
-    view = cadalign.View(camera, seen.points_2d[kept], ids=ids, confidences=confidences, **fields)
+    scores = seen.scores[kept]
+    view = cadalign.View(camera, seen.points_2d[kept], ids=ids, scores=scores, **fields)
     try:
         result = cadalign.align(model, view)
     except CadalignError:

@@ -91,8 +91,8 @@ class Retrieval:
         file = path.with_name("queries.jsonl")
         with file.open("wb") as queries:
             for _, seen in islice(found, self.run_queries):
-                points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.semantic_ids)
-                query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, semantic_ids=ids)
+                points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.ids)
+                query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
                 queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
         out = path.with_name("run")
         command = ["retrieve", str(file), f"--library={path}", f"--out={out}", "--no-picture"]
@@ -151,7 +151,7 @@ def _observed(
 
 
 def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
-    return library.retrieve(seen.points_2d, seen.semantic_ids, KEYPOINT_CAMERA, sigma=noise_px)
+    return library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
 
 
 @dataclass
@@ -193,14 +193,14 @@ class UnseenRetrieval:
         ious: dict[str, list[float]] = {name: [] for name in _ranking_options(shape)}
         times: dict[str, list[float]] = {name: [] for name in ious}
         for model_id, seen in self._sightings(dataset, category, count):
-            known = np.isin(seen.semantic_ids, shape.ids)
+            known = np.isin(seen.ids, shape.ids)
             gt = Box.from_model(seen.task.hull.bounds, seen.gt)
             if known.sum() < _LEAST_SHARED or gt.volume < 1e-9:
                 continue
             call = partial(
                 library.retrieve,
                 seen.points_2d[known],
-                seen.semantic_ids[known],
+                seen.ids[known],
                 KEYPOINT_CAMERA,
                 top=1,
                 category=category,
@@ -258,7 +258,7 @@ def _alike(library: Library, key: ModelKey) -> list[ModelKey]:
         *(
             model.key
             for model in library
-            if np.array_equal(np.sort(model.semantic_ids), np.sort(own.semantic_ids))
+            if np.array_equal(np.sort(model.ids), np.sort(own.ids))
             and shape_distance(model, own) <= SAME_SHAPE
         ),
     ]

@@ -105,8 +105,8 @@ class Align:
         tasks = UnseenTasks(dataset, options)
         for place in range(0, len(tasks), -(-len(tasks) // self.objects)):
             seen = observe_object(tasks[place], options)
-            known = np.isin(seen.semantic_ids, shape.ids)
-            points, ids = seen.xyz[seen.rows][known], seen.semantic_ids[known]
+            known = np.isin(seen.ids, shape.ids)
+            points, ids = seen.xyz[seen.rows][known], seen.ids[known]
             turned = Alignment(_SECOND_VIEW @ seen.gt.rotation, seen.gt.translation, seen.gt.scale)
             noise = np.random.default_rng(place).normal(0, self.noise_px, points[:, :2].shape)
             second = KEYPOINT_CAMERA.project(turned.apply(points)) + noise
@@ -154,7 +154,7 @@ class FocalShapes:
         rows, deviations = [], []
         for key in sorted(objects.ids(category))[: self.objects]:
             keypoints, rng = objects[key].keypoints, instance_rng(seed, *key)
-            ids = keypoints.semantic_ids.tolist()
+            ids = keypoints.ids.tolist()
             seen = _see(keypoints.xyz, ids, noise_px=self.noise_px, rng=rng)
             known, found = (
                 _estimate(shape, seen, camera, noise_px=self.noise_px)
@@ -328,8 +328,8 @@ def _similar_problem(
     """A random view of an object, and a random other model."""
     rng = instance_rng(0, seen.category, seen.model_id, "similar")
     other = others[int(rng.integers(len(others)))].keypoints
-    own = dict(zip(seen.keypoints.semantic_ids.tolist(), seen.keypoints.xyz, strict=True))
-    ids = zip(other.semantic_ids.tolist(), other.xyz, strict=True)
+    own = dict(zip(seen.keypoints.ids.tolist(), seen.keypoints.xyz, strict=True))
+    ids = zip(other.ids.tolist(), other.xyz, strict=True)
     pairs = [(own[k], xyz) for k, xyz in ids if k in own]
     points, model = (np.array(each).reshape(-1, 3) for each in zip(*pairs, strict=True))
     pose = look_at(

@@ -50,7 +50,7 @@ def live_of(
         problem.points_3d,
         problem.points_2d if points_2d is None else points_2d,
         intrinsics.with_focal(choice),
-        semantic_ids=np.arange(count),
+        ids=np.arange(count),
     )
     known = Known(
         None, BOX, stretch=stretch, estimates_focal=not choice.known, focal_prior=intrinsics.prior

@@ -92,7 +92,7 @@ def test_points_that_the_library_lacks_do_not_count(case: Case, library: Path) -
     (clicked,) = session.photos[0].document.keypoints - dict(case.clicks[:3]).keys()
     choice = session.choice
     assert choice is not None
-    assert clicked > max(choice.semantic_ids)
+    assert clicked > max(choice.ids)
     ranking = ranking_state(session, 0)
     assert ranking["models"] == []
     assert ranking["note"].startswith("Mark 1 more of the named keypoints")
@@ -126,10 +126,8 @@ def test_switch_keeps_pairs_by_name_and_is_saved(case: Case, library: Path) -> N
     assert observation.model is not None
     assert observation.model.samefile(other)
     shown = Library.open(library)["chair", "sample_chair_003"]
-    for number, xyz in zip(
-        observation.semantic_ids.tolist(), observation.points_3d.tolist(), strict=True
-    ):
-        row = shown.semantic_ids.tolist().index(number)
+    for number, xyz in zip(observation.ids.tolist(), observation.points_3d.tolist(), strict=True):
+        row = shown.ids.tolist().index(number)
         assert xyz == shown.xyz[row].tolist()
 
     # Undo goes on with the new model, and a restart without MODEL finds it.
@@ -147,9 +145,9 @@ def test_switch_keeps_pairs_by_name_and_is_saved(case: Case, library: Path) -> N
 def test_begins_with_the_model_of_the_most_keypoints(case: Case, library: Path) -> None:
     first = starting_model(FileOptions(library=library, category="chair"), case.photo)
     models = [model for model in Library.open(library) if model.category == "chair"]
-    most = max(len(model.semantic_ids) for model in models)
+    most = max(len(model.ids) for model in models)
     (chosen,) = (model for model in models if model.mesh_path == first)
-    assert len(chosen.semantic_ids) == most
+    assert len(chosen.ids) == most
 
 
 def test_names_carry_where_ids_do_not() -> None:

@@ -227,7 +227,7 @@ def test_keypointnet_annotations_of_the_model_are_taken(sample_root: Path) -> No
     mesh = load_mesh(annotated.mesh_path)
     file = sample_root / "annotations" / "chair.json"
     points = ModelKeypoints.load(file, mesh=mesh, model=annotated.mesh_path).keypoints
-    assert [point.semantic_id for point in points] == annotated.keypoints.semantic_ids.tolist()
+    assert [point.semantic_id for point in points] == annotated.keypoints.ids.tolist()
     np.testing.assert_array_equal([point.xyz for point in points], annotated.keypoints.xyz)
     with pytest.raises(DataError, match="has no annotations of a model whose id occurs in"):
         ModelKeypoints.load(file, mesh=mesh, model=Path("other.ply"))

@@ -163,7 +163,7 @@ def test_objects_have_models_of_their_own(
     assert shown["image"]["model_number"] == 1
     model = session.objects[0][2].model
     for keypoint, uv in case.clicks[:6]:
-        xyz = case.instance.points_3d[case.instance.semantic_ids.tolist().index(keypoint)]
+        xyz = case.instance.points_3d[case.instance.ids.tolist().index(keypoint)]
         known = model.registry.find(xyz, tolerance=1e-3)
         number = known if known is not None else add_point(model, xyz)
         perform(session, 0, {"do": "place_uv", "uv": uv}, slot=2)

@@ -492,7 +492,7 @@ def test_shape_is_drawn_and_an_unknown_point_identified(browser: Browser, case: 
     """Rings and regions of unmarked keypoints, and the choice which keypoint a point is."""
     points = ModelKeypoints.load(case.keypoints)
     rng = np.random.default_rng(0)
-    ids = [int(number or 0) for number in points.semantic_ids[1:]]
+    ids = [int(number or 0) for number in points.ids[1:]]
     examples = [
         Example(f"chair {row}", ids, points.xyz[1:] * rng.normal(1, 0.1, 3)) for row in range(40)
     ]

@@ -100,9 +100,9 @@ def photographed(cars: Path, folder: Path) -> Iterator[Scripted]:
     """Cars of three street photos, whose model is the average car."""
     for truth in json.loads((cars / "truth.json").read_text()):
         observed = Observation.load(cars / "observations" / f"{truth['name']}.json")
-        assert observed.confidences is not None
+        assert observed.scores is not None
         assert observed.image is not None
-        seen = observed.confidences > 0.1
+        seen = observed.scores > 0.1
         points, uv = observed.points_3d[seen], observed.points_2d[seen]
         own = folder / truth["name"]
         own.mkdir()

@@ -61,8 +61,8 @@ def test_file_gives_the_same_alignment_as_the_page(
     written = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
     assert written.alignment.to_dict() == state["alignment"]["alignment"]
     observation = Observation.load(case.observation)
-    assert observation.semantic_ids is not None
-    assert observation.semantic_ids.tolist() == case.instance.semantic_ids.tolist()
+    assert observation.ids is not None
+    assert observation.ids.tolist() == case.instance.ids.tolist()
     np.testing.assert_array_equal(observation.points_2d, case.instance.points_2d)
     assert observation.camera == case.instance.camera
     assert observation.image is not None
@@ -194,7 +194,7 @@ def test_errors_of_saving_are_shown_and_nothing_is_lost(
 def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
     instance = case.instance
     count = len(instance.points_3d)
-    sigma, confidences = np.linspace(0.5, 3, count), np.linspace(0, 0.9, count)
+    sigma, scores = np.linspace(0.5, 3, count), np.linspace(0, 0.9, count)
     names = tuple(f"detected {k}" for k in range(count))
     Observation(
         instance.points_3d,
@@ -202,7 +202,7 @@ def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
         instance.camera,
         sigma=sigma,
         names=names,
-        confidences=confidences,
+        scores=scores,
     ).save(case.observation)
     session = case.open()
     expected = fit(instance.points_3d, instance.points_2d, instance.camera, sigma=sigma)
@@ -212,10 +212,10 @@ def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
     written = Observation.load(case.observation)
     assert written.sigma is not None
     assert written.names is not None
-    assert written.confidences is not None
+    assert written.scores is not None
     assert written.sigma.tolist() == [*sigma.tolist(), 1.0]
     assert written.names[:-1] == names
-    assert written.confidences.tolist() == [*confidences.tolist(), 1.0]
+    assert written.scores.tolist() == [*scores.tolist(), 1.0]
 
 
 # --- actions ---------------------------------------------------------------------------------

@@ -42,7 +42,7 @@ def shape_file(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     """The shape of chairs; two of the sample chair's keypoints were not learned, one is new."""
     keypoints = KeypointNet(sample_root)["chair", "sample_chair_000"].keypoints
     points = np.concatenate([keypoints.xyz[LACKING:], [[0.0, 0.1, 0.0]]])
-    ids = [*keypoints.semantic_ids[LACKING:].tolist(), 77]
+    ids = [*keypoints.ids[LACKING:].tolist(), 77]
     path = tmp_path_factory.mktemp("shapes") / "chair.shape"
     learn(points, ids).save(path)
     return path
@@ -81,7 +81,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
 ) -> None:
     instance = case.instance
     keep = slice(None if count is None else count + LACKING)
-    ids = instance.semantic_ids[keep]
+    ids = instance.ids[keep]
     sigma = np.random.default_rng(0).uniform(0.5, 2, len(ids)) if weighted else None
     of_model = {
         each.semantic_id: each.xyz for each in ModelKeypoints.load(case.keypoints).keypoints
@@ -162,7 +162,7 @@ def test_warp_carries_points_that_the_shape_lacks(case: Case, shape_file: Path) 
     observation = Observation.load(case.observation)
     assert observation.shape is not None
     assert observation.shape.samefile(shape_file)
-    assert set(observation.semantic_ids.tolist()) <= known  # type: ignore[union-attr]
+    assert set(observation.ids.tolist()) <= known  # type: ignore[union-attr]
     again = page_state(case.open(shape=shape_file), 0)["pairs"]
     both = ({(p["keypoint"], tuple(p["uv"])) for p in pairs} for pairs in (state["pairs"], again))
     assert next(both) == next(both)
@@ -187,7 +187,7 @@ def test_points_of_the_model_can_be_identified(
     assert state["pairs"][0]["keypoint"] == 77
     assert state["shape"]["missing"] == []
     written = ModelKeypoints.load(session.keypoints_path)
-    assert 77 in written.semantic_ids
+    assert 77 in written.ids
     perform(session, 0, {"do": "undo"})
     assert not page_state(session, 0)["pairs"][0]["counts"]
 

@@ -37,7 +37,7 @@ def observations(count: int, *, noise: float = 1.0) -> Iterator[Observation]:
         scale = np.array([1, *np.exp(rng.uniform(-0.3, 0.3, 2))])
         pose = Alignment(cadalign_rotation(rng), [0.1, 0.2, 6.0], scale)
         seen = CAMERA.project(pose.apply(POINTS)) + rng.normal(0, noise, (8, 2))
-        yield Observation(POINTS, seen, CAMERA, semantic_ids=np.arange(8))
+        yield Observation(POINTS, seen, CAMERA, ids=np.arange(8))
 
 
 def cadalign_rotation(rng: np.random.Generator) -> Any:

@@ -56,7 +56,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         stretch = (1.0, *np.exp(rng.uniform(-0.2, 0.2, 2)).tolist())
         pose = look_at(azimuth=rng.uniform(0, 360), elevation=20.0, distance=2.6, scale=stretch)
         seen = CAMERA.project(pose.apply(model.xyz)) + rng.normal(0, 0.5, (len(model.xyz), 2))
-        query = Observation(np.zeros_like(model.xyz), seen, CAMERA, None, model.semantic_ids)
+        query = Observation(np.zeros_like(model.xyz), seen, CAMERA, None, model.ids)
         texts.append(json.dumps(query.to_dict(states_origins=True)))
         keys.append(model.key)
     (folder / "queries.jsonl").write_text("\n".join(texts) + "\n")
@@ -191,12 +191,12 @@ def test_another_library_is_another_run(
 def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:
     model = case.library["chair", "sample_chair_001"]
     pose = look_at(azimuth=40.0, elevation=20.0, distance=2.6, scale=(1.0, 1.2, 0.9))
-    ids = model.semantic_ids[::-1]
+    ids = model.ids[::-1]
     seen = Observation(
         np.zeros_like(model.xyz),
         CAMERA.project(pose.apply(model.xyz))[::-1],
         CAMERA,
-        semantic_ids=ids,
+        ids=ids,
         names=tuple(f"k{each}" for each in ids),
     )
     match = case.library.retrieve(seen.points_2d, ids, CAMERA)[0]

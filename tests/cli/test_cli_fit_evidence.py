@@ -46,7 +46,7 @@ def observed(angle: float = 0.0, rows: slice = slice(None), **evidence: Any) -> 
     pixels = CAMERA.project(in_camera(POINTS, TRUTH, around(angle))) + noise
     ids = np.arange(len(POINTS))[rows]
     return ObservedImage(
-        POINTS[rows], pixels[rows], CAMERA, semantic_ids=ids, evidence=ImageEvidence(**evidence)
+        POINTS[rows], pixels[rows], CAMERA, ids=ids, evidence=ImageEvidence(**evidence)
     )
 
 
@@ -126,7 +126,7 @@ def test_views_of_a_rig_share_the_model(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_keypoints_without_ids_are_the_same_at_the_same_point(tmp_path: Path) -> None:
-    images = [replace(observed(angle), semantic_ids=None) for angle in (0.0, 25.0)]
+    images = [replace(observed(angle), ids=None) for angle in (0.0, 25.0)]
     images[1] = replace(
         images[1], points_3d=images[1].points_3d[::-1], points_2d=images[1].points_2d[::-1]
     )

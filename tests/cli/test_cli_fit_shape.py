@@ -58,7 +58,7 @@ def write(folder: Path, count: int = 6, **fields: Any) -> Path:
     """An observation of a box's first corners, some noise, and corners of the unit box as xyz."""
     noise = np.random.default_rng(1).normal(0, 0.5, (8, 2))
     pixels = CAMERA.project(TRUTH.apply(CORNERS * RIGHT)) + noise
-    fields = {"semantic_ids": np.arange(count), **fields}
+    fields = {"ids": np.arange(count), **fields}
     Observation(CORNERS[:count], pixels[:count], CAMERA, **fields).save(folder / "box.json")
     return folder / "box.json"
 
@@ -117,7 +117,7 @@ def test_keypoints_are_found_by_name_and_need_no_xyz(
 ) -> None:
     shape = boxes(NAMES)
     shape.save(tmp_path / "box.shape")
-    path = write(tmp_path, names=NAMES[:6], semantic_ids=np.full(6, 3))
+    path = write(tmp_path, names=NAMES[:6], ids=np.full(6, 3))
     keypoints = json.loads(path.read_text())["keypoints"]
     edit(path, keypoints=[{"name": each["name"], "uv": each["uv"]} for each in keypoints])
     assert main(["fit", str(path), "--shape", str(tmp_path / "box.shape"), "--sigma", "2"]) == 0
@@ -236,15 +236,15 @@ def test_options_of_the_robust_search_and_confidences_count_with_a_shape(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
 ) -> None:
     numbered.save(tmp_path / "box.shape")
-    confidences = np.array([0.9, 0.8, 0.1, 0.9, 0.8, 0.9, 0.7, 0.9])
-    path = write(tmp_path, 8, shape=tmp_path / "box.shape", confidences=confidences)
+    scores = np.array([0.9, 0.8, 0.1, 0.9, 0.8, 0.9, 0.7, 0.9])
+    path = write(tmp_path, 8, shape=tmp_path / "box.shape", scores=scores)
     data = json.loads(path.read_text())
     data["keypoints"][2]["uv"] = [20.0, 400.0]
     path.write_text(json.dumps(data))
     flags = ["--robust", "--max-iterations", "20", "--min-iterations", "5", "--no-refine"]
     assert main(["fit", str(path), *flags]) == 0
     ransac = RansacOptions(max_iterations=20, min_iterations=5, refine=False)
-    view = View(CAMERA, Observation.load(path).points_2d, confidences=confidences)
+    view = View(CAMERA, Observation.load(path).points_2d, scores=scores)
     assert capsys.readouterr().out == f"{align(numbered, view, ransac=ransac)}\n"
 
 
@@ -285,7 +285,7 @@ def test_unknown_keypoints_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
 ) -> None:
     numbered.save(tmp_path / "box.shape")
-    path = write(tmp_path, semantic_ids=np.array([0, 1, 9, 3, 12, 5]))
+    path = write(tmp_path, ids=np.array([0, 1, 9, 3, 12, 5]))
     assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
         f"{path}: keypoints.semantic_id: box has no keypoint 9, 12; "
         "known are [0, 1, 2, 3, 4, 5, 6, 7]"
@@ -296,7 +296,7 @@ def test_keypoints_without_ids(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
 ) -> None:
     numbered.save(tmp_path / "box.shape")
-    path = write(tmp_path, semantic_ids=None, names=NAMES[:6])
+    path = write(tmp_path, ids=None, names=NAMES[:6])
     assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
         f"{path}: keypoints: the keypoints have no semantic_id; "
         "the shape of box knows its keypoints by their semantic ids"
@@ -307,7 +307,7 @@ def test_keypoint_that_occurs_twice(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
 ) -> None:
     numbered.save(tmp_path / "box.shape")
-    path = write(tmp_path, semantic_ids=np.array([0, 1, 2, 3, 1, 5]))
+    path = write(tmp_path, ids=np.array([0, 1, 2, 3, 1, 5]))
     assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
         f"{path}: keypoints[4].semantic_id: 1 occurs twice, first in keypoints[1]"
     )

@@ -74,8 +74,8 @@ def test_photo_and_detection_become_an_observation(
     assert observation.camera == Camera.without_focal(640, 480)
     assert observation.names == tuple(NAMES)
     np.testing.assert_allclose(observation.points_2d, POINTS_2D)
-    assert observation.confidences is not None
-    assert observation.confidences.min() >= 0.3
+    assert observation.scores is not None
+    assert observation.scores.min() >= 0.3
     assert observation.image == folder / "photo.jpg"
     assert json.loads(out.read_text())["image"] == "photo.jpg"
 
@@ -166,7 +166,7 @@ def test_robust_fit_draws_by_the_scores(folder: Path) -> None:
     points_2d[:8] += 60.0
     scores = np.where(np.arange(24) < 8, 0.1, 0.9)
     camera = Camera.without_focal(640, 480)
-    Observation(POINTS_3D, points_2d, camera, confidences=scores).save(folder / "spoiled.json")
+    Observation(POINTS_3D, points_2d, camera, scores=scores).save(folder / "spoiled.json")
     result = fitted(folder, "spoiled", "--robust")
     assert result.inliers.tolist() == [False] * 8 + [True] * 16
     assert result.camera.fx == pytest.approx(620, rel=0.1)
@@ -177,7 +177,7 @@ def test_scores_can_weigh_instead(folder: Path) -> None:
         folder, "--image", str(folder / "photo.jpg"), "--weigh", "--sigma", "2", "--min-score", ".5"
     )
     observation = Observation.load(folder / "found.observation.json")
-    assert observation.confidences is None
+    assert observation.scores is None
     assert observation.sigma is not None
     assert observation.sigma.min() >= 2.0
     assert observation.sigma.max() <= 4.0

@@ -75,7 +75,7 @@ def test_trusted_keypoints_on_one_side_do_not_mislead(car: Path) -> None:
     for seed in range(5):
         ransac = RansacOptions(max_reproj_error=THRESHOLD_PX, seed=seed)
         scores = np.linspace(1.0, 0.5, 36)
-        result = fit(points_3d, points_2d, camera, sigma=None, ransac=ransac, confidences=scores)
+        result = fit(points_3d, points_2d, camera, sigma=None, ransac=ransac, scores=scores)
         assert result.inliers.sum() >= 25
 
 

@@ -289,14 +289,14 @@ def test_csv_needs_pixels_only(tmp_path: Path) -> None:
     text = "\ufeffX, Y ,visibility,semantic_id,sigma\r\n1,2,2,4,0.5\r\n,,0,5,\r\n\r\n3,4,1,0,2\r\n"
     (found,) = read(tmp_path, text, "keypoints.csv")
     assert found.points_2d.tolist() == [[1, 2], [3, 4]]
-    assert found.semantic_ids == (4, 0)
+    assert found.ids == (4, 0)
     assert found.scores is not None
     assert found.scores.tolist() == [1.0, 0.5]
     assert found.sigma is not None
     assert found.sigma.tolist() == [0.5, 2.0]
     (plain,) = read(tmp_path, "u,v\n1,2\n", "plain.CSV")
     assert plain.names is None
-    assert plain.semantic_ids is None
+    assert plain.ids is None
     assert plain.scores is None
 
 
@@ -409,21 +409,21 @@ def test_names_pair_whatever_their_spelling() -> None:
     assert observation.names == ("nose", "left ear")
     assert observation.points_3d.tolist() == [[0.5, 0.5, 1.0], [0.0, 1.0, 0.0]]
     assert observation.points_2d.tolist() == POINTS[:2]
-    assert observation.semantic_ids is not None
-    assert observation.semantic_ids.tolist() == [0, 4]
-    assert observation.confidences is not None
-    assert observation.confidences.tolist() == [0.9, 0.8]
+    assert observation.ids is not None
+    assert observation.ids.tolist() == [0, 4]
+    assert observation.scores is not None
+    assert observation.scores.tolist() == [0.9, 0.8]
     assert observation.sigma is None
     assert (observation.image, observation.model) == (Path("a.jpg"), MODEL.model)
     assert observation.camera == CAMERA
 
 
 def test_ids_pair_where_there_are_no_names_and_order_where_there_is_neither() -> None:
-    by_id = join_keypoints(ImageKeypoints(np.array(POINTS), semantic_ids=(0, 4, 5)), MODEL, CAMERA)
+    by_id = join_keypoints(ImageKeypoints(np.array(POINTS), ids=(0, 4, 5)), MODEL, CAMERA)
     assert by_id.names == ("nose", "left ear", "right ear")
     by_order = join_keypoints(ImageKeypoints(np.array(POINTS)), MODEL, CAMERA)
     assert by_order.names == MODEL.names
-    assert by_order.confidences is None
+    assert by_order.scores is None
 
 
 def test_scores_leave_out_or_weigh() -> None:
@@ -432,7 +432,7 @@ def test_scores_leave_out_or_weigh() -> None:
     weighed = join_keypoints(found, MODEL, CAMERA, sigma_from_scores=2.0)
     assert weighed.sigma is not None
     assert weighed.sigma.tolist() == [8.0, 2.5, 2.0]
-    assert weighed.confidences is None
+    assert weighed.scores is None
 
 
 def test_unknown_keypoints_can_be_left_out() -> None:
@@ -443,7 +443,7 @@ def test_unknown_keypoints_can_be_left_out() -> None:
 
 def test_model_keypoints_without_ids_give_none() -> None:
     nameless = ModelKeypoints(tuple(ModelKeypoint(n, (0.0, 0.0, 0.0)) for n in "abc"))
-    assert join_keypoints(ImageKeypoints(np.array(POINTS)), nameless, CAMERA).semantic_ids is None
+    assert join_keypoints(ImageKeypoints(np.array(POINTS)), nameless, CAMERA).ids is None
 
 
 @pytest.mark.parametrize(
@@ -456,7 +456,7 @@ def test_model_keypoints_without_ids_give_none() -> None:
             "it has left ear, right ear, nose; ignore_unknown leaves out what it has not",
         ),
         (
-            {"semantic_ids": (0, 4, 9)},
+            {"ids": (0, 4, 9)},
             {},
             "photo.json: the model has no keypoint 9; "
             "it has left ear, right ear, nose; ignore_unknown leaves out what it has not",
@@ -502,7 +502,7 @@ def test_keypoints_that_cannot_be_paired_are_refused(
         ({"points_2d": np.zeros((3, 3))}, "keypoints: keypoints: shape (3, 3), expected (n, 2)"),
         ({"scores": np.ones(2)}, "keypoints: scores: shape (2,), expected (3)"),
         ({"names": ("a",)}, "keypoints: 3 keypoints but 1 names"),
-        ({"semantic_ids": (1, 2)}, "keypoints: 3 keypoints but 2 semantic ids"),
+        ({"ids": (1, 2)}, "keypoints: 3 keypoints but 2 ids"),
     ],
 )
 def test_fields_that_do_not_match_are_refused(fields: dict[str, Any], text: str) -> None:

@@ -86,7 +86,7 @@ def test_keypoints_and_symmetries_arrive(root):
     assert model.class_id == CHAIR
     keypoints = model.keypoints
     assert len(keypoints) == 4
-    assert keypoints.semantic_ids.tolist() == [0, 2, 4, 6]
+    assert keypoints.ids.tolist() == [0, 2, 4, 6]
     assert keypoints.face_index.tolist() == keypoints.point_index.tolist() == [0, 1, 2, 3]
     np.testing.assert_allclose(keypoints.barycentric.sum(axis=1), 1, atol=1e-15)
     np.testing.assert_allclose(keypoints.colors[0], [1, 0, 0.2])

@@ -52,7 +52,7 @@ def changed(row: int, **fields: Any) -> dict[str, Any]:
 def test_fields_arrive_and_faces_become_places(tmp_path: Path) -> None:
     keypoints = ModelKeypoints.load(write(tmp_path / "a.keypoints.json"))
     assert keypoints.names == ("top", "floor", "slope")
-    assert keypoints.semantic_ids == (7, None, 2)
+    assert keypoints.ids == (7, None, 2)
     assert keypoints.model == tmp_path / "tetrahedron.obj"
     np.testing.assert_allclose(
         keypoints.xyz, [[0, 0, 1], [0.25, 0.5, 0], [0.2, 0.3, 0.5]], atol=1e-15
@@ -84,13 +84,13 @@ def test_load_undoes_save_exactly(tmp_path: Path) -> None:
 
 def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_path: Path) -> None:
     model = next(iter(KeypointNet(sample_root)["chair"]))
-    ids = model.keypoints.semantic_ids.tolist()
+    ids = model.keypoints.ids.tolist()
     keypoints = ModelKeypoints.of_model(model, names={ids[1]: "back, top left"})
     keypoints.save(tmp_path / "chair.keypoints.json")
     again = ModelKeypoints.load(tmp_path / "chair.keypoints.json")
     assert again == keypoints
     assert again.names[:2] == (f"keypoint {ids[0]}", "back, top left")
-    assert again.semantic_ids == tuple(ids)
+    assert again.ids == tuple(ids)
     data = json.loads((tmp_path / "chair.keypoints.json").read_text())
     for entry in data["keypoints"]:
         del entry["xyz"]

@@ -83,7 +83,7 @@ def case_of(root: Path, kind: str) -> Case:
         "up": truth.rotation[:, 1],
         "camera_height": abs(float(camera[1] - scale[1] * scene.bounds[0, 1])),
     }
-    ids = bottles[0].keypoints.semantic_ids
+    ids = bottles[0].keypoints.ids
     model: Model | ShapeModel
     if kind == "learned":
         examples = examples_of(bottles[1:], meshes=True, on_progress=lambda done, total: None)

@@ -102,7 +102,7 @@ def test_file_is_read_as_written(tmp_path: Path) -> None:
         (
             lambda: DetectorNoise([0.2, 0.8], [2.0, 1.0]).sigma(np.zeros((1, 2))),
             "scores: the detector's noise depends on the scores, which are missing; give the "
-            "keypoints' confidences",
+            "keypoints' scores",
         ),
         (lambda: DetectorNoise([0.8, 0.2], [2.0, 1.0]), "scores: do not rise"),
         (
@@ -151,7 +151,7 @@ def test_a_fit_and_a_view_take_the_noise(
         problem_of(1).camera,
         [each["uv"] for each in data],
         ids=[each["name"] for each in data],
-        confidences=[each["confidence"] for each in data],
+        scores=[each["confidence"] for each in data],
         noise=noise,
     )
     expected = 3.0 * (0.5 / 3.0) ** (np.arange(10) / 10.0)
@@ -210,7 +210,7 @@ def test_calibrated_noise_states_the_yaw_of_cars_honestly() -> None:
         if len(kept) < 6:
             continue
         ids = [each.names[row] for row in kept]
-        fields: dict[str, Any] = {"ids": ids, "confidences": each.scores[kept]}
+        fields: dict[str, Any] = {"ids": ids, "scores": each.scores[kept]}
         ways = ({"sigma": 3.0}, {"noise": noise}, {"noise": others[k]})
         for name, way in zip(rows, ways, strict=True):
             view = View(camera, each.points_2d[kept], **fields, **way)

@@ -312,9 +312,9 @@ def test_threads_agree_where_all_of_a_share_fail() -> None:
     assert batch.fisher_covariance.shape == (4, 10, 10)
 
 
-def test_confidences_without_ransac_are_refused() -> None:
+def test_scores_without_ransac_are_refused() -> None:
     problems = problems_of([8, 9])
-    with pytest.raises(InputError, match="confidences: given without ransac"):
-        run(problems, confidences=[np.ones(8), np.ones(9)])
-    with pytest.raises(InputError, match="confidences: 2 problems but 1 sets"):
-        run(problems, confidences=[np.ones(8)], ransac=RansacOptions())
+    with pytest.raises(InputError, match="scores: given without ransac"):
+        run(problems, scores=[np.ones(8), np.ones(9)])
+    with pytest.raises(InputError, match="scores: 2 problems but 1 sets"):
+        run(problems, scores=[np.ones(8)], ransac=RansacOptions())

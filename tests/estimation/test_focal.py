@@ -489,8 +489,8 @@ def test_robust_search_is_reproducible_and_guided() -> None:
     with pytest.raises(NoConsensusError):
         fit(*arguments, **options)
     scores = np.where(wrong, 0.1, 0.9)
-    first = fit(*arguments, **options, confidences=scores)
-    second = fit(*arguments, **options, confidences=scores)
+    first = fit(*arguments, **options, scores=scores)
+    second = fit(*arguments, **options, scores=scores)
     assert first.alignment == second.alignment
     assert not first.inliers[wrong].any()
     assert first.inliers.sum() >= 18

@@ -15,7 +15,7 @@ from cadalign import fit, fit_batch
 from cadalign.estimation import options
 from cadalign.estimation.options import FitOptions, RansacOptions
 
-NOT_OPTIONS = {"ransac", "confidences", "workers", "symmetry"}
+NOT_OPTIONS = {"ransac", "scores", "workers", "symmetry"}
 
 
 @pytest.mark.parametrize("function", [fit, fit_batch])

@@ -71,7 +71,7 @@ def test_regions_hold_unseen_keypoints_of_unseen_chairs() -> None:
     for row, model in enumerate(dataset.subset(categories=["chair"], split="val")["chair"]):
         rng = np.random.default_rng(row)
         pose = look_at(azimuth=rng.uniform(0, 360), elevation=rng.uniform(0, 60), distance=2.0)
-        ids = model.keypoints.semantic_ids.tolist()
+        ids = model.keypoints.ids.tolist()
         pixels = KEYPOINT_CAMERA.project(pose.apply(model.keypoints.xyz))
         seen = rng.permutation(len(ids))[:6]
         noisy = pixels[seen] + 2 * rng.standard_normal((len(seen), 2))

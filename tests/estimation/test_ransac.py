@@ -97,17 +97,15 @@ def test_threads_do_not_change_the_result() -> None:
 def test_order_of_the_keypoints_does_not_matter() -> None:
     problem, points_2d, wrong = spoiled(6, points=120, outliers=70)
     order = np.random.default_rng(0).permutation(120)
-    confidences = np.where(wrong, 0.3, 0.7) + np.random.default_rng(1).uniform(0, 0.3, 120)
-    for trusted in (None, confidences):
-        plain = fit(
-            problem.points_3d, points_2d, CAMERA, ransac=RansacOptions(), confidences=trusted
-        )
+    scores = np.where(wrong, 0.3, 0.7) + np.random.default_rng(1).uniform(0, 0.3, 120)
+    for trusted in (None, scores):
+        plain = fit(problem.points_3d, points_2d, CAMERA, ransac=RansacOptions(), scores=trusted)
         mixed = fit(
             problem.points_3d[order],
             points_2d[order],
             CAMERA,
             ransac=RansacOptions(),
-            confidences=None if trusted is None else trusted[order],
+            scores=None if trusted is None else trusted[order],
         )
         np.testing.assert_array_equal(mixed.inliers, plain.inliers[order])
         np.testing.assert_allclose(mixed.alignment.scale, plain.alignment.scale, rtol=1e-6)
@@ -116,18 +114,18 @@ def test_order_of_the_keypoints_does_not_matter() -> None:
 def test_trusted_inliers_are_sampled_first() -> None:
     problem, points_2d, wrong = spoiled(3, points=300, outliers=270)
     options = RansacOptions(min_iterations=1, max_iterations=100)
-    trusted = fit(problem.points_3d, points_2d, CAMERA, ransac=options, confidences=1.0 - wrong)
+    trusted = fit(problem.points_3d, points_2d, CAMERA, ransac=options, scores=1.0 - wrong)
     assert not trusted.inliers[wrong].any()
     assert trusted.inliers[~wrong].mean() > 0.9
 
 
 @pytest.mark.long
-def test_confidences_shorten_the_search() -> None:
+def test_scores_shorten_the_search() -> None:
     problem, points_2d, wrong = spoiled(3, points=300, outliers=255)
     options = RansacOptions(min_iterations=1, max_iterations=50_000)
     rng = np.random.default_rng(0)
-    confidences = np.where(wrong, 0.3, 0.7) + rng.uniform(0, 0.3, 300)
-    guided = fit(problem.points_3d, points_2d, CAMERA, ransac=options, confidences=confidences)
+    scores = np.where(wrong, 0.3, 0.7) + rng.uniform(0, 0.3, 300)
+    guided = fit(problem.points_3d, points_2d, CAMERA, ransac=options, scores=scores)
     blind = fit(problem.points_3d, points_2d, CAMERA, ransac=options)
     assert not guided.inliers[wrong].any()
     assert not blind.inliers[wrong].any()
@@ -202,9 +200,9 @@ def good() -> Problem:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"confidences": -np.ones(10)}, "confidences: keypoint 0 has the confidence -1; "),
-        ({"confidences": np.full(10, np.nan)}, "confidences: NaN or infinite values in rows 0, 1"),
-        ({"confidences": np.ones(9)}, "confidences: shape (9,), expected (10)"),
+        ({"scores": -np.ones(10)}, "scores: keypoint 0 has the score -1; "),
+        ({"scores": np.full(10, np.nan)}, "scores: NaN or infinite values in rows 0, 1"),
+        ({"scores": np.ones(9)}, "scores: shape (9,), expected (10)"),
         ({"method": "aepnp"}, "method: the method 'aepnp' does not go with ransac; "),
     ],
 )
@@ -221,10 +219,10 @@ def test_too_few_keypoints_are_refused() -> None:
         fit(problem.points_3d[:3], problem.points_2d[:3], CAMERA, ransac=RansacOptions())
 
 
-def test_confidences_without_ransac_are_refused() -> None:
+def test_scores_without_ransac_are_refused() -> None:
     problem = good()
-    with pytest.raises(InputError, match="confidences: given without ransac"):
-        fit(problem.points_3d, problem.points_2d, CAMERA, confidences=np.ones(10))
+    with pytest.raises(InputError, match="scores: given without ransac"):
+        fit(problem.points_3d, problem.points_2d, CAMERA, scores=np.ones(10))
 
 
 @pytest.mark.parametrize(
@@ -291,10 +289,10 @@ def test_real_correspondences(share: float, draws: int, wanted: float, max_itera
     assert np.mean(succeeded) >= wanted
 
 
-def test_confidences_that_are_all_alike_guide_nothing() -> None:
+def test_scores_that_are_all_alike_guide_nothing() -> None:
     problem, points_2d, _ = spoiled(3, points=60, outliers=20)
     options = RansacOptions()
-    alike = fit(problem.points_3d, points_2d, CAMERA, ransac=options, confidences=np.full(60, 0.7))
+    alike = fit(problem.points_3d, points_2d, CAMERA, ransac=options, scores=np.full(60, 0.7))
     blind = fit(problem.points_3d, points_2d, CAMERA, ransac=options)
     assert alike.alignment == blind.alignment
     assert alike.stats.iterations == blind.stats.iterations

@@ -195,7 +195,7 @@ def test_samples_follow_confidences(minimal: str) -> None:
     moved = photo.copy()
     wrong = [0, 3, 5, 8, 11]
     moved[wrong] += np.random.default_rng(0).uniform(60, 120, (5, 2))
-    confidences = np.where(np.isin(np.arange(POINTS), wrong), 0.1, 0.9)
-    view = View(TRUE, moved, sigma=0.5, confidences=confidences)
+    scores = np.where(np.isin(np.arange(POINTS), wrong), 0.1, 0.9)
+    view = View(TRUE, moved, sigma=0.5, scores=scores)
     result = align(model, view, ransac=RansacOptions(minimal=minimal))
     assert np.flatnonzero(~result.inliers).tolist() == wrong

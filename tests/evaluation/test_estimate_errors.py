@@ -30,7 +30,7 @@ def instance(rng: np.random.Generator, gt: Alignment, extents: FloatArray) -> In
         cam_from_model=gt,
         points_3d=points,
         points_2d=KEYPOINT_CAMERA.project(gt.apply(points)) + rng.normal(size=(len(points), 2)),
-        semantic_ids=np.arange(len(points)),
+        ids=np.arange(len(points)),
         bounds=np.array([-0.5, 0.5])[:, None] * extents,
         gt=gt,
         visibility=HULL,

@@ -105,7 +105,7 @@ def task(model_id: str = "a", view: int = 0) -> KeypointTask:
         model_id=model_id,
         view=view,
         hull=KeypointHull(cloud()),
-        semantic_ids=np.arange(14),
+        ids=np.arange(14),
         symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
         model=None,
     )

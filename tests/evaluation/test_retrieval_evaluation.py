@@ -83,8 +83,8 @@ class TestQueries:
             task = RetrievalTask("box", "003", 2.0, 7)
             query = observe_model(model, task, seed=seed)
             assert len(query.points_2d) == 7
-            assert len(set(query.semantic_ids.tolist())) == 7
-            projected = KEYPOINT_CAMERA.project(query.gt.apply(model.xyz[query.semantic_ids]))
+            assert len(set(query.ids.tolist())) == 7
+            projected = KEYPOINT_CAMERA.project(query.gt.apply(model.xyz[query.ids]))
             errors.append(query.points_2d - projected)
             assert query.gt.scale[0] == 1
             assert ((query.gt.scale[1:] > 0.5) & (query.gt.scale[1:] < 2)).all()
@@ -164,7 +164,7 @@ class TestRows:
         query = observe_model(model, task, seed=0)
         best = opened.retrieve(
             query.points_2d,
-            query.semantic_ids,
+            query.ids,
             KEYPOINT_CAMERA,
             shape_sigma=QUICK.shape_sigma,
             exclude=[("box", "007")],
@@ -184,7 +184,7 @@ class TestRows:
         xyz = np.vstack(
             [make_model(1).xyz[:8], np.random.default_rng(5).uniform(-0.01, 0.01, (6, 3))]
         )
-        model = replace(make_model(1, keypoints=12), xyz=xyz, semantic_ids=np.arange(14))
+        model = replace(make_model(1, keypoints=12), xyz=xyz, ids=np.arange(14))
         other = replace(model, model_id="2", xyz=xyz * [1.1, 1, 1])
         path = tmp_path / "lib"
         Library.from_models([model, other]).save(path)

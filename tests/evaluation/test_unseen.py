@@ -145,7 +145,7 @@ class TestViews:
         all_points = observe_object(tasks[1], options)
         few = observe_object(tasks[1], replace(options, keypoints=5))
         assert len(few.points_2d) == 5
-        rows = [all_points.semantic_ids.tolist().index(label) for label in few.semantic_ids]
+        rows = [all_points.ids.tolist().index(label) for label in few.ids]
         np.testing.assert_array_equal(all_points.points_2d[rows], few.points_2d)
         np.testing.assert_array_equal(all_points.gt.rotation, few.gt.rotation)
         other = observe_object(tasks[1], replace(options, seed=1))

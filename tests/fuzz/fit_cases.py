@@ -16,7 +16,7 @@ CAMERA = Camera(640, 480, 500.0, 505.0, 319.5, 239.5)
 LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.25, 0.08, 0.004, -0.003))
 OPTIONS = (
     "method", "sigma", "loss", "loss_scale", "stretch", "scale_prior_sigma", "known_axis", "focal",
-    "focal_prior", "ransac", "confidences",
+    "focal_prior", "ransac", "scores",
 )  # fmt: skip
 
 
@@ -135,7 +135,7 @@ def _exact_outliers(rng: np.random.Generator) -> Case:
     pixels[:wrong] = rng.uniform(0, 1, (wrong, 2)) * [640, 480]
     options: dict[str, Any] = {"ransac": RansacOptions(seed=int(rng.integers(1000)))}
     if rng.random() < 0.3:
-        options["confidences"] = rng.uniform(0, 1, len(points))
+        options["scores"] = rng.uniform(0, 1, len(points))
     # An outlier may come to lie within the threshold by chance, and then shifts the optimum.
     in_reach = np.linalg.norm(_pixels(pose, points[:wrong]) - pixels[:wrong], axis=1) < 40
     truth = None if in_reach.any() else pose
@@ -304,7 +304,7 @@ def _careless(rng: np.random.Generator) -> Case:
             "minimal", "refine",
         ))  # fmt: skip
         if rng.random() < 0.3:
-            options["confidences"] = draw_array(rng, (8,))
+            options["scores"] = draw_array(rng, (8,))
     if rng.random() < 0.1:
         options["focal"] = "estimate"
         options["focal_prior"] = _call(

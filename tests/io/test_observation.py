@@ -40,9 +40,9 @@ def test_fields_arrive() -> None:
     assert observation.points_2d.tolist() == [k["uv"] for k in DATA["keypoints"]]
     assert observation.camera == Camera(640, 480, 500, 500, 319.5, 239.5)
     assert observation.sigma is not None
-    assert observation.semantic_ids is not None
+    assert observation.ids is not None
     assert observation.sigma.tolist() == [1, 2, 3, 4, 5, 6]
-    assert observation.semantic_ids.tolist() == [0, 1, 2, 3, 4, 5]
+    assert observation.ids.tolist() == [0, 1, 2, 3, 4, 5]
     assert observation.image == Path("photo.png")
     assert observation.model == Path("models/chair.obj")
 
@@ -101,7 +101,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         POINTS_2D,
         CAMERA,
         sigma=np.linspace(0.5, 2, 7) if extras else None,
-        semantic_ids=np.arange(7) if extras else None,
+        ids=np.arange(7) if extras else None,
     )
     written.save(tmp_path / "observation.json")
     read = Observation.load(tmp_path / "observation.json")
@@ -110,10 +110,10 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
     assert read.camera == CAMERA
     if extras:
         assert (read.sigma == written.sigma).all()
-        assert (read.semantic_ids == written.semantic_ids).all()
+        assert (read.ids == written.ids).all()
     else:
         assert read.sigma is None
-        assert read.semantic_ids is None
+        assert read.ids is None
     assert read.to_dict() == written.to_dict()
 
 
@@ -142,7 +142,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (
             changed("keypoints.2.uvw", 3),
             "{path}: keypoints[2]: unknown field 'uvw'; "
-            "known are confidence, depth, name, semantic_id, sigma, uv, xyz",
+            "known are confidence, depth, name, score, semantic_id, sigma, uv, xyz",
         ),
         (changed("keypoints.2.xyz", [1, 2]), "{path}: keypoints[2].xyz: [1, 2] is not a list of 3"),
         (

@@ -81,7 +81,7 @@ def test_top_does_not_change_it() -> None:
 
 def test_distances_of_a_category_are_those_of_its_pairs_of_models() -> None:
     models = [
-        replace(model, xyz=model.xyz[keep], semantic_ids=model.semantic_ids[keep])
+        replace(model, xyz=model.xyz[keep], ids=model.ids[keep])
         for seed, model in enumerate(LIBRARY)
         for keep in [np.random.default_rng(seed).permutation(10)[: 3 + seed % 8]]
     ]
@@ -92,12 +92,12 @@ def test_distances_of_a_category_are_those_of_its_pairs_of_models() -> None:
     every = list(library)
     for row, distances in zip(rows, found, strict=True):
         for model, distance in zip(every, distances, strict=True):
-            shared = np.intersect1d(model.semantic_ids, every[row].semantic_ids)
+            shared = np.intersect1d(model.ids, every[row].ids)
             if len(shared) < 4:
                 assert np.isnan(distance)
                 continue
             # The distance is a share of the extent of all the keypoints of the true model.
-            part = np.isin(every[row].semantic_ids, shared)
+            part = np.isin(every[row].ids, shared)
             extents = [
                 np.linalg.norm(np.ptp(xyz, axis=0))
                 for xyz in (every[row].xyz[part], every[row].xyz)

@@ -46,7 +46,7 @@ def assert_same(one: LibraryModel, other: LibraryModel) -> None:
     assert one.key == other.key
     assert one.mesh_path == other.mesh_path
     np.testing.assert_array_equal(one.xyz, other.xyz)
-    np.testing.assert_array_equal(one.semantic_ids, other.semantic_ids)
+    np.testing.assert_array_equal(one.ids, other.ids)
     np.testing.assert_array_equal(one.bounds, other.bounds)
     assert one.symmetries.reflections == other.symmetries.reflections
     assert len(one.symmetries.rotations) == len(other.symmetries.rotations)
@@ -66,16 +66,15 @@ def test_a_dataset_s_models_are_in_it_with_symmetries_bounds_and_meshes(sample_r
     assert library.keys == tuple(sorted(dataset.ids()))
     for model in dataset:
         held = library[model.key]
-        order = np.argsort(model.keypoints.semantic_ids)
-        np.testing.assert_array_equal(held.semantic_ids, model.keypoints.semantic_ids[order])
+        order = np.argsort(model.keypoints.ids)
+        np.testing.assert_array_equal(held.ids, model.keypoints.ids[order])
         np.testing.assert_array_equal(held.xyz, model.keypoints.xyz[order])
         np.testing.assert_array_equal(held.bounds, model.load_mesh().bounds)
         np.testing.assert_array_equal(held.load_mesh().faces, model.load_mesh().faces)
         # The same pairs of keypoints, wherever they stand now.
-        ids = model.keypoints.semantic_ids
+        ids = model.keypoints.ids
         assert [{int(ids[a]), int(ids[b])} for a, b in model.symmetries.reflections] == [
-            {int(held.semantic_ids[a]), int(held.semantic_ids[b])}
-            for a, b in held.symmetries.reflections
+            {int(held.ids[a]), int(held.ids[b])} for a, b in held.symmetries.reflections
         ]
 
 
@@ -122,8 +121,8 @@ def test_duplicated_models_and_semantic_ids_are_refused() -> None:
         Library.from_models([make_model(1), make_model(2), make_model(1)])
     Library.from_models([make_model(1), make_model(1, category="crate")])
     model = make_model(1)
-    with pytest.raises(InputError, match="box, model 0001, semantic_ids: the semantic id 3 occurs"):
-        replace(model, semantic_ids=np.array([3, 1, 2, 3, 4, 5, 6, 7]))
+    with pytest.raises(InputError, match="box, model 0001, ids: the semantic id 3 occurs"):
+        replace(model, ids=np.array([3, 1, 2, 3, 4, 5, 6, 7]))
 
 
 def test_malformed_models_are_refused() -> None:
@@ -133,9 +132,9 @@ def test_malformed_models_are_refused() -> None:
     with pytest.raises(InputError, match="NaN or infinite values in row 2"):
         replace(model, xyz=np.where(np.arange(8)[:, None] == 2, np.nan, model.xyz))
     with pytest.raises(InputError, match=r"expected whole numbers of shape \(8,\)"):
-        replace(model, semantic_ids=np.arange(8.0))
+        replace(model, ids=np.arange(8.0))
     with pytest.raises(InputError, match=r"expected whole numbers of shape \(8,\)"):
-        replace(model, semantic_ids=np.arange(7))
+        replace(model, ids=np.arange(7))
 
 
 class TestMirroredLabelings:
@@ -172,7 +171,7 @@ def test_a_saved_library_is_the_same_when_opened(sample_root: Path, tmp_path: Pa
 def test_an_opened_library_is_mapped_and_cannot_be_changed(file: Path) -> None:
     table = Library.open(file)._table
     assert not table.xyz.flags.owndata
-    for array in (table.xyz, table.semantic_ids, table.bounds, table.places, table.offsets):
+    for array in (table.xyz, table.ids, table.bounds, table.places, table.offsets):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
 

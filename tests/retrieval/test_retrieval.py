@@ -89,7 +89,7 @@ def test_a_match_holds_what_belongs_to_its_pose() -> None:
     assert best.model_id == "003"
     assert best.shared == 8
     assert best.missing_ids == ()
-    assert best.semantic_ids.tolist() == shown
+    assert best.ids.tolist() == shown
     np.testing.assert_array_equal(best.points_3d, model.xyz[shown])
     np.testing.assert_array_equal(best.points_2d, pixels[shown])
     projected = CAMERA.project(best.alignment.apply(model.xyz[shown]))
@@ -538,7 +538,7 @@ def test_an_empty_library_is_refused() -> None:
         Library.from_models([]).retrieve(PIXELS, IDS, CAMERA)
 
 
-def test_unknown_semantic_ids_are_refused_and_the_known_ones_named() -> None:
+def test_unknown_ids_are_refused_and_the_known_ones_named() -> None:
     models = [
         make_model(1, ids=(0, 1, 2, 3, 7, 8)),
         make_model(2, ids=range(30, 36), category="can"),
@@ -572,10 +572,10 @@ def test_keypoints_that_no_model_can_be_aligned_with_are_refused() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"points_2d": PIXELS[:9]}, r"semantic_ids: int64 of shape \(10,\), expected .* \(9,\)"),
+        ({"points_2d": PIXELS[:9]}, r"ids: int64 of shape \(10,\), expected .* \(9,\)"),
         ({"points_2d": PIXELS * np.nan}, "points_2d: NaN or infinite values in rows 0, 1"),
-        ({"semantic_ids": np.r_[IDS[:9], 3]}, "semantic_ids: the semantic id 3 occurs twice"),
-        ({"semantic_ids": IDS + 0.5}, "semantic_ids: float64 of shape"),
+        ({"ids": np.r_[IDS[:9], 3]}, "ids: the semantic id 3 occurs twice"),
+        ({"ids": IDS + 0.5}, "ids: float64 of shape"),
         ({"camera": "none"}, "camera: expected a cadalign.Camera, got str"),
         ({"top": 0}, "top: must be a whole number >= 1, not 0"),
         ({"method": "aepnp"}, "method: unknown method 'aepnp'; known are optimal, epnp"),
@@ -598,7 +598,7 @@ def test_keypoints_that_no_model_can_be_aligned_with_are_refused() -> None:
     ],
 )
 def test_invalid_arguments_are_refused(change: dict[str, Any], message: str) -> None:
-    arguments: dict[str, Any] = {"points_2d": PIXELS, "semantic_ids": IDS, "camera": CAMERA}
+    arguments: dict[str, Any] = {"points_2d": PIXELS, "ids": IDS, "camera": CAMERA}
     with pytest.raises(InputError, match=message):
         LIBRARY.retrieve(**{**arguments, **change})
 
@@ -608,7 +608,7 @@ def test_invalid_arguments_are_refused(change: dict[str, Any], message: str) -> 
 
 def is_same_shape(est: LibraryModel, gt: LibraryModel) -> bool:
     """True if two models have the same ids and differ by at most `SAME_SHAPE` after stretch."""
-    if est.category != gt.category or set(est.semantic_ids) != set(gt.semantic_ids):
+    if est.category != gt.category or set(est.ids) != set(gt.ids):
         return False
     return shape_distance(est, gt) <= SAME_SHAPE
 
@@ -622,7 +622,7 @@ def test_shape_distance_knows_no_place_and_no_stretch(seed: int, y: float, z: fl
         model,
         model_id="moved",
         xyz=(model.xyz * [1, y, z] + rng.normal(size=3))[order],
-        semantic_ids=model.semantic_ids[order],
+        ids=model.ids[order],
     )
     assert shape_distance(moved, model) < 1e-9
     assert is_same_shape(moved, model)
@@ -667,9 +667,7 @@ def rank_1_rate(library: Library, noise_px: float, keypoints: int, queries: int)
         except DegenerateError:
             continue
         made += 1
-        best = library.retrieve(
-            seen.points_2d, seen.semantic_ids, KEYPOINT_CAMERA, sigma=noise_px, top=1
-        )[0]
+        best = library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px, top=1)[0]
         hits += is_same_shape(library[best.category, best.model_id], model)
     assert made > queries / 3
     return hits / made
@@ -695,7 +693,7 @@ def test_scores_of_real_chairs_are_calibrated(chairs: Library) -> None:
     for model in models:
         task = RetrievalTask(*model.key, 5.0, 8)
         seen = observe_model(model, task, seed=3)
-        best = chairs.retrieve(seen.points_2d, seen.semantic_ids, CAMERA, sigma=5.0, top=1)[0]
+        best = chairs.retrieve(seen.points_2d, seen.ids, CAMERA, sigma=5.0, top=1)[0]
         right.append(is_same_shape(chairs[best.category, best.model_id], model))
         scores.append(best.score)
     assert np.mean(scores) == pytest.approx(np.mean(right), abs=0.12)
@@ -706,7 +704,7 @@ def test_the_list_is_exact_in_a_library_of_real_chairs(chairs: Library) -> None:
     for place, noise_px in enumerate((1.0, 3.0, 5.0)):
         model = list(chairs)[100 * place]
         seen = observe_model(model, RetrievalTask(*model.key, noise_px, 8), seed=1)
-        arguments = (seen.points_2d, seen.semantic_ids, KEYPOINT_CAMERA)
+        arguments = (seen.points_2d, seen.ids, KEYPOINT_CAMERA)
         found = chairs.retrieve(*arguments, sigma=noise_px)
         every = chairs.retrieve(*arguments, sigma=noise_px, exhaustive=True)
         assert names(found) == names(every)

@@ -42,7 +42,7 @@ def make_table(number: int, category: str = "table", lack: tuple[int, ...] = ())
 
 def learn(models: list[LibraryModel]) -> ShapeModel:
     examples = [
-        Example(model.model_id, model.semantic_ids.tolist(), model.xyz, bounds=model.bounds)
+        Example(model.model_id, model.ids.tolist(), model.xyz, bounds=model.bounds)
         for model in models
     ]
     return ShapeModel.learn(examples, category=models[0].category, components=1, reflection=False)
@@ -61,7 +61,7 @@ def seen(model: LibraryModel, noise_px: float = 0.0) -> np.ndarray:
 
 def first(model: LibraryModel, library: Library = LIBRARY, **options: Any) -> Any:
     options = {"shape": SHAPE, "sigma": 1.0, **options}
-    return library.retrieve(seen(model, 1.0), model.semantic_ids, CAMERA, **options)[0]
+    return library.retrieve(seen(model, 1.0), model.ids, CAMERA, **options)[0]
 
 
 def iou(match: Any, model: LibraryModel) -> float:
@@ -99,7 +99,7 @@ def test_models_of_the_library_are_found(count: int) -> None:
     ranks = []
     for model in MODELS[::15]:
         matches = LIBRARY.retrieve(
-            seen(model)[:count], model.semantic_ids[:count], CAMERA, sigma=0.2, shape=SHAPE, top=150
+            seen(model)[:count], model.ids[:count], CAMERA, sigma=0.2, shape=SHAPE, top=150
         )
         assert len(matches) == len(MODELS)
         ranks.append([match.model_id for match in matches].index(model.model_id))
@@ -122,15 +122,15 @@ def test_size_and_place_of_models_do_not_count() -> None:
 
 def rank_all(library: Library, model: LibraryModel, **options: Any) -> list[Any]:
     options = {"shape": SHAPE, "top": len(library), "shape_sigma": 0.05, **options}
-    return library.retrieve(seen(model, 1.0), model.semantic_ids, CAMERA, **options)
+    return library.retrieve(seen(model, 1.0), model.ids, CAMERA, **options)
 
 
 def test_result_does_not_depend_on_the_order_of_keypoints() -> None:
     model, order = OBJECTS[1], np.random.default_rng(0).permutation(10)
     sigma = np.linspace(0.5, 3, 10)
-    one = LIBRARY.retrieve(seen(model), model.semantic_ids, CAMERA, sigma=sigma, shape=SHAPE)
+    one = LIBRARY.retrieve(seen(model), model.ids, CAMERA, sigma=sigma, shape=SHAPE)
     other = LIBRARY.retrieve(
-        seen(model)[order], model.semantic_ids[order], CAMERA, sigma=sigma[order], shape=SHAPE
+        seen(model)[order], model.ids[order], CAMERA, sigma=sigma[order], shape=SHAPE
     )
     assert [match.model_id for match in one] == [match.model_id for match in other]
     np.testing.assert_allclose(one[0].alignment.packed, other[0].alignment.packed, atol=1e-6)
@@ -145,7 +145,7 @@ def test_matches_are_sorted_and_scores_sum_to_one() -> None:
 
 def test_stretched_box_is_close_to_the_estimated_one() -> None:
     model = OBJECTS[3]
-    estimate = align(SHAPE, View(CAMERA, seen(model, 1.0), ids=model.semantic_ids.tolist()))
+    estimate = align(SHAPE, View(CAMERA, seen(model, 1.0), ids=model.ids.tolist()))
     best = first(model)
     assert best.alignment.scale[0] == 1
     assert box_iou_up_to_scale(est=best.box, gt=estimate.box) > 0.9
@@ -157,8 +157,8 @@ def test_models_that_lack_keypoints_are_ranked_below_the_same_with_them() -> Non
     model = OBJECTS[4]
     best = first(model)
     whole = LIBRARY[best.category, best.model_id]
-    kept = whole.semantic_ids[whole.semantic_ids != 9]
-    part = replace(whole, model_id="part", xyz=whole.xyz[kept], semantic_ids=kept)
+    kept = whole.ids[whole.ids != 9]
+    part = replace(whole, model_id="part", xyz=whole.xyz[kept], ids=kept)
     matches = rank_all(Library.from_models([*MODELS, part]), model)
     ranks = {match.model_id: rank for rank, match in enumerate(matches)}
     assert ranks[best.model_id] < ranks["part"]
@@ -176,8 +176,8 @@ def test_outliers_do_not_count_with_a_robust_loss() -> None:
     model = OBJECTS[5]
     pixels = seen(model)
     pixels[8] += 150
-    robust = LIBRARY.retrieve(pixels, model.semantic_ids, CAMERA, shape=SHAPE, loss="cauchy")
-    plain = LIBRARY.retrieve(pixels, model.semantic_ids, CAMERA, shape=SHAPE)
+    robust = LIBRARY.retrieve(pixels, model.ids, CAMERA, shape=SHAPE, loss="cauchy")
+    plain = LIBRARY.retrieve(pixels, model.ids, CAMERA, shape=SHAPE)
     assert iou(robust[0], model) > iou(plain[0], model)
     assert iou(robust[0], model) > iou(first(model), model) - 0.1
 
@@ -259,7 +259,7 @@ class TestCommand:
             points_3d=np.zeros((10, 3)),
             points_2d=seen(OBJECTS[0], 1.0),
             camera=CAMERA,
-            semantic_ids=np.arange(10),
+            ids=np.arange(10),
         ).save(folder / "seen.json")
         return folder
 
@@ -301,9 +301,7 @@ UNKNOWN = Camera.without_focal(640, 480)
 def test_an_unknown_focal_length_is_estimated_with_the_shape() -> None:
     model, prior = OBJECTS[0], FocalPrior(900.0, 0.1)
     pixels = seen(model, 1.0)
-    found = LIBRARY.retrieve(
-        pixels, model.semantic_ids, UNKNOWN, shape=SHAPE, sigma=1.0, focal_prior=prior
-    )
+    found = LIBRARY.retrieve(pixels, model.ids, UNKNOWN, shape=SHAPE, sigma=1.0, focal_prior=prior)
     view = View(UNKNOWN, pixels, sigma=1.0)
     expected = align(SHAPE, view, focal="estimate", focal_prior=prior)
     assert {match.camera for match in found} == {expected.camera}
@@ -318,15 +316,15 @@ def test_the_most_probable_category_gives_the_focal_length() -> None:
     shapes = {"table": SHAPE, "stool": learn(squashed)}
     asked: dict[str, Any] = {"sigma": 1.0, "focal_prior": FocalPrior(935.0, 0.05)}
     pixels = seen(model, 1.0)
-    both = library.retrieve(pixels, model.semantic_ids, UNKNOWN, shape=shapes, **asked)
-    alone = LIBRARY.retrieve(pixels, model.semantic_ids, UNKNOWN, shape=SHAPE, **asked)
+    both = library.retrieve(pixels, model.ids, UNKNOWN, shape=shapes, **asked)
+    alone = LIBRARY.retrieve(pixels, model.ids, UNKNOWN, shape=SHAPE, **asked)
     assert both[0].category == "table"
     assert both[0].camera == alone[0].camera
 
 
 def test_models_themselves_are_not_ranked_without_a_focal_length() -> None:
     with pytest.raises(InputError) as caught:
-        LIBRARY.retrieve(seen(OBJECTS[0]), OBJECTS[0].semantic_ids, UNKNOWN)
+        LIBRARY.retrieve(seen(OBJECTS[0]), OBJECTS[0].ids, UNKNOWN)
     assert str(caught.value) == (
         "camera: the focal length is unknown, without which no model's pose is searched; "
         "rank by shape=, which estimates it, or give it: camera.with_focal(...)"
@@ -340,7 +338,7 @@ def test_command_estimates_a_focal_length_with_the_shape_alone(
     SHAPE.save(tmp_path / "table.shape")
     LIBRARY.save(tmp_path / "tables.library")
     query = tmp_path / "query.json"
-    Observation(model.xyz, seen(model), UNKNOWN, semantic_ids=model.semantic_ids).save(query)
+    Observation(model.xyz, seen(model), UNKNOWN, ids=model.ids).save(query)
     command = ["retrieve", str(query), "--library", str(tmp_path / "tables.library")]
     assert refusal_line(capsys, *command) == (
         f"{query}: camera: the focal length is unknown, without which no model's pose is searched; "

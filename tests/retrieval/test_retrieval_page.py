@@ -43,7 +43,7 @@ class Case:
 
     def retrieve(self, **options: Any) -> list[Match]:
         seen = self.observation
-        return self.library.retrieve(seen.points_2d, seen.semantic_ids, CAMERA, **options)
+        return self.library.retrieve(seen.points_2d, seen.ids, CAMERA, **options)
 
     @property
     def arguments(self) -> list[str]:
@@ -66,7 +66,7 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         points_3d=np.zeros((len(model.xyz), 3)),
         points_2d=CAMERA.project(pose.apply(model.xyz)) + noise,
         camera=CAMERA,
-        semantic_ids=model.semantic_ids,
+        ids=model.ids,
         image=folder / "photo.png",
     )
     observation.save(folder / "seen.json")
@@ -460,7 +460,7 @@ def test_a_query_needs_no_model_points_but_semantic_ids(case: Case, tmp_path: Pa
     data["image"] = None if "image" not in data else str(case.folder / "photo.png")
     query = read_query(Path(write_json(tmp_path / "bare.json", data)))
     np.testing.assert_array_equal(query.points_2d, case.observation.points_2d)
-    np.testing.assert_array_equal(query.semantic_ids, case.observation.semantic_ids)
+    np.testing.assert_array_equal(query.ids, case.observation.ids)
     for keypoint in data["keypoints"]:
         del keypoint["semantic_id"]
     with pytest.raises(

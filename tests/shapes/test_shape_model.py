@@ -475,8 +475,8 @@ def test_real_models_that_were_held_out_are_likely(real_data: Path, category: st
     mean, covariance = component.mean.ravel(), component.covariance
     errors, spreads, whitened = [], [], []
     for each in dataset.subset(categories=[category], split="val")[category]:
-        known = [row for row, label in enumerate(each.keypoints.semantic_ids) if label in model.ids]
-        rows = model.rows(each.keypoints.semantic_ids[known])
+        known = [row for row, label in enumerate(each.keypoints.ids) if label in model.ids]
+        rows = model.rows(each.keypoints.ids[known])
         left, others = rows[0], rows[1:]
         a, b = (3 * np.atleast_1d(part)[:, None] + np.arange(3) for part in (left, others))
         a, b = a.ravel(), b.ravel()

@@ -119,7 +119,7 @@ def test_a_real_chair_becomes_another_without_folds(real_data: Path) -> None:
     cloud = with_points(grid.reshape(-1, 3))
     for other in chairs[:40:8]:
         ids, mine, theirs = np.intersect1d(
-            model.keypoints.semantic_ids, other.keypoints.semantic_ids, return_indices=True
+            model.keypoints.ids, other.keypoints.ids, return_indices=True
         )
         assert len(ids) >= 6
         source, target = model.keypoints.xyz[mine], other.keypoints.xyz[theirs]

@@ -52,7 +52,7 @@ class Case:
     @property
     def clicks(self) -> list[tuple[int, list[float]]]:
         """Semantic ids and pixels of the visible keypoints."""
-        ids = self.instance.semantic_ids.tolist()
+        ids = self.instance.ids.tolist()
         return list(zip(ids, self.instance.points_2d.tolist(), strict=True))
 
     def copied_to(self, folder: Path) -> Case:

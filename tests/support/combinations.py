@@ -71,7 +71,7 @@ OUTLIERS = {
     "huber": '`loss="huber"`',
     "cauchy": '`loss="cauchy"`',
     "ransac": "`ransac=RansacOptions()`",
-    "confidences": "`ransac` and `confidences`",
+    "scores": "`ransac` and `scores`",
     "unrefined": "`RansacOptions(refine=False)`",
     "six": '`RansacOptions(minimal="aepnp")`',
 }
@@ -290,8 +290,8 @@ def _keypoints(cell: Cell, rng: np.random.Generator, exact: np.ndarray) -> dict[
     if cell.outliers != "linear" and count > 4:
         wrong = [3] if cell.outliers == "huber" else [3, 9]
         noise[wrong] += 6.0 if cell.outliers == "huber" else [30.0, -25.0]
-    if cell.outliers == "confidences":
-        fields["confidences"] = np.where(np.isin(np.arange(count), wrong), 0.2, 0.9)
+    if cell.outliers == "scores":
+        fields["scores"] = np.where(np.isin(np.arange(count), wrong), 0.2, 0.9)
     return {"points_2d": exact + noise, **fields}
 
 

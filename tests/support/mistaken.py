@@ -54,7 +54,7 @@ def examples(root: Path, category: str) -> tuple[Example, ...]:
     """Annotated models of a category of KeypointNet with enough keypoints."""
     models = KeypointNet(root / "keypointnet").subset(categories=[category])
     return tuple(
-        Example(each.model_id, [int(name) for name in each.keypoints.semantic_ids], xyz)
+        Example(each.model_id, [int(name) for name in each.keypoints.ids], xyz)
         for each in models
         if len(xyz := np.array(each.keypoints.xyz)) >= LEAST
     )

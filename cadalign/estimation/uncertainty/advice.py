@@ -213,7 +213,7 @@ def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
         points_2d=np.vstack([cast(FloatArray, view.points_2d), place]),
         ids=(*view.keypoint_ids, name),
         sigma=_with_mean(sigma, count, is_one=np.ndim(sigma) == 0),
-        confidences=None,
+        scores=None,
         depth=depth,
         depth_sigma=_with_mean(relative, count, is_one=relative.ndim == 0),
     )

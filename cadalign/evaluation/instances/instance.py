@@ -116,7 +116,7 @@ class KeypointTask:
     view: int = 0
     hull: KeypointHull = NO_KEYPOINTS
     """Keypoints (k, 3), and what views without a mesh need to know of them."""
-    semantic_ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     symmetry: InstanceSymmetry = NO_SYMMETRY
     model: AnnotatedModel | None = None
     """The model with its mesh; None where it is evaluated on its keypoints alone."""
@@ -140,7 +140,7 @@ class KeypointTask:
             category,
             model_id,
             hull=KeypointHull(model.keypoints.xyz),
-            semantic_ids=model.keypoints.semantic_ids,
+            ids=model.keypoints.ids,
             symmetry=symmetry_group(model.keypoints.xyz, model.symmetries),
             model=mesh_of(model, visibility),
         )
@@ -164,7 +164,7 @@ class Instance:
     cam_from_model: Alignment  # the pose of the model as the image shows it
     points_3d: FloatArray  # (n, 3), the visible keypoints of the stretched model
     points_2d: FloatArray  # (n, 2), their noisy observations [px]
-    semantic_ids: IntArray
+    ids: IntArray
     bounds: FloatArray
     """(2, 3), lowest and highest coordinates of the stretched model; of its keypoints without a
     mesh."""
@@ -216,7 +216,7 @@ def make_instance(
     rng = instance_rng(seed, model.category, model.model_id, str(view_index))
     xyz = model.keypoints.xyz
     view = sample_view(scene, xyz, KEYPOINT_CAMERA, rng=rng, min_visible=min_visible)
-    ids = model.keypoints.semantic_ids
+    ids = model.keypoints.ids
     seen = _Seen(view.cam_from_model, xyz[view.visible], ids[view.visible], scene.bounds, rng)
     (instance,) = _stretched([seen], noise_px=noise_px, scene=scene)
     return instance
@@ -238,7 +238,7 @@ def make_hull_instances(
         _Seen(
             found.cam_from_model,
             each.hull.xyz[found.visible],
-            each.semantic_ids[found.visible],
+            each.ids[found.visible],
             each.hull.bounds,
             rng,
         )
@@ -254,7 +254,7 @@ class _Seen(NamedTuple):
 
     cam_from_model: Alignment
     xyz: FloatArray
-    semantic_ids: IntArray
+    ids: IntArray
     bounds: FloatArray
     rng: np.random.Generator
 
@@ -282,7 +282,7 @@ def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) 
             cam_from_model=view.cam_from_model,
             points_3d=view.xyz * stretch,
             points_2d=observed,
-            semantic_ids=view.semantic_ids,
+            ids=view.ids,
             bounds=stretched_bounds,
             gt=Alignment(
                 view.cam_from_model.rotation, view.cam_from_model.translation, scale, is_valid=True

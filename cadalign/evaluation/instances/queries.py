@@ -97,7 +97,7 @@ class RetrievalQuery:
     """View of a stretched model: noisy keypoints [px], and its true pose and stretch."""
 
     points_2d: FloatArray
-    semantic_ids: IntArray
+    ids: IntArray
     gt: Alignment
 
 
@@ -115,7 +115,7 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
     pixels = KEYPOINT_CAMERA.project(pose.apply(hull.xyz[chosen]))
     return RetrievalQuery(
         points_2d=pixels + task.noise_px * rng.standard_normal(pixels.shape),
-        semantic_ids=model.semantic_ids[chosen],
+        ids=model.ids[chosen],
         gt=Alignment(pose.rotation, pose.translation, stretch),
     )
 
@@ -190,7 +190,7 @@ def _retrieve(instance: RetrievalInstance, *, method: str) -> list[Match]:
     is_exact = instance.protocol == LEAVE_IN and method == "optimal"
     return _opened(instance.library).retrieve(
         instance.query.points_2d,
-        instance.query.semantic_ids,
+        instance.query.ids,
         KEYPOINT_CAMERA,
         top=TOP,
         category=None if options.whole_library else task.category,
@@ -246,7 +246,7 @@ def same_shapes(library: str, key: ModelKey) -> frozenset[ModelKey]:
     """The models of a library's file that count as the given one, itself among them."""
     groups = _by_keypoints(library)
     gt = _opened(library)[key]
-    keys, xyz = groups[gt.category, tuple(gt.semantic_ids.tolist())]
+    keys, xyz = groups[gt.category, tuple(gt.ids.tolist())]
     near = distances(xyz, gt.xyz) <= SAME_SHAPE
     return frozenset([key, *(keys[k] for k in np.flatnonzero(near).tolist())])
 
@@ -263,7 +263,7 @@ def _by_keypoints(
     """Names and keypoints of the models with the same set of keypoints."""
     groups: dict[tuple[str, tuple[int, ...]], list[LibraryModel]] = {}
     for model in _opened(library):
-        groups.setdefault((model.category, tuple(model.semantic_ids.tolist())), []).append(model)
+        groups.setdefault((model.category, tuple(model.ids.tolist())), []).append(model)
     return {
         ids: ([model.key for model in models], np.array([model.xyz for model in models]))
         for ids, models in groups.items()

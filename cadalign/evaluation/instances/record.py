@@ -96,11 +96,11 @@ def align_instance(
     # Only here: their kernels take time to import, and most experiments do without.
     from cadalign.estimation.align import align
 
-    known = np.isin(instance.semantic_ids, shape.ids)
+    known = np.isin(instance.ids, shape.ids)
     view = View(
         instance.camera,
         instance.points_2d[known],
-        ids=instance.semantic_ids[known].tolist(),
+        ids=instance.ids[known].tolist(),
         sigma=sigma,
     )
     result = align(shape, view)
@@ -211,7 +211,7 @@ def record_row(
         bounds=instance.bounds,
         points_3d=instance.points_3d,
         points_2d=instance.points_2d,
-        semantic_ids=instance.semantic_ids,
+        ids=instance.ids,
         outcomes=outcomes,
         estimates=estimates,
     )
@@ -225,7 +225,7 @@ def record_of(
     bounds: FloatArray,
     points_3d: FloatArray,
     points_2d: FloatArray,
-    semantic_ids: IntArray,
+    ids: IntArray,
     outcomes: Sequence[Outcome],
     estimates: Sequence[Estimate],
 ) -> Row:
@@ -238,7 +238,7 @@ def record_of(
         "bounds": _rounded(bounds),
         "points_3d": _rounded(points_3d),
         "points_2d": _rounded(points_2d, _PIXEL_DIGITS),
-        "semantic_ids": semantic_ids.tolist(),
+        "semantic_ids": ids.tolist(),
         "estimates": [
             _described(outcome, estimate)
             for outcome, estimate in zip(outcomes, estimates, strict=True)

@@ -77,14 +77,14 @@ class SimulatedVideo(TrackTask):
     """A video of an object of a data set."""
 
     xyz: FloatArray
-    semantic_ids: IntArray
+    ids: IntArray
 
     def video(self, options: TracksOptions) -> tuple[Sequence[View], FloatArray]:
         rng = instance_rng(options.seed, self.category, self.model_id, "video")
         track = simulate_track(
             rng,
             self.xyz,
-            self.semantic_ids.tolist(),
+            self.ids.tolist(),
             frames=options.frames,
             noise_px=options.noise_px,
             visible=options.visible,
@@ -253,11 +253,9 @@ def simulated_videos(root: Path, options: TracksOptions, folder: RunFolder) -> P
         shape = learned.shape(category)
         for model in list(objects[category])[: options.max_models]:
             known = model.keypoints
-            has = np.isin(known.semantic_ids, shape.ids)
-            tasks.append(
-                SimulatedVideo(category, model.model_id, known.xyz[has], known.semantic_ids[has])
-            )
-    parts = [part for each in tasks for part in (each.model_id, each.xyz, each.semantic_ids)]
+            has = np.isin(known.ids, shape.ids)
+            tasks.append(SimulatedVideo(category, model.model_id, known.xyz[has], known.ids[has]))
+    parts = [part for each in tasks for part in (each.model_id, each.xyz, each.ids)]
     benchmark = _benchmark(learned, options)
     return PlannedVideos(tasks, benchmark, fingerprint(learned.fingerprint(), *parts))
 

@@ -91,7 +91,7 @@ class UnseenTasks(KeypointTasks):
         for place in range(0, len(self), len(self) // len(self.keys)):
             task = self.task(place)
             parts.append(f"{task.category}\0{task.model_id}\0{task.problem}")
-            parts += [task.hull.xyz, task.semantic_ids]
+            parts += [task.hull.xyz, task.ids]
         return fingerprint(*parts)
 
 
@@ -166,7 +166,7 @@ class UnseenObjects(Setting):
     def warm_up(self) -> Sequence[KeypointTask]:
         """Compile the kernels."""
         (points, pixels, pose), ids = example_view(), np.arange(9)
-        task = KeypointTask("", "", hull=KeypointHull(points), semantic_ids=ids)
+        task = KeypointTask("", "", hull=KeypointHull(points), ids=ids)
         seen = UnseenObject(task, pose, ids, pixels, np.zeros(9, dtype=bool))
         view = View(KEYPOINT_CAMERA, pixels)
         for model in (Model(points_3d=points), ShapeModel.from_basis(points, [points], [0.1])):
@@ -184,8 +184,8 @@ class UnseenObjects(Setting):
 
     def given(self, instance: UnseenInstance) -> MethodInput:
         shape, seen = instance.shape, instance.seen
-        known = np.isin(seen.semantic_ids, shape.ids)
-        rows = shape.rows(seen.semantic_ids[known].tolist())
+        known = np.isin(seen.ids, shape.ids)
+        rows = shape.rows(seen.ids[known].tolist())
         return MethodInput(
             shape.mean[rows],
             seen.points_2d[known],
@@ -326,7 +326,7 @@ def _record(
         bounds=seen.task.hull.bounds,
         points_3d=seen.xyz[seen.rows],
         points_2d=seen.points_2d,
-        semantic_ids=seen.semantic_ids,
+        ids=seen.ids,
         outcomes=outcomes,
         estimates=[
             each if isinstance(each, CadalignError) else _aligned(each, seen, sigma)
@@ -338,7 +338,7 @@ def _record(
 def _shared(found: ShapeEstimate, seen: UnseenObject) -> tuple[IntArray, IntArray]:
     """Rows of the object's keypoints that an estimate has, and their rows in it."""
     row_of = {name: row for row, name in enumerate(found.ids.tolist())}
-    ids = seen.task.semantic_ids.tolist()
+    ids = seen.task.ids.tolist()
     known = np.flatnonzero([name in row_of for name in ids])
     return known, np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
 

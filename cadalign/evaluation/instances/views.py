@@ -141,7 +141,7 @@ class KeypointViews(Setting):
         """A task whose evaluation compiles solvers and metrics."""
         rng = np.random.default_rng(0)
         hull = KeypointHull(rng.uniform(-0.3, 0.3, (12, 3)))
-        return [KeypointTask("warm-up", "", hull=hull, semantic_ids=np.arange(12))]
+        return [KeypointTask("warm-up", "", hull=hull, ids=np.arange(12))]
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
         start, found = time.perf_counter(), []
@@ -235,7 +235,7 @@ def _aligned(view: KeypointView) -> AlignedShape:
     task = view.task
     shape = view.shapes.shape(task.category)
     assert shape is not None
-    own = task.semantic_ids, task.hull.xyz
+    own = task.ids, task.hull.xyz
     return align_instance(shape, view.instance, *own, sigma=view.sigma)
 
 

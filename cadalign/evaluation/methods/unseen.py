@@ -64,9 +64,9 @@ class UnseenObject:
         return self.task.hull.xyz
 
     @property
-    def semantic_ids(self) -> IntArray:
+    def ids(self) -> IntArray:
         """Semantic ids of the given keypoints, (n,) int."""
-        return self.task.semantic_ids[self.rows]
+        return self.task.ids[self.rows]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +88,8 @@ class UnseenInstance:
     def view_of(self, model: Model | ShapeModel) -> View:
         """Those given keypoints that a model has."""
         seen = self.seen
-        shared = np.isin(seen.semantic_ids, np.array(model.ids, dtype=np.int64))
-        ids = seen.semantic_ids[shared].tolist()
+        shared = np.isin(seen.ids, np.array(model.ids, dtype=np.int64))
+        ids = seen.ids[shared].tolist()
         return View(KEYPOINT_CAMERA, seen.points_2d[shared], ids=ids, sigma=self.sigma)
 
 
@@ -99,7 +99,7 @@ def _of_shape(instance: UnseenInstance) -> ShapeEstimate:
 
 def _of_own_model(instance: UnseenInstance) -> ShapeEstimate:
     seen = instance.seen
-    return _aligned(Model(points_3d=seen.xyz, ids=seen.task.semantic_ids.tolist()), instance)
+    return _aligned(Model(points_3d=seen.xyz, ids=seen.task.ids.tolist()), instance)
 
 
 def _of_mean(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
@@ -111,7 +111,7 @@ def _of_mean(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
 
 def _of_random_model(instance: UnseenInstance, *, stretch: str | None) -> ShapeEstimate:
     other = _random_model(instance)
-    ids = other.semantic_ids.tolist()
+    ids = other.ids.tolist()
     model = Model(points_3d=other.xyz, ids=ids, bounds=other.bounds, stretch=stretch)
     return _aligned(model, instance, misfit_px=_MISFIT_PX)
 
@@ -132,7 +132,7 @@ def _nearest(instance: UnseenInstance) -> ShapeEstimate:
     library = instance.learned.opened_library()
     first = library.retrieve(
         instance.seen.points_2d,
-        instance.seen.semantic_ids,
+        instance.seen.ids,
         KEYPOINT_CAMERA,
         top=1,
         category=instance.seen.task.category,
@@ -142,20 +142,20 @@ def _nearest(instance: UnseenInstance) -> ShapeEstimate:
         workers=1,
     )[0]
     model = library[first.category, first.model_id]
-    return ShapeEstimate(first.alignment, first.bounds, model.semantic_ids, model.xyz)
+    return ShapeEstimate(first.alignment, first.bounds, model.ids, model.xyz)
 
 
 def _random_model(instance: UnseenInstance) -> LibraryModel:
     """A random model of the category, among those that share enough keypoints with the image."""
     library, task = instance.learned.opened_library(), instance.seen.task
-    given = instance.seen.semantic_ids
+    given = instance.seen.ids
     keys = [key for key in library.keys if key[0] == task.category]
     names = (task.category, task.model_id, str(task.view))
     rng = instance_rng(instance.seed, *names, "another model")
     least = min(_LEAST_SHARED, len(given))
     for place in rng.permutation(len(keys)).tolist():
         model = library[keys[place]]
-        if np.isin(given, model.semantic_ids).sum() >= least:
+        if np.isin(given, model.ids).sum() >= least:
             return model
     raise DegenerateError(f"no other model has {least} of the keypoints", where="keypoints")
 
@@ -167,7 +167,7 @@ def _bound(instance: UnseenInstance) -> ShapeEstimate:
     alignment = limit_estimate(
         seen.xyz[seen.rows[kept]], seen.points_2d[kept], KEYPOINT_CAMERA, seen.gt
     )
-    return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.semantic_ids, seen.xyz)
+    return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
 
 
 _SOLVERS: dict[str, Callable[[UnseenInstance], ShapeEstimate]] = {

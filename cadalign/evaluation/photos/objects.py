@@ -179,7 +179,7 @@ def sighting_record(
         bounds=sighting.bounds,
         points_3d=sighting.points_3d,
         points_2d=sighting.points_2d,
-        semantic_ids=np.arange(len(sighting.names)),
+        ids=np.arange(len(sighting.names)),
         outcomes=outcomes,
         estimates=[_described(each, sighting) for each in estimates],
     )

@@ -44,7 +44,7 @@ def test_a_learned_shape_is_better_with_a_mask(bottles: tuple[AnnotatedModel, ..
         truth = shown.cam_from_model
         pixels = CAMERA.project(truth.apply(points[shown.visible]))
         pixels += rng.normal(0, 1, pixels.shape)
-        ids = model.keypoints.semantic_ids[shown.visible].tolist()
+        ids = model.keypoints.ids[shown.visible].tolist()
         mask = cast_geometry(scene, CAMERA, truth).mask
         box = Box.from_model(scene.bounds, truth)
         for found, given in ((alone, None), (joint, mask)):
@@ -65,7 +65,7 @@ def test_depth_over_a_learned_surface_counts_as_similar(
     pixels += rng.normal(0, 1, pixels.shape)
     seen = cast_geometry(scene, CAMERA, truth)
     depth = np.where(seen.mask, seen.depth * (1 + 0.005 * rng.normal(size=seen.depth.shape)), 6.0)
-    ids = model.keypoints.semantic_ids[shown.visible].tolist()
+    ids = model.keypoints.ids[shown.visible].tolist()
     view = View(CAMERA, pixels, ids=ids, mask=seen.mask, depth=depth, depth_sigma=0.005)
     result = align(shape, view)
     of_depth = next(each for each in result.evidence if each.kind == "depth")
@@ -144,7 +144,7 @@ class TestLearnedWithoutAnnotatedMask:
 
     def test_a_photo_counts_beside_clicks(self, bottles: tuple[AnnotatedModel, ...]) -> None:
         shown, mask = self.shown(bottles[0], 0)
-        points, ids = bottles[0].keypoints.xyz, bottles[0].keypoints.semantic_ids
+        points, ids = bottles[0].keypoints.xyz, bottles[0].keypoints.ids
         rng = np.random.default_rng(0)
         clicks = CAMERA.project(shown.cam_from_model.apply(points[shown.visible]))
         clicks += rng.normal(0, 4, clicks.shape)

@@ -11,6 +11,7 @@ import pytest
 from support.problems import problem_of
 
 import cadalign
+from cadalign.cli import main
 from cadalign.datasets import ImageKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.io.observation import Observation
@@ -68,3 +69,35 @@ def test_a_file_of_an_earlier_field_is_read(tmp_path: Path) -> None:
     path.write_text(json.dumps(data))
     with pytest.raises(DataError, match="confidence: given beside score"):
         Observation.load(path)
+
+
+def test_a_stored_option_and_a_flag_of_earlier_names_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "seen.json"
+    rows = zip(PROBLEM.points_3d.tolist(), PROBLEM.points_2d.tolist(), strict=True)
+    data = {
+        "camera": PROBLEM.camera.to_dict(),
+        "keypoints": [{"xyz": xyz, "uv": uv} for xyz, uv in rows],
+        "fit": {"scale_prior_sigma": 0.3},
+    }
+    path.write_text(json.dumps(data))
+    assert Observation.load(path).fit_options == {"stretch_sigma": 0.3}
+    command = ["fit", str(path), "--json", "--no-picture", "--out", str(tmp_path / "out")]
+    assert main([*command, "--scale-prior-sigma", "0.2"]) == 0
+    given = capsys.readouterr()
+    assert json.loads(given.out)["options"]["stretch_sigma"] == 0.2
+    assert given.err.startswith("cadalign: --scale-prior-sigma is now called --stretch-sigma\n")
+    data["fit"] = {"scale_prior_sigma": 0.3, "stretch_sigma": 0.3}
+    path.write_text(json.dumps(data))
+    with pytest.raises(DataError, match=r"scale_prior_sigma: given beside stretch_sigma"):
+        Observation.load(path)
+
+
+def test_a_result_of_an_earlier_version_is_read() -> None:
+    result = cadalign.fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, stretch_sigma=0.3)
+    data = result.to_dict()
+    data["options"]["scale_prior_sigma"] = data["options"].pop("stretch_sigma")
+    again = cadalign.Result.from_dict(data)
+    assert again.options is not None
+    assert again.options.stretch_sigma == 0.3

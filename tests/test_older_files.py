@@ -224,7 +224,7 @@ def test_observation_of_a_detector() -> None:
         "loss": "huber",
         "loss_scale": 3.0,
         "stretch": "z",
-        "scale_prior_sigma": 0.3,
+        "stretch_sigma": 0.3,
         "known_axis": "y",
         "focal": "estimate",
         "focal_prior": {"focal": 480.0, "relative_sigma": 0.2},

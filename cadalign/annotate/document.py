@@ -52,7 +52,7 @@ class Priors:
         """Options with which `cadalign fit` has them, where it takes the likely focal length's."""
         options: dict[str, Any] = {}
         if self.stretch is not None:
-            options["scale_prior_sigma"] = self.stretch
+            options["stretch_sigma"] = self.stretch
         if self.focal != likely:
             options["focal_prior"] = None if self.focal is None else asdict(self.focal)
         return options

@@ -72,7 +72,7 @@ class Known:
             points = self.anchors.values()
             return shape.model_with(points, self.mesh, up_axis=observation.up_axis)
         sigma = None if shape is None else shape.sigma
-        options = FitOptions(scale_prior_sigma=self.stretch)
+        options = FitOptions(stretch_sigma=self.stretch)
         return model_of(observation, options=options, shape_sigma=sigma, mesh=self.mesh)
 
 
@@ -192,13 +192,13 @@ class LiveProblem:
             yield problem, _FOCAL_ASSUMED
         if self.exact is None:
             return
-        if self.exact.scale_prior_sigma is None:
-            model = replace(self.exact, scale_prior_sigma=LIKELY_STRETCH)
+        if self.exact.stretch_sigma is None:
+            model = replace(self.exact, stretch_sigma=LIKELY_STRETCH)
             yield (
                 replace(problem, model=model),
                 "The stretch shown is assumed: {reason}. Add a pair elsewhere.",
             )
-        rigid = replace(self.exact, scale_prior_sigma=None, stretch="none")
+        rigid = replace(self.exact, stretch_sigma=None, stretch="none")
         yield replace(problem, model=rigid), "The model is shown unstretched: add a pair elsewhere."
 
     def at_focal(self, cameras: Sequence[Camera]) -> LiveProblem:
@@ -332,7 +332,7 @@ class LiveProblem:
 def warm_up(points_3d: FloatArray, points_2d: FloatArray, camera: Camera, *, joint: bool) -> None:
     """Compile or load what alignments call, by aligning points (n, 3) with (n, 2) [px]."""
     view, prior = View(camera, points_2d, sigma=1.0), FocalPrior(camera.fx, 0.4)
-    exact = Model(points_3d=points_3d, scale_prior_sigma=LIKELY_STRETCH)
+    exact = Model(points_3d=points_3d, stretch_sigma=LIKELY_STRETCH)
     for estimates_focal in (False, True):
         problem = LiveProblem(exact, (view,), None, "settled", estimates_focal, prior)
         problem.solve()

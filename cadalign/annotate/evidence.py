@@ -53,7 +53,7 @@ class FurtherEvidence:
         place = _place_of(photo, views, where=where)
         options = observation.fit_options
         # Beside a prior on the stretch it is the annotator's own, from the pairs of that time.
-        sigma = None if "scale_prior_sigma" in options else options.get("sigma")
+        sigma = None if "stretch_sigma" in options else options.get("sigma")
         return cls(
             views[place].evidence,
             views[:place] + views[place + 1 :],

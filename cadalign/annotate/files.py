@@ -112,7 +112,7 @@ class Stored:
         if "focal_prior" in self.fit_options:
             stored = self.fit_options["focal_prior"]
             focal = None if stored is None else FocalPrior(**stored)
-        return Priors(self.fit_options.get("scale_prior_sigma"), focal)
+        return Priors(self.fit_options.get("stretch_sigma"), focal)
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ class AnnotationFiles:
         ours = {"sigma": further.sigma, "shape_sigma": None if shape is None else shape.sigma}
         stored = dict(observation.fit_options)
         stored.pop("focal_prior", None)
-        if shape is None and stored.pop("scale_prior_sigma", None) is not None:
+        if shape is None and stored.pop("stretch_sigma", None) is not None:
             stored.pop("sigma", None)  # the annotator's own
         others = [
             name

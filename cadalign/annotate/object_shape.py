@@ -113,7 +113,7 @@ class ObjectShape:
             lengths = np.ptp(np.asarray(model.bounds), axis=0)
             options = model.fit_options(1.0)
             free = np.isin(list("xyz"), list(options.stretched_axes))
-            prior = options.scale_prior_sigma or 0.0
+            prior = options.stretch_sigma or 0.0
             squares = 2 * float(self.sigma or 0.0) ** 2 + np.where(free, prior * lengths, 0.0) ** 2
         safe = np.where(lengths > 0, lengths, np.inf)
         return np.asarray(np.sqrt(squares) / safe)

@@ -210,7 +210,7 @@ def rank(
         ids=(*ids, *candidates),
         bounds=model.scene.bounds,
         mesh=scene.mesh,
-        scale_prior_sigma=None if result.options is None else result.options.scale_prior_sigma,
+        stretch_sigma=None if result.options is None else result.options.stretch_sigma,
     )
     sigma = _widening(result) * marked.sigma / times
     view = View(camera, rescaled_pixels(marked.points_2d, 1 / times), ids=ids, sigma=sigma)

@@ -210,7 +210,7 @@ def find_consensus(search: RobustSearch) -> Consensus:
         raise DegenerateError(
             "all keypoints lie in one plane, where the samples of ransac determine nothing",
             where="points_3d",
-            fix="leave ransac away: use loss='cauchy', with stretch= or scale_prior_sigma=",
+            fix="leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
         )
     if options.focal == "estimate":
         camera = camera.with_focal(math.exp(log_focal))

@@ -59,10 +59,11 @@ class _Options(ForeignDocument):
     loss: str
     loss_scale: Positive
     stretch: str | None
-    scale_prior_sigma: Positive | None
     known_axis: str
     focal: str
     focal_prior: FocalPrior | Literal["usual"] | None
+    stretch_sigma: Positive | None = None
+    scale_prior_sigma: Positive | None = None  # its earlier name
     principal_sigma: Positive | None = None  # older files lack it
 
 
@@ -376,7 +377,9 @@ def _options(read: _Options, count: int) -> FitOptions:
             sigma = float(as_floats(sigma, name="sigma", shape=()))
         if sigma is not None:
             pixel_information(sigma, count)  # checks it
-        return FitOptions(**{**msgspec.structs.asdict(read), "sigma": sigma})
+        given = {**msgspec.structs.asdict(read), "sigma": sigma}
+        earlier = given.pop("scale_prior_sigma")
+        return FitOptions(**given | ({} if earlier is None else {"stretch_sigma": earlier}))
 
 
 def _alternative(entry: _Alternative, where: str) -> Alternative:

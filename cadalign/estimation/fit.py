@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.results import Results
 
 
-@renamed(confidences="scores")
+@renamed(confidences="scores", scale_prior_sigma="stretch_sigma")
 @np.errstate(all="ignore")  # what is not finite is refused
 def fit(
     points_3d: npt.ArrayLike,
@@ -41,7 +41,7 @@ def fit(
     loss: str = "linear",
     loss_scale: float = 2.0,
     stretch: str | None = None,
-    scale_prior_sigma: float | None = None,
+    stretch_sigma: float | None = None,
     known_axis: str = "x",
     focal: str = "known",
     focal_prior: PriorOption = USUAL,
@@ -79,7 +79,7 @@ def fit(
     stretch : str, optional
         The axes whose scale is estimated: with x known, ``"yz"`` (the default), ``"y"``, ``"z"``
         or ``"none"``. The others keep the scale 1.
-    scale_prior_sigma : float, optional
+    stretch_sigma : float, optional
         Standard deviation of a Gaussian prior on the logarithm of each scale, about the scale 1.
         It keeps keypoints in one plane, or seen end-on, solvable. By default the prior is flat from
         1/5 to 5 and falls off beyond: it bounds what keypoints leave open, and moves nothing else.
@@ -140,7 +140,7 @@ def fit(
     150.0
     """
     start = time.perf_counter()
-    shape = (stretch, scale_prior_sigma, known_axis)
+    shape = (stretch, stretch_sigma, known_axis)
     chosen: tuple[Any, ...] = (
         method,
         sigma,
@@ -164,7 +164,7 @@ def fit(
     return _fit_one(problems, options, ransac, scores, symmetry, start)
 
 
-@renamed(confidences="scores")
+@renamed(confidences="scores", scale_prior_sigma="stretch_sigma")
 @np.errstate(all="ignore")
 def fit_batch(
     points_3d: Sequence[npt.ArrayLike] | FloatArray,
@@ -176,7 +176,7 @@ def fit_batch(
     loss: str = "linear",
     loss_scale: float = 2.0,
     stretch: str | None = None,
-    scale_prior_sigma: float | None = None,
+    stretch_sigma: float | None = None,
     known_axis: str = "x",
     focal: str = "known",
     focal_prior: PriorOption = USUAL,
@@ -198,7 +198,7 @@ def fit_batch(
         One for all problems, or one each.
     sigma : float, None, or sequence of B
         As for `fit`, for all problems; a sequence gives each problem its own.
-    method, loss, loss_scale, stretch, scale_prior_sigma, known_axis, focal, focal_prior
+    method, loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
         As for `fit`; every problem has a focal length of its own.
     principal_sigma, ransac
         As for `fit`.
@@ -236,7 +236,7 @@ def fit_batch(
 
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
-    shape = (stretch, scale_prior_sigma, known_axis)
+    shape = (stretch, stretch_sigma, known_axis)
     options = FitOptions(
         method, given, loss, loss_scale, *shape, focal, focal_prior, principal_sigma
     )

@@ -15,8 +15,10 @@ from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.names import renamed
 
 
+@renamed(scale_prior_sigma="stretch_sigma")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
     """One CAD model: its keypoints, and how far the object may differ from it.
@@ -37,7 +39,7 @@ class Model:
         exact, stretched model.
     stretch, known_axis
         As for `cadalign.fit`.
-    scale_prior_sigma : float, optional
+    stretch_sigma : float, optional
         As for `cadalign.fit`; 0.2 by default where ``shape_sigma`` is given: an object that is only
         similar has similar proportions, and its keypoints alone would say otherwise.
     up_axis : {"y", "x", "z"} or None
@@ -65,7 +67,7 @@ class Model:
     mesh: Mesh | None = None
     shape_sigma: float | None = None
     stretch: str | None = None
-    scale_prior_sigma: float | None = None
+    stretch_sigma: float | None = None
     known_axis: str = "x"
     up_axis: str | None = "y"
     symmetry: Symmetry | None = None
@@ -106,13 +108,13 @@ class Model:
 
     def fit_options(self, sigma: float) -> FitOptions:
         """The options of the plain fit to this model."""
-        prior = self.scale_prior_sigma
+        prior = self.stretch_sigma
         if prior is None and self.shape_sigma is not None:
             prior = SIMILAR_SCALE_SIGMA
         return FitOptions(
             sigma=sigma,
             stretch=self.stretch,
-            scale_prior_sigma=prior,
+            stretch_sigma=prior,
             known_axis=self.known_axis,
         )
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cadalign.io.observation import Observation, ObservationChanges
     from cadalign.shapes.model import ShapeModel
 
-_OF_THE_MODEL = ("stretch", "known_axis", "scale_prior_sigma")  # options that a learned shape lacks
+_OF_THE_MODEL = ("stretch", "known_axis", "stretch_sigma")  # options that a learned shape lacks
 Note = Callable[[str], object]
 """What is told about an estimate, such as the source of its focal length."""
 
@@ -54,11 +54,11 @@ class ObservationFit:
     keypoints by their scores and names, in the place of the file's."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object. Its
-    proportions are similar, too: --scale-prior-sigma is 0.2, unless the file or a flag says
+    proportions are similar, too: --stretch-sigma is 0.2, unless the file or a flag says
     otherwise."""
-    scale_prior: bool = True
+    stretch_prior: bool = True
     """Take a prior on the stretch: the flag's, the file's, or with --similar the default one; with
-    --no-scale-prior none."""
+    --no-stretch-prior none."""
     robust: bool = False
     """Search for outliers among the keypoints (RANSAC) and fit to the inliers."""
     shape: Path | None = None
@@ -187,7 +187,7 @@ class ObservationFit:
         sigma = self.stated_sigma(observation).get("sigma", self.sigma_of(observation))
         changes = {**set_by_flags, "sigma": sigma, "focal": focal, "focal_prior": prior}
         chosen = replace(stored, **changes)
-        return self._with_scale_prior(chosen, is_stored="scale_prior_sigma" in given)
+        return self._with_stretch_prior(chosen, is_stored="stretch_sigma" in given)
 
     def _prior_for(
         self, observation: Observation, stored: Mapping[str, Any], note: Note
@@ -203,21 +203,21 @@ class ObservationFit:
             return FocalPrior(**prior) if isinstance(prior, dict) else prior
         return (_prior_of_photos(observation, note) if self.exif else None) or USUAL
 
-    def _with_scale_prior(self, options: FitOptions, *, is_stored: bool) -> FitOptions:
+    def _with_stretch_prior(self, options: FitOptions, *, is_stored: bool) -> FitOptions:
         """The options with the default prior on a similar model's stretch, or without any."""
-        if not self.scale_prior:
-            if self.fitting.scale_prior_sigma is not None:
-                left_out, given = map(self.named, ("no_scale_prior", "scale_prior_sigma"))
+        if not self.stretch_prior:
+            if self.fitting.stretch_sigma is not None:
+                left_out, given = map(self.named, ("no_stretch_prior", "stretch_sigma"))
                 raise InputError(
                     f"{left_out} leaves out the prior, which {given} gives",
                     where=left_out,
                     fix="give one of the two options",
                 )
-            return replace(options, scale_prior_sigma=None)
-        chosen = is_stored or options.scale_prior_sigma is not None
+            return replace(options, stretch_sigma=None)
+        chosen = is_stored or options.stretch_sigma is not None
         if chosen or not self.similar or options.method != "optimal" or not options.stretched_axes:
             return options
-        return replace(options, scale_prior_sigma=SIMILAR_SCALE_SIGMA)
+        return replace(options, stretch_sigma=SIMILAR_SCALE_SIGMA)
 
     def check_for(self, observation: Observation) -> None:
         """Refuse options that have no effect together with a shape or further evidence."""
@@ -231,7 +231,7 @@ class ObservationFit:
         is_shaped = learned is not None or self.shape_sigma_of(observation) is not None
         refused = {
             "similar": is_shaped and self.similar,
-            "no_scale_prior": is_shaped and not self.scale_prior,
+            "no_stretch_prior": is_shaped and not self.stretch_prior,
         }
         for name in ("method", *(_OF_THE_MODEL if learned is not None else ())):
             is_changed = getattr(self.fitting, name) != getattr(FitOptions, name)

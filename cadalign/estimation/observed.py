@@ -65,7 +65,7 @@ def model_of(
         mesh=mesh,
         shape_sigma=shape_sigma,
         stretch=options.stretch,
-        scale_prior_sigma=options.scale_prior_sigma,
+        stretch_sigma=options.stretch_sigma,
         known_axis=options.known_axis,
         symmetry=observation.symmetry,
         up_axis=observation.up_axis,

@@ -22,6 +22,7 @@ from cadalign.estimation.focal import (
     prior_of_camera,
 )
 from cadalign.geometry.camera import Camera
+from cadalign.names import renamed
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS, ScalePrior
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
@@ -65,6 +66,7 @@ class AlignmentOptions:
     "none"."""
 
 
+@renamed(scale_prior_sigma="stretch_sigma")
 @dataclass(frozen=True)
 class FitOptions(AlignmentOptions):
     """Options of a fit.
@@ -75,7 +77,7 @@ class FitOptions(AlignmentOptions):
         If a value is out of range or unknown, or options exclude each other.
     """
 
-    scale_prior_sigma: float | None = None
+    stretch_sigma: float | None = None
     """Standard deviation of a Gaussian prior on the logarithm of each scale, about scale 1; by
     default one that is flat from 1/5 to 5, and falls off beyond."""
     known_axis: str = "x"
@@ -95,9 +97,9 @@ class FitOptions(AlignmentOptions):
         _check_known("known_axis", self.known_axis, AXES)
         _check_known("focal", self.focal, FOCALS)
         object.__setattr__(self, "loss_scale", as_positive(self.loss_scale, name="loss_scale"))
-        if self.scale_prior_sigma is not None:
-            scale_prior_sigma = as_positive(self.scale_prior_sigma, name="scale_prior_sigma")
-            object.__setattr__(self, "scale_prior_sigma", scale_prior_sigma)
+        if self.stretch_sigma is not None:
+            stretch_sigma = as_positive(self.stretch_sigma, name="stretch_sigma")
+            object.__setattr__(self, "stretch_sigma", stretch_sigma)
         if self.principal_sigma is not None:
             principal_sigma = as_positive(self.principal_sigma, name="principal_sigma")
             object.__setattr__(self, "principal_sigma", principal_sigma)
@@ -119,7 +121,7 @@ class FitOptions(AlignmentOptions):
             object.__setattr__(self, "focal_prior", None)
         if self.method != "optimal" and (
             self.loss != "linear"
-            or self.scale_prior_sigma is not None
+            or self.stretch_sigma is not None
             or (self.stretch is not None and len(self.stretched_axes) < 2)
             or self.principal_sigma is not None
         ):
@@ -175,12 +177,12 @@ class FitOptions(AlignmentOptions):
     @property
     def prior_weight(self) -> float:
         """Inverse variance of the prior on the log scales that is given; 0 for none."""
-        return 0.0 if self.scale_prior_sigma is None else float(self.scale_prior_sigma) ** -2
+        return 0.0 if self.stretch_sigma is None else float(self.stretch_sigma) ** -2
 
     @property
     def scale_prior(self) -> ScalePrior:
         """The prior on the log scales; without one that is given it only bounds them."""
-        if self.scale_prior_sigma is None:
+        if self.stretch_sigma is None:
             return BOUNDING_PRIOR
         return ScalePrior(self.prior_weight, 0.0)
 
@@ -212,7 +214,7 @@ class FitOptions(AlignmentOptions):
     def min_points(self) -> int:
         """The number of keypoints that the method needs."""
         if self.method == "optimal":
-            prior = len(self.stretched_axes) if self.scale_prior_sigma is not None else 0
+            prior = len(self.stretched_axes) if self.stretch_sigma is not None else 0
             prior += self.focal_prior is not None
             return (self.unknowns - prior + 1) // 2
         return 4 if self.method == "epnp" else 6

@@ -368,9 +368,9 @@ def solver_error(
             f"no alignment reprojects the {len(points_3d)} keypoints exactly, and the nearest one "
             f"leaves {missing} open",
             where="points_3d",
-            fix="give more keypoints, or a scale_prior_sigma",
+            fix="give more keypoints, or a stretch_sigma",
         )
-    fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
+    fix = "add keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma"
     if undetermined < 3 and are_on_a_line(points_3d, _FLAT):
         fix = "add keypoints off their line: no option, and no symmetry about it, takes their place"
     return DegenerateError(

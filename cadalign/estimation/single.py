@@ -75,7 +75,7 @@ def align_plain(
     prior = prior_of(model)
     points, bounds = cast(FloatArray, model.points_3d), cast(FloatArray, model.bounds)
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
-    shape = ("stretch", "scale_prior_sigma", "known_axis")
+    shape = ("stretch", "stretch_sigma", "known_axis")
     chosen = vars(options) | {name: getattr(model, name) for name in shape}
     found = fit(
         points[rows],

@@ -26,7 +26,7 @@ it is that of ``uv``, by default ``"center"``. `Observation.save` states both.
 each given for all keypoints or for none. ``image`` and ``model`` are optional paths, relative to
 the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
 ``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
-``loss``, ``loss_scale``, ``stretch``, ``scale_prior_sigma``, ``known_axis``, ``focal`` and
+``loss``, ``loss_scale``, ``stretch``, ``stretch_sigma``, ``known_axis``, ``focal`` and
 ``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``"usual"`` for that of usual lenses,
 ``null`` for none; by default that of the first photo's EXIF data, unless another photo's differ,
 and otherwise the usual one); ``shape_sigma`` of

@@ -79,13 +79,22 @@ class FitFields(Document):
     loss: Text | UnsetType = UNSET
     loss_scale: Positive | UnsetType = UNSET
     stretch: Text | UnsetType | None = UNSET
-    scale_prior_sigma: Positive | UnsetType | None = UNSET
+    stretch_sigma: Positive | UnsetType | None = UNSET
+    scale_prior_sigma: Positive | UnsetType | None = UNSET  # the earlier name
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
     focal_prior: FocalPriorFields | Literal["usual"] | UnsetType | None = UNSET
     principal_sigma: Positive | UnsetType | None = UNSET
     shape_sigma: Positive | UnsetType = UNSET
     image: bool | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        if self.scale_prior_sigma is UNSET:
+            return
+        if self.stretch_sigma is not UNSET:
+            what = "given beside stretch_sigma, its present name"
+            raise InputError(what, where="scale_prior_sigma")
+        self.stretch_sigma, self.scale_prior_sigma = self.scale_prior_sigma, UNSET
 
 
 class SizeFields(Document):

@@ -10,7 +10,7 @@ stretch::
 
     B_k(tau) = l_k(tau) / l_k(0)
     log l_k(tau) = - sum over the shared keypoints [log det(C_i(tau)) + |r_i|^2] / 2
-                   - sum of (log stretch / scale_prior_sigma)^2 / 2 - log det(H) / 2
+                   - sum of (log stretch / stretch_sigma)^2 / 2 - log det(H) / 2
 
 with the whitened errors r_i at the optimum, bent by a robust loss, and H the Hessian there. The
 logarithm of tau is Gaussian; its mean and standard deviation are those of the distances from the

@@ -16,7 +16,7 @@ several categories, each has the probability that its shape model gives to the i
 All models are ranked, but those that would reach behind the camera; none is searched for a pose.
 Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
 box closest to the estimated ones. An unknown focal length is estimated with the shape of the most
-probable category. Of the options, ``scale_prior_sigma`` and ``exhaustive`` have no
+probable category. Of the options, ``stretch_sigma`` and ``exhaustive`` have no
 effect.
 """
 

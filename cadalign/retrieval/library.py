@@ -214,7 +214,7 @@ class Library:
             Number of threads; -1 for one per core.
         **options
             Fields of `cadalign.retrieval.options.RetrievalOptions`, which describes them: top,
-            category, method, sigma, shape_sigma, loss, loss_scale, stretch, scale_prior_sigma,
+            category, method, sigma, shape_sigma, loss, loss_scale, stretch, stretch_sigma,
             max_stretch, symmetries, missing_prob, spurious, none_prior, exhaustive.
 
         Returns

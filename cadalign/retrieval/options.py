@@ -11,7 +11,7 @@ assumptions:
 - An image shows ``spurious`` keypoints, on average, that the object does not have, anywhere in the
   image with equal density: each costs ``log(spurious / area)``.
 - The logarithms of the stretches along y and z are Gaussian about zero, with the standard deviation
-  ``scale_prior_sigma``, and within ``max_stretch``.
+  ``stretch_sigma``, and within ``max_stretch``.
 
 So with N the number of shared keypoints, their errors r_i whitened by their covariances C_i, m the
 number of the model's keypoints that the image lacks and e of the image's that the model lacks::
@@ -33,10 +33,12 @@ from dataclasses import dataclass
 
 from cadalign.errors import InputError
 from cadalign.estimation.options import AlignmentOptions, FitOptions
+from cadalign.names import renamed
 
 METHODS = ("optimal", "epnp")
 
 
+@renamed(scale_prior_sigma="stretch_sigma")
 @dataclass(frozen=True)
 class RetrievalOptions(AlignmentOptions):
     """Options of a retrieval."""
@@ -48,7 +50,7 @@ class RetrievalOptions(AlignmentOptions):
     shape_sigma: float = 0.0
     """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
     in the image: above 0, say 0.03, for libraries with only similar models."""
-    scale_prior_sigma: float | None = 0.4
+    stretch_sigma: float | None = 0.4
     """Standard deviation of a Gaussian prior on the logarithm of each stretch; None for no
     prior."""
     max_stretch: float = 4.0
@@ -108,13 +110,13 @@ class RetrievalOptions(AlignmentOptions):
             loss=self.loss,
             loss_scale=self.loss_scale,
             stretch="none" if self.method == "epnp" else self.stretch,
-            scale_prior_sigma=self.scale_prior_sigma,
+            stretch_sigma=self.stretch_sigma,
         )
 
     @property
     def log_scale_constant(self) -> float:
         """The log density of the prior at no stretch; 0 without a prior."""
-        sigma = self.scale_prior_sigma
+        sigma = self.stretch_sigma
         if sigma is None:
             return 0.0
         axes = len(self.fitting.stretched_axes)

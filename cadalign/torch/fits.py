@@ -27,6 +27,7 @@ from cadalign.estimation.uncertainty.derivatives import (
 )
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
+from cadalign.names import renamed
 from cadalign.solvers.constants import OK
 from cadalign.torch.keypoints import GivenTensors, KeypointBatch, as_array, expanded, in_threads
 from cadalign.torch.library import torch
@@ -41,6 +42,7 @@ _HELD = 1e12  # information about a log focal length at its bound
 _NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
 
 
+@renamed(scale_prior_sigma="stretch_sigma")
 def fit(
     points_3d: Tensor,
     points_2d: Tensor,
@@ -51,7 +53,7 @@ def fit(
     loss: str = "linear",
     loss_scale: float = 2.0,
     stretch: str | None = None,
-    scale_prior_sigma: float | None = None,
+    stretch_sigma: float | None = None,
     known_axis: str = "x",
     focal: str = "known",
     focal_prior: PriorOption = USUAL,
@@ -76,7 +78,7 @@ def fit(
         Standard deviations of the keypoints [px].
     mask : (B, n) bool tensor, optional
         Marks the keypoints that are present. Those that are not finite count as absent.
-    loss, loss_scale, stretch, scale_prior_sigma, known_axis, focal, focal_prior
+    loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
         As for `cadalign.fit`; with ``focal="estimate"`` all images have one size.
     exact : bool
         Take the cost's Hessian for the gradients, otherwise its Gauss-Newton matrix.
@@ -113,7 +115,7 @@ def fit(
         loss,
         loss_scale,
         stretch,
-        scale_prior_sigma,
+        stretch_sigma,
         known_axis,
         focal,
         focal_prior,

@@ -534,7 +534,7 @@ def _cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:
         ("1 wrong of 8, cauchy", draw(8, misplace), given | {"loss": "cauchy"}),
         *((f"{points} right", draw(points), given) for points in _CALIBRATED_SIZES),
         ("8 right, cauchy", draw(8), given | {"loss": "cauchy"}),
-        ("8 right, prior", draw(8), given | {"scale_prior_sigma": 0.5}),
+        ("8 right, prior", draw(8), given | {"stretch_sigma": 0.5}),
         ("8 right, covariances", draw(8), {"sigma": np.tile(noise_px**2 * np.eye(2), (8, 1, 1))}),
         ("8 right, focal unknown", draw(8), given | {"focal": "estimate"}),
         ("20 right, RANSAC", draw(20), given | {"ransac": RansacOptions(max_iterations=300)}),

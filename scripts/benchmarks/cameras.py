@@ -186,7 +186,7 @@ class Scenes:
                     Model(
                         points_3d=each.points_3d,
                         bounds=boxes.BOUNDS,
-                        scale_prior_sigma=_SCALE_SIGMA,
+                        stretch_sigma=_SCALE_SIGMA,
                     ),
                     View(_UNKNOWN, each.points_2d),
                 )
@@ -243,7 +243,7 @@ class Scenes:
         truths = [_pose_of(label, mean) for label in labels]
         pixels = [camera.project(each.apply(mean)) for each in truths]
         pixels = [each + sigma * rng.normal(size=each.shape) for each in pixels]
-        model = Model(points_3d=mean, scale_prior_sigma=0.1, up_axis="z")
+        model = Model(points_3d=mean, stretch_sigma=0.1, up_axis="z")
         size = Size(width=float(np.ptp(mean[:, 0])), sigma=_WIDTHS)
         ground = {"up": (0.0, -1.0, 0.0), "camera_height": 1.65, "camera_height_sigma": 0.03}
         for name, evidence, share in (

@@ -127,7 +127,7 @@ class PhotoCase:
             points_3d=points,
             mesh=mesh,
             stretch="yz" if stretched else "none",
-            scale_prior_sigma=_STRETCH_SIGMA if stretched else None,
+            stretch_sigma=_STRETCH_SIGMA if stretched else None,
         )
         return PhotoClicks(self, model, truth, pixels, sigma)
 

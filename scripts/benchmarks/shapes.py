@@ -344,7 +344,7 @@ def _similar_errors(problem: _SimilarProblem, sigma: float) -> tuple[float, floa
     prior = None if np.isinf(sigma) else sigma
     try:
         est = fit(
-            problem.model, problem.points_2d, KEYPOINT_CAMERA, sigma=None, scale_prior_sigma=prior
+            problem.model, problem.points_2d, KEYPOINT_CAMERA, sigma=None, stretch_sigma=prior
         ).alignment
     except CadalignError:
         return 180.0, 0.0

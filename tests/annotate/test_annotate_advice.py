@@ -56,7 +56,7 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
             points_3d=np.vstack([session.registry.xyz(keypoints), suggestion.point.xyz]),
             ids=[*keypoints, "next"],
             mesh=session.model.scene.mesh,
-            scale_prior_sigma=LIKELY_STRETCH,
+            stretch_sigma=LIKELY_STRETCH,
         ),
         View(camera, uv, ids=keypoints, sigma=sigma),
         alignment,

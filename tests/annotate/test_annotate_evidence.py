@@ -191,7 +191,7 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
         points_3d=points,
         ids=[k for k, _ in case.clicks],
         mesh=session.model.scene.mesh,
-        scale_prior_sigma=LIKELY_STRETCH,
+        stretch_sigma=LIKELY_STRETCH,
     )
     expected = align(model, view, size=Size(**whole.size.given))
     assert live.result is not None

@@ -170,7 +170,7 @@ def test_what_is_the_objects_is_shared(both: Session, case: Case) -> None:
     data = json.loads(case.observation.read_text())
     assert data["object"] == "chair"
     assert data["size"]["height"] == 0.8
-    assert data["fit"]["scale_prior_sigma"] == 0.1
+    assert data["fit"]["stretch_sigma"] == 0.1
     outcome = perform(both, 0, {"do": "undo"})  # in whichever photo it was done
     assert not outcome.message
     assert page_state(both, 1, slot=1)["objects"][0]["label"] == "object 1 of photo.png"

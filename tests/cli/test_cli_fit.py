@@ -98,10 +98,10 @@ def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("flags", "options"),
     [
-        ([], {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "scale_prior_sigma": 0.3}),
+        ([], {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "stretch_sigma": 0.3}),
         (
             ["--sigma", "2", "--stretch", "z"],
-            {"sigma": 2.0, "loss": "cauchy", "stretch": "z", "scale_prior_sigma": 0.3},
+            {"sigma": 2.0, "loss": "cauchy", "stretch": "z", "stretch_sigma": 0.3},
         ),
         (["--no-stored"], {"sigma": np.linspace(0.2, 5, 10)}),
     ],
@@ -109,7 +109,7 @@ def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_options_stored_in_the_file_are_used(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], options: dict[str, Any]
 ) -> None:
-    stored = {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "scale_prior_sigma": 0.3}
+    stored = {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "stretch_sigma": 0.3}
     sigma = np.linspace(0.2, 5, 10)
     path = write_observation(tmp_path / "chair.json", sigma=sigma, fit_options=stored)
     assert main(["fit", str(path), *flags]) == 0
@@ -122,12 +122,12 @@ def test_options_stored_in_the_file_are_used(
     ("flags", "stored", "prior"),
     [
         ([], {}, 0.2),
-        (["--scale-prior-sigma", "0.4"], {}, 0.4),
-        (["--no-scale-prior"], {}, None),
-        ([], {"scale_prior_sigma": 0.1}, 0.1),
-        ([], {"scale_prior_sigma": None}, None),
-        (["--no-scale-prior"], {"scale_prior_sigma": 0.1}, None),
-        (["--no-stored"], {"scale_prior_sigma": 0.1}, 0.2),
+        (["--stretch-sigma", "0.4"], {}, 0.4),
+        (["--no-stretch-prior"], {}, None),
+        ([], {"stretch_sigma": 0.1}, 0.1),
+        ([], {"stretch_sigma": None}, None),
+        (["--no-stretch-prior"], {"stretch_sigma": 0.1}, None),
+        (["--no-stored"], {"stretch_sigma": 0.1}, 0.2),
         (["--stretch", "none"], {}, None),
         (["--method", "aepnp"], {}, None),
     ],
@@ -148,7 +148,7 @@ def test_similar_model_has_similar_proportions(
         PROBLEM.points_2d,
         PROBLEM.camera,
         sigma=None,
-        scale_prior_sigma=prior,
+        stretch_sigma=prior,
         **options,
     )
     assert capsys.readouterr().out == f"{expected}\n"
@@ -167,9 +167,9 @@ def test_given_and_refused_prior_exclude_each_other(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_observation(tmp_path / "chair.json")
-    flags = ["--scale-prior-sigma", "0.1", "--no-scale-prior"]
+    flags = ["--stretch-sigma", "0.1", "--no-stretch-prior"]
     assert refusal_line(capsys, "fit", str(path), *flags) == (
-        "--no-scale-prior: --no-scale-prior leaves out the prior, which --scale-prior-sigma gives; "
+        "--no-stretch-prior: --no-stretch-prior leaves out the prior, which --stretch-sigma gives; "
         "give one of the two options"
     )
 
@@ -186,7 +186,7 @@ def test_options_of_fit_are_those_of_the_function(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_observation(tmp_path / "chair.json", sigma=np.linspace(0.2, 5, 10))
-    flags = ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--scale-prior-sigma", "0.3"]
+    flags = ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--stretch-sigma", "0.3"]
     assert main(["fit", str(path), *flags]) == 0
     expected = fit(
         PROBLEM.points_3d,
@@ -195,7 +195,7 @@ def test_options_of_fit_are_those_of_the_function(
         sigma=2.0,
         loss="cauchy",
         stretch="y",
-        scale_prior_sigma=0.3,
+        stretch_sigma=0.3,
     )
     assert capsys.readouterr().out == f"{expected}\n"
 
@@ -342,7 +342,7 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
     )
     assert refusal_line(capsys, "fit", str(path)) == (
         "points_3d: the scale s_z is not determined: the points lie in the plane z = 0.1; "
-        "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
+        "add keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma"
     )
 
 

@@ -198,7 +198,7 @@ def test_similar_models_noise_is_estimated_beside_evidence(
     path = write(tmp_path, observed(up=UP))
     assert main(["fit", str(path), "--similar"]) == 0
     view = View(CAMERA, observed().points_2d, up=UP, sigma=None)
-    expected = align(Model(points_3d=POINTS, scale_prior_sigma=0.2), view)
+    expected = align(Model(points_3d=POINTS, stretch_sigma=0.2), view)
     assert capsys.readouterr().out.startswith(f"{expected}\n")
 
 

@@ -148,12 +148,12 @@ def test_shape_of_the_file_is_fitted(
 def test_similar_model_is_that_of_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stored = {"scale_prior_sigma": 0.1, "known_axis": "y", "sigma": 2.0}
+    stored = {"stretch_sigma": 0.1, "known_axis": "y", "sigma": 2.0}
     path = write(tmp_path, 8, fit_options=stored)
     assert main(["fit", str(path), "--shape-sigma", "0.05", "--stretch", "z"]) == 0
     seen = Observation.load(path)
     model = Model(
-        points_3d=CORNERS, shape_sigma=0.05, stretch="z", known_axis="y", scale_prior_sigma=0.1
+        points_3d=CORNERS, shape_sigma=0.05, stretch="z", known_axis="y", stretch_sigma=0.1
     )
     expected = align(model, View(CAMERA, seen.points_2d, sigma=2.0))
     assert capsys.readouterr().out == f"{expected}\n"
@@ -358,7 +358,7 @@ def test_both_kinds_of_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     "flags",
     [
         ["--similar"],
-        ["--no-scale-prior"],
+        ["--no-stretch-prior"],
         ["--method", "aepnp"],
     ],
 )
@@ -372,7 +372,7 @@ def test_options_without_effect(
 
 
 @pytest.mark.parametrize(
-    "flags", [["--stretch", "y"], ["--known-axis", "z"], ["--scale-prior-sigma", "0.1"]]
+    "flags", [["--stretch", "y"], ["--known-axis", "z"], ["--stretch-sigma", "0.1"]]
 )
 def test_options_of_a_stretch_without_effect_on_a_learned_shape(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]

@@ -119,7 +119,7 @@ def test_detection_goes_all_the_way_from_file_to_picture(
         points_2d,
         camera,
         sigma=None,
-        scale_prior_sigma=0.2,  # the command's, for a similar model
+        stretch_sigma=0.2,  # the command's, for a similar model
         ransac=RansacOptions(max_reproj_error=THRESHOLD_PX),
     )
     np.testing.assert_allclose(written.alignment.scale, direct.alignment.scale, rtol=1e-6)

@@ -98,7 +98,7 @@ def test_stretched_object_contradicts_a_held_stretch() -> None:
         (20, {}),
         (8, {"loss": "cauchy"}),
         (8, {"loss": "huber"}),
-        (8, {"scale_prior_sigma": 0.5}),
+        (8, {"stretch_sigma": 0.5}),
         (8, {"sigma": np.ones(8)}),
         (20, {"ransac": RansacOptions(max_iterations=200)}),
     ],
@@ -239,7 +239,7 @@ def test_covariance_that_overflows_is_refused() -> None:
     )
     camera = Camera(640, 480, 1048204.971549734, 245403.3967991035, 319.5, 239.5)
     with pytest.raises(DegenerateError, match="beyond the range"):
-        fit(points_3d, points_2d, camera, stretch="none", scale_prior_sigma=0.001, sigma=None)
+        fit(points_3d, points_2d, camera, stretch="none", stretch_sigma=0.001, sigma=None)
 
 
 def test_batches_estimate_the_same_noise() -> None:

@@ -156,9 +156,9 @@ def test_true_scale_may_be_held() -> None:
 def test_weak_prior_changes_nothing_and_a_strong_one_holds_the_scale() -> None:
     problem = problem_of(2, points=20)
     free = fit_problem(problem)
-    weak = fit_problem(problem, scale_prior_sigma=1e4)
+    weak = fit_problem(problem, stretch_sigma=1e4)
     assert_same(weak.alignment, free.alignment, 1e-5)
-    strong = fit_problem(problem, scale_prior_sigma=1e-6)
+    strong = fit_problem(problem, stretch_sigma=1e-6)
     held = fit_problem(problem, stretch="none")
     assert_same(strong.alignment, held.alignment, 1e-3)
     np.testing.assert_allclose(strong.alignment.scale, 1.0, atol=1e-5)
@@ -166,7 +166,7 @@ def test_weak_prior_changes_nothing_and_a_strong_one_holds_the_scale() -> None:
 
 def test_prior_adds_its_information() -> None:
     problem = problem_of(2, points=20, noise_px=0.0, stretch=(1.0, 1.0))
-    free, prior = fit_problem(problem), fit_problem(problem, scale_prior_sigma=0.02)
+    free, prior = fit_problem(problem), fit_problem(problem, stretch_sigma=0.02)
     information, without = (
         np.linalg.inv(of_unknowns(each.fisher_covariance)) for each in (prior, free)
     )
@@ -185,7 +185,7 @@ def test_prior_makes_keypoints_in_one_plane_solvable(seed: int, axis: int) -> No
     points_3d[:, axis] = 0.1
     points_2d = problem.camera.project(problem.alignment.apply(points_3d))
     points_2d += 0.2 * rng.standard_normal(points_2d.shape)
-    result = fit(points_3d, points_2d, problem.camera, scale_prior_sigma=0.5)
+    result = fit(points_3d, points_2d, problem.camera, stretch_sigma=0.5)
     assert result.rms < 1.0
     assert result.std is not None
     # Nothing but the prior knows this scale.

@@ -124,7 +124,7 @@ def test_something_else_than_a_camera_is_refused(method: str) -> None:
 
 
 LINE_FIX = "add keypoints off their line: no option, and no symmetry about it, takes their place"
-OPTIMAL_FIX = "add keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma"
+OPTIMAL_FIX = "add keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma"
 
 
 def in_plane(axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -260,11 +260,11 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
         ({"loss_scale": 0}, "loss_scale: 0 is not positive"),
         ({"loss_scale": np.nan}, "loss_scale: nan is not positive"),
         ({"loss_scale": "2"}, "loss_scale: '2' is not positive"),
-        ({"scale_prior_sigma": -0.1}, "scale_prior_sigma: -0.1 is not positive"),
-        ({"scale_prior_sigma": "0.3"}, "scale_prior_sigma: '0.3' is not positive"),
+        ({"stretch_sigma": -0.1}, "stretch_sigma: -0.1 is not positive"),
+        ({"stretch_sigma": "0.3"}, "stretch_sigma: '0.3' is not positive"),
         (
-            {"scale_prior_sigma": 1e-200},
-            "scale_prior_sigma: 1e-200 is not between 1e-100 and 1e+100",
+            {"stretch_sigma": 1e-200},
+            "stretch_sigma: 1e-200 is not between 1e-100 and 1e+100",
         ),
         ({"sigma": [[1.0], [1.0, 2.0]]}, "sigma: its entries are not of one shape"),
         (
@@ -298,8 +298,8 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
             "give one of yz, y, z, none",
         ),
         (
-            {"scale_prior_sigma": np.timedelta64(2, "s")},
-            "scale_prior_sigma: np.timedelta64(2,'s') is not positive",
+            {"stretch_sigma": np.timedelta64(2, "s")},
+            "stretch_sigma: np.timedelta64(2,'s') is not positive",
         ),
         ({"known_axis": "w"}, "known_axis: unknown known_axis 'w'; known are x, y, z"),
         (
@@ -348,7 +348,7 @@ def test_matrices_and_numbers_of_any_width_are_taken() -> None:
 def test_noise_beyond_all_numbers_is_refused() -> None:
     size = 1e200
     error = fit_refusal(
-        GOOD.points_3d, size * GOOD.points_2d, GOOD.camera, sigma=None, scale_prior_sigma=0.1
+        GOOD.points_3d, size * GOOD.points_2d, GOOD.camera, sigma=None, stretch_sigma=0.1
     )
     assert isinstance(error, InputError | DegenerateError)
 

@@ -208,7 +208,7 @@ def test_what_is_no_symmetry_is_refused(given):
 
 
 @pytest.mark.parametrize("count", [4, 7])
-@pytest.mark.parametrize("options", [{}, {"stretch": "none"}, {"scale_prior_sigma": 0.2}])
+@pytest.mark.parametrize("options", [{}, {"stretch": "none"}, {"stretch_sigma": 0.2}])
 def test_keypoints_on_the_axis_alone_are_refused(count, options):
     points = OFFSET + UP * np.linspace(-0.4, 0.5, count)[:, None]
     seen = CAMERA.project(truth_of(0.3).apply(points))

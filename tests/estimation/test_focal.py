@@ -442,9 +442,9 @@ def test_prior_with_estimated_noise_counts_by_its_own_deviation() -> None:
 def test_scale_prior_holds_a_scale_that_an_unknown_focal_length_leaves_open() -> None:
     problem = problem_of(5, points=30, noise_px=3.0)
     free = fit_unknown(problem, sigma=None)
-    result = fit_unknown(problem, sigma=None, scale_prior_sigma=0.05)
+    result = fit_unknown(problem, sigma=None, stretch_sigma=0.05)
     assert np.abs(np.log(result.alignment.scale)).sum() < np.abs(np.log(free.alignment.scale)).sum()
-    known = fit_unknown(problem, sigma=result.sigma, scale_prior_sigma=0.05)
+    known = fit_unknown(problem, sigma=result.sigma, stretch_sigma=0.05)
     np.testing.assert_allclose(result.alignment.scale, known.alignment.scale, rtol=1e-3)
     np.testing.assert_allclose(
         result.fisher_covariance, known.fisher_covariance, rtol=1e-2, atol=1e-8

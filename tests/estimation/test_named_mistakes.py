@@ -218,7 +218,7 @@ def detected(words: str, *, normalised: bool = False, twice: bool = False) -> Ma
 
 
 ROBUST = {"ransac": RansacOptions()}
-SIMILAR = {"sigma": None, "scale_prior_sigma": 0.2}
+SIMILAR = {"sigma": None, "stretch_sigma": 0.2}
 DOUBLE, HALF = "images of 1280 x 960 px", "images of 320 x 240 px"
 
 

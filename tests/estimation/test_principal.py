@@ -143,7 +143,7 @@ def seen_by_cropped(seed: int, views: int, shape_sigma: float) -> tuple[Model, l
         pose = Alignment(turn, [*rng.uniform(-0.4, 0.4, 2), rng.uniform(2, 3)], scale)
         seen.append(View(CENTERED, camera.project(pose.apply(shape)) + rng.normal(size=(20, 2))))
     kind = {"shape_sigma": shape_sigma} if shape_sigma else {}
-    return Model(points_3d=points, scale_prior_sigma=0.2, **kind), seen, camera
+    return Model(points_3d=points, stretch_sigma=0.2, **kind), seen, camera
 
 
 @pytest.mark.parametrize(

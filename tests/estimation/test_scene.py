@@ -48,7 +48,7 @@ class Simulated:
     def objects(self, camera: Camera, *, sized: int = 0, **evidence: Any) -> list[SceneObject]:
         return [
             SceneObject(
-                Model(points_3d=points, bounds=StandingBoxes.BOUNDS, scale_prior_sigma=0.3),
+                Model(points_3d=points, bounds=StandingBoxes.BOUNDS, stretch_sigma=0.3),
                 View(camera, pixels, **evidence),
                 size=Size(width=1.0) if number < sized else None,
             )

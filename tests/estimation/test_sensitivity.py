@@ -104,7 +104,7 @@ def errors_of_fit(problem: Problem, rng: np.random.Generator, **options: Any) ->
         (150, {"loss": "cauchy"}),
         (150, {"loss": "huber"}),
         (30, {"focal": "estimate"}),
-        (100, {"stretch": "y", "known_axis": "z", "scale_prior_sigma": 0.1}),
+        (100, {"stretch": "y", "known_axis": "z", "stretch_sigma": 0.1}),
     ],
     ids=lambda value: str(value),
 )

@@ -21,8 +21,8 @@ _VALUES = [
 ]  # fmt: skip
 _COMMANDS: dict[str, list[str]] = {
     "fit": ["--method", "--loss", "--stretch", "--max-reproj-error", "--focal", "--sigma",
-            "--robust", "--similar", "--json", "--out", "--scale-prior-sigma", "--known-axis",
-            "--shape", "--shape-sigma", "--no-scale-prior"],
+            "--robust", "--similar", "--json", "--out", "--stretch-sigma", "--known-axis",
+            "--shape", "--shape-sigma", "--no-stretch-prior"],
     "observe": ["--image", "--model", "--out", "--object", "--min-score", "--sigma"],
     "retrieve": ["--library", "--out", "--top", "--category", "--json", "--loss"],
     "render": ["--out", "--width", "--height", "--view", "--style", "--background", "--keypoints"],

@@ -15,7 +15,7 @@ from cadalign import Alignment, Camera, FocalPrior, RansacOptions
 CAMERA = Camera(640, 480, 500.0, 505.0, 319.5, 239.5)
 LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.25, 0.08, 0.004, -0.003))
 OPTIONS = (
-    "method", "sigma", "loss", "loss_scale", "stretch", "scale_prior_sigma", "known_axis", "focal",
+    "method", "sigma", "loss", "loss_scale", "stretch", "stretch_sigma", "known_axis", "focal",
     "focal_prior", "ransac", "scores",
 )  # fmt: skip
 
@@ -156,7 +156,7 @@ def _options(rng: np.random.Generator) -> dict[str, Any]:
     if rng.random() < 0.05:
         options["known_axis"] = str(rng.choice(["y", "z"]))
     if rng.random() < 0.2:
-        options["scale_prior_sigma"] = float(rng.choice([1e-3, 0.1, 0.3, 3.0]))
+        options["stretch_sigma"] = float(rng.choice([1e-3, 0.1, 0.3, 3.0]))
     if rng.random() < 0.2:
         options["loss"] = str(rng.choice(["linear", "huber", "cauchy"]))
         options["loss_scale"] = float(10 ** rng.uniform(-2, 2))

@@ -71,7 +71,7 @@ def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
 
 def test_options_of_the_fit_are_kept(tmp_path: Path) -> None:
     """An explicit null, which estimates sigma, differs from a missing one."""
-    options = {"sigma": None, "loss": "cauchy", "stretch": "y", "scale_prior_sigma": 0.3}
+    options = {"sigma": None, "loss": "cauchy", "stretch": "y", "stretch_sigma": 0.3}
     observation = Observation.from_dict(DATA | {"fit": options})
     assert observation.fit_options == options
     observation.save(tmp_path / "chair.json")

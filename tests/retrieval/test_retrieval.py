@@ -105,7 +105,7 @@ def test_the_alignment_is_the_optimum_that_fit_finds() -> None:
     for number in range(6):
         pixels = view(MODELS[number], pose_of(number), noise_px=2.0, seed=number)
         best = LIBRARY.retrieve(pixels, IDS, CAMERA, sigma=2.0)[0]
-        fitted = fit(MODELS[number].xyz, pixels, CAMERA, sigma=2.0, scale_prior_sigma=0.4)
+        fitted = fit(MODELS[number].xyz, pixels, CAMERA, sigma=2.0, stretch_sigma=0.4)
         np.testing.assert_allclose(best.alignment.rotation, fitted.alignment.rotation, atol=1e-6)
         np.testing.assert_allclose(best.alignment.scale, fitted.alignment.scale, rtol=1e-6)
 
@@ -119,7 +119,7 @@ def test_the_log_likelihood_is_what_the_documentation_says() -> None:
     pixels = view(whole, pose_of(2), noise_px=1.5)[shown]
     sigma = np.linspace(1.0, 2.0, 8)
     (match,) = library.retrieve(
-        pixels, shown, CAMERA, sigma=sigma, missing_prob=0.3, spurious=0.05, scale_prior_sigma=0.6
+        pixels, shown, CAMERA, sigma=sigma, missing_prob=0.3, spurious=0.05, stretch_sigma=0.6
     )
     shared = slice(0, 6)
     residuals = CAMERA.project(match.alignment.apply(model.xyz[shared])) - pixels[shared]
@@ -221,12 +221,10 @@ class TestStretch:
     @pytest.mark.long
     def test_no_model_is_stretched_beyond_the_limit(self) -> None:
         pixels = view(MODELS[4], pose_of(4, scale=(2.5, 1.0)))
-        wide = LIBRARY.retrieve(pixels, IDS, CAMERA, scale_prior_sigma=None)
+        wide = LIBRARY.retrieve(pixels, IDS, CAMERA, stretch_sigma=None)
         assert wide[0].model_id == "004"
         assert wide[0].alignment.scale[1] == pytest.approx(2.5, rel=1e-3)
-        narrow = LIBRARY.retrieve(
-            pixels, IDS, CAMERA, scale_prior_sigma=None, max_stretch=2.0, top=60
-        )
+        narrow = LIBRARY.retrieve(pixels, IDS, CAMERA, stretch_sigma=None, max_stretch=2.0, top=60)
         (held,) = (match for match in narrow if match.model_id == "004")
         assert held.alignment.scale[1] == pytest.approx(2.0)
         assert held.rms > 1
@@ -248,7 +246,7 @@ class TestStretch:
         # The density of log 3.3 over that of log 1.1.
         ratio = np.exp((np.log(1.1) ** 2 - np.log(3.3) ** 2) / (2 * 0.4**2))
         assert second.score / first.score == pytest.approx(ratio, rel=0.1)
-        equal = library.retrieve(pixels, IDS, CAMERA, scale_prior_sigma=None)
+        equal = library.retrieve(pixels, IDS, CAMERA, stretch_sigma=None)
         assert [m.score for m in equal] == pytest.approx([0.5, 0.5], abs=1e-6)
 
     def test_axes_can_be_held(self) -> None:
@@ -591,7 +589,7 @@ def test_keypoints_that_no_model_can_be_aligned_with_are_refused() -> None:
         ({"max_stretch": float("nan")}, "max_stretch: must be between 1 and 1000, not nan"),
         ({"loss": "tukey"}, "loss: unknown loss 'tukey'; known are linear, huber, cauchy"),
         ({"loss_scale": -1}, "loss_scale: -1 is not positive"),
-        ({"scale_prior_sigma": 0.0}, "scale_prior_sigma: 0.0 is not positive"),
+        ({"stretch_sigma": 0.0}, "stretch_sigma: 0.0 is not positive"),
         ({"stretch": "x"}, "stretch: 'x' are not axes that can stretch"),
         ({"workers": 0}, "workers: must be >= 1, or -1 for all cores, not 0"),
         ({"mask": np.ones((480, 640)), "image": np.ones((480, 640, 3))}, "a mask or an image, not"),

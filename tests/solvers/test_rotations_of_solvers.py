@@ -45,7 +45,7 @@ def test_start_far_from_a_rotation_does_not_reach_the_result() -> None:
     [
         {"stretch": "none"},
         {"stretch": "y"},
-        {"scale_prior_sigma": 0.3},
+        {"stretch_sigma": 0.3},
         {"ransac": RansacOptions(refine=False)},
     ],
     ids=lambda options: "-".join(options),

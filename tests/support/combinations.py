@@ -425,14 +425,14 @@ def requests() -> list[Request]:
             "keypoints of it in one plane",
             "the stretch across the plane changes nothing in the image",
             "points_3d: the scale s_z is not determined: the points lie in the plane x = -0.5; add "
-            "keypoints elsewhere, hold scales fixed with stretch=, or give scale_prior_sigma",
+            "keypoints elsewhere, hold scales fixed with stretch=, or give stretch_sigma",
             lambda: align(exact, _seen([0, 1, 2, 3])),
         ),
         Request(
             "keypoints of it in one plane, `ransac`",
             "the samples' stretch is not determined",
             "points_3d: all keypoints lie in one plane, where the samples of ransac determine "
-            "nothing; leave ransac away: use loss='cauchy', with stretch= or scale_prior_sigma=",
+            "nothing; leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
             lambda: align(exact, _seen([0, 1, 2, 3]), ransac=RansacOptions()),
         ),
         Request(

@@ -64,7 +64,7 @@ def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
         points_3d=result.points_3d,
         ids=result.ids,
         stretch=options.stretch,
-        scale_prior_sigma=options.scale_prior_sigma,
+        stretch_sigma=options.stretch_sigma,
         known_axis=options.known_axis,
     )
     sigma = result.sigma if options.sigma is None else options.sigma

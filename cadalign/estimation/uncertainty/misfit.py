@@ -310,10 +310,10 @@ class Tested:
 def contradicting_scale(tested: Tested) -> tuple[float, float, float] | None:
     """The scales without the constraints on them, if these contradict the keypoints."""
     options = tested.options
-    if len(options.stretched_axes) == _SCALES and options.scale_prior_sigma is None:
+    if len(options.stretched_axes) == _SCALES and options.stretch_sigma is None:
         return None
     try:
-        free = tested.fit(stretch=None, scale_prior_sigma=None)
+        free = tested.fit(stretch=None, stretch_sigma=None)
         decrease = tested.chi_square - Tested.of(free).chi_square
     except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
         return None

@@ -103,7 +103,7 @@ class KeypointStatistics(FittedKeypoints):
                 self.alignment,
                 uncertainty_of(self.covariance),
                 redundancy=2 * len(kept) - options.unknowns,
-                scale_prior_sigma=options.scale_prior_sigma,
+                stretch_sigma=options.stretch_sigma,
                 doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
             )
         )

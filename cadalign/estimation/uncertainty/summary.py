@@ -67,7 +67,7 @@ def weaknesses_of_keypoints(
     std: Uncertainty,
     *,
     redundancy: int,
-    scale_prior_sigma: float | None,
+    stretch_sigma: float | None,
     doubt: str | None,
 ) -> tuple[str, ...]:
     """Warn about stretch and motion that the keypoints do not determine, with the reason.
@@ -88,8 +88,8 @@ def weaknesses_of_keypoints(
     if doubt is not None:
         warnings.append(doubt)
     most = UNDETERMINED
-    if scale_prior_sigma is not None:
-        most = min(most, _LEAST_GAIN * scale_prior_sigma)
+    if stretch_sigma is not None:
+        most = min(most, _LEAST_GAIN * stretch_sigma)
     for axis, relative in enumerate(std.scale):
         if relative > most:
             why = _why_scale_is_weak(points_3d, alignment, axis)
@@ -269,7 +269,7 @@ class Misfit:
     redundancy : int
         What is expected of it: the equations minus the unknowns.
     free_scale : tuple of 3 float, optional
-        The scales without the constraints on them (stretch=, scale_prior_sigma), where it is these
+        The scales without the constraints on them (stretch=, stretch_sigma), where it is these
         that contradict the keypoints.
     outliers : mapping of int to float
         The keypoints without which the others fit, and their distances from where the others put

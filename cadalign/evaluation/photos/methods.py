@@ -190,7 +190,7 @@ def _calibrated(sighting: Sighting) -> Sighting:
         sighting.points_2d,
         sighting.camera,
         sigma=sighting.sigma,
-        scale_prior_sigma=_FOCAL_PRIOR,
+        stretch_sigma=_FOCAL_PRIOR,
         focal="estimate",
     )
     return replace(sighting, camera=found.camera)
@@ -301,7 +301,7 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
     if base == RIGID:
         kind = {"stretch": "none"}
     elif base == PRIOR:
-        kind = {"scale_prior_sigma": SIMILAR_SCALE_SIGMA}
+        kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
     elif base == SIMILAR:
         diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
         kind = {"shape_sigma": similar_sigma * diagonal}

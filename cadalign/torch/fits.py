@@ -1,45 +1,22 @@
-"""`fit`: alignments of a batch with gradients by keypoints, sigmas and model points.
-
-The forward pass is the search of `cadalign.fit_batch`; a Newton step removes what its tolerance
-leaves. The backward pass solves one linear system for each problem, vectorised over the batch.
-"""
+"""`fit`: alignments of a batch with gradients by keypoints, sigmas and model points."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import InputError
-from cadalign.estimation.focal import USUAL, PriorOption, log_focal_range
-from cadalign.estimation.options import LOSSES, FitOptions
-from cadalign.estimation.problems import Problems
-from cadalign.estimation.solve import solve
-from cadalign.estimation.uncertainty.derivatives import (
-    UNKNOWNS,
-    Optima,
-    PriorTerms,
-    SeenKeypoints,
-)
+from cadalign.estimation.focal import USUAL, PriorOption
+from cadalign.estimation.layers import FitTask, fits_of
+from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotations_from_vectors
 from cadalign.names import renamed
-from cadalign.solvers.constants import OK
-from cadalign.torch.keypoints import GivenTensors, KeypointBatch, as_array, expanded, in_threads
+from cadalign.torch.keypoints import GivenTensors, as_array, expanded
 from cadalign.torch.library import torch
 from cadalign.torch.poses import PoseBatch
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-_LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
-_AT_BOUND = 1e-9
-_HELD = 1e12  # information about a log focal length at its bound
-_NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
 
 
 @renamed(scale_prior_sigma="stretch_sigma")
@@ -122,66 +99,11 @@ def fit(
     )
     given = GivenTensors.of(points_2d, camera, sigma, mask)
     models = expanded(points_3d, (*points_2d.shape[:2], 3), "points_3d")
-    task = _FitTask(given.cameras, given.mask.numpy(), options, exact, workers)
-    found = _layer().apply(models, points_2d, given.sigma, task)
+    task = FitTask(given.cameras, options, exact, workers)
+    found = _layer().apply(models, points_2d, given.sigma, given.mask, task)
     rotation, translation, scale, focals, covariance, valid = found
     estimated = focals if focal == "estimate" else None
     return PoseBatch(rotation, translation, scale, valid, estimated, covariance=covariance)
-
-
-@dataclass(frozen=True, eq=False)
-class _FitTask:
-    """Input of a fit beside tensors."""
-
-    cameras: tuple[Camera, ...]
-    mask: BoolArray
-    options: FitOptions
-    exact: bool
-    workers: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Fits:
-    """Fits of some problems, their optima before the polish, and which of them are valid (B,).
-
-    ``by_pixels`` (B, n, 2, 2) are the derivatives of the optima's rays by the pixels.
-    """
-
-    optima: Optima
-    by_pixels: FloatArray
-    sigmas: FloatArray
-    rotation: FloatArray
-    translation: FloatArray
-    scale: FloatArray
-    focals: FloatArray
-    valid: BoolArray
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Inverse of the Hessian (B, 10, 10) of all unknowns."""
-        free = self.optima.free
-        covariance = np.zeros((len(self.valid), UNKNOWNS, UNKNOWNS))
-        covariance[:, free[:, None], free] = self.optima.inverse
-        covariance[~self.valid] = 0.0
-        return covariance
-
-    def pulled_back(
-        self,
-        by_rotation: FloatArray,
-        by_translation: FloatArray,
-        by_scale: FloatArray,
-        by_focal: FloatArray,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Slopes by points, pixels and sigmas from those by what the layer returns."""
-        slopes = np.empty((len(by_focal), UNKNOWNS))
-        slopes[:, :3] = np.cross(self.rotation, by_rotation, axis=1).sum(axis=2)
-        slopes[:, 3:6] = by_translation
-        slopes[:, 6:9] = by_scale * self.scale
-        slopes[:, 9] = by_focal * self.focals
-        slopes[~self.valid] = 0.0
-        pulled = self.optima.pull_back(slopes)
-        by_pixels = (pulled.by_rays[..., None, :] @ self.by_pixels)[..., 0, :]
-        return pulled.by_points, by_pixels, pulled.by_log_sigma / self.sigmas
 
 
 @cache
@@ -193,115 +115,29 @@ def _layer() -> Any:
 
         @staticmethod
         def forward(
-            ctx: Any, points_3d: Tensor, points_2d: Tensor, sigma: Tensor, task: _FitTask
+            ctx: Any,
+            points_3d: Tensor,
+            points_2d: Tensor,
+            sigma: Tensor,
+            mask: Tensor,
+            task: FitTask,
         ) -> tuple[Tensor, ...]:
             given = points_3d, points_2d, sigma
             ctx.kinds = [(each.device, each.dtype) for each in given]
-            ctx.parts = _all_fits(task, *map(as_array, given))
-            names = "rotation", "translation", "scale", "focals", "covariance", "valid"
-            arrays = [np.concatenate([getattr(each, name) for each in ctx.parts]) for name in names]
-            tensors = [torch.as_tensor(each).to(points_2d) for each in arrays[:-1]]
-            valid = torch.as_tensor(arrays[-1], device=points_2d.device)
+            ctx.fits = fits_of(
+                task, as_array(points_3d), as_array(points_2d), as_array(sigma), mask.numpy()
+            )
+            *arrays, valid = ctx.fits.values
+            tensors = [torch.as_tensor(each).to(points_2d) for each in arrays]
+            valid = torch.as_tensor(valid, device=points_2d.device)
             ctx.mark_non_differentiable(tensors[-1], valid)
             return (*tensors, valid)
 
         @staticmethod
         @torch.autograd.function.once_differentiable
         def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
-            given = [as_array(each) for each in slopes[:4]]
-            ends = np.cumsum([len(each.valid) for each in ctx.parts])
-
-            pulled = [
-                part.pulled_back(*(each[end - len(part.valid) : end] for each in given))
-                for part, end in zip(ctx.parts, ends, strict=True)
-            ]
-            arrays = [np.concatenate(each) for each in zip(*pulled, strict=True)]
-            kinds = zip(arrays, ctx.kinds, strict=True)
-            return (*(torch.as_tensor(each).to(*kind) for each, kind in kinds), None)
+            pulled = ctx.fits.pulled_back(*map(as_array, slopes[:4]))
+            kinds = zip(pulled, ctx.kinds, strict=True)
+            return (*(torch.as_tensor(each).to(*kind) for each, kind in kinds), None, None)
 
     return FitLayer
-
-
-def _all_fits(
-    task: _FitTask, points: FloatArray, pixels: FloatArray, sigmas: FloatArray
-) -> list[_Fits]:
-    """Fits of a batch, in the parts that the threads share."""
-    options = task.options
-    if options.focal == "estimate":
-        if len({(each.width, each.height) for each in task.cameras}) > 1:
-            what = "with an unknown focal length all images must have one size"
-            raise InputError(what, where="camera", fix="call fit for each size")
-        if any(each.distortion for each in task.cameras):
-            what = "an unknown focal length and lens distortion have no gradients together"
-            raise InputError(what, where="focal", fix="undistort keypoints and camera first")
-        options = options.for_camera(task.cameras[0])
-
-    @np.errstate(all="ignore")  # holds for one thread only
-    def run(first: int, last: int) -> _Fits:
-        some = slice(first, last)
-        cameras = task.cameras if len(task.cameras) == 1 else task.cameras[some]
-        present = task.mask[some] & np.isfinite(points[some]).all(axis=2)
-        batch = KeypointBatch.of(pixels[some], sigmas[some], present, cameras)
-        known = np.where(batch.present[..., None], points[some], 0.0)
-        return _fits_of(known, batch, options, task.exact)
-
-    return in_threads(run, len(points), task.workers)
-
-
-def _fits_of(points: FloatArray, batch: KeypointBatch, options: FitOptions, exact: bool) -> _Fits:
-    """The fits of some problems, polished by a Newton step.
-
-    The derivatives are those before it: it is far below the noise.
-    """
-    poses, focals, valid = _solved(points, batch, options)
-    pose = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:12], poses[:, 12:]
-    given = np.array([camera.fx for camera in batch.cameras])
-    ratio = (focals / given)[:, None, None]
-    prior = PriorTerms(options.scale_prior)
-    rays, information, by_pixels = batch.rays, batch.information, batch.by_pixels
-    if options.focal == "estimate":
-        rays, by_pixels = rays / ratio, by_pixels / ratio[..., None]
-        information = information * ratio[..., None] ** 2
-        low, high, mean, weight = log_focal_range(batch.cameras[0], options.focal_prior)
-        logs = np.log(focals)
-        is_held = (logs < low + _AT_BOUND) | (logs > high - _AT_BOUND)
-        weights = np.where(is_held, _HELD, weight)
-        prior = PriorTerms(options.scale_prior, np.where(is_held, 0.0, logs - mean), weights)
-    loss, bend = LOSSES[options.loss], options.loss_scale
-    keypoints = SeenKeypoints(points, rays, information, loss, bend)
-    optima = Optima(keypoints, *pose, prior, options.estimated_unknowns, exact)
-    step = optima.newton_step
-    size = np.abs(step[:, [0, 1, 2, 6, 7, 8, 9]]).max(axis=1)
-    step[~(valid & (size < _LARGEST_POLISH))] = 0.0
-    return _Fits(
-        optima,
-        by_pixels,
-        batch.sigmas,
-        rotations_from_vectors(step[:, :3]) @ pose[0],
-        pose[1] + step[:, 3:6],
-        pose[2] * np.exp(step[:, 6:9]),
-        focals * np.exp(step[:, 9]),
-        valid & optima.determined,
-    )
-
-
-def _solved(
-    points: FloatArray, batch: KeypointBatch, options: FitOptions
-) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Poses (B, 15) and focal lengths (B,) of the best minima, and which problems have one."""
-    present, cameras = batch.present, batch.cameras
-    offsets = np.concatenate([[0], np.cumsum(batch.counts)]).astype(np.int64)
-    problems = Problems(points[present], batch.pixels[present], offsets, cameras)
-    sigmas, each = batch.sigmas[present], None
-    if len(cameras) > 1 or options.focal == "estimate":
-        each = [sigmas[problems.rows(b)] for b in range(len(points))]
-    else:  # those of all problems, one after the other
-        options = replace(options, sigma=sigmas)
-    found = solve(problems, options, each)
-    valid = (found.statuses == OK) & np.isfinite(found.poses[:, 0]).all(axis=1)
-    valid[list(found.errors)] = False
-    poses = np.where(valid[:, None], found.poses[:, 0], _NO_POSE)
-    focals = np.array([camera.fx for camera in cameras]) * np.ones(len(points))
-    if found.focals is not None:
-        focals = np.where(valid, found.focals[:, 0], focals)
-    return poses, focals, valid

@@ -12,6 +12,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
+from cadalign.estimation.layers import KeypointBatch, in_threads
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.geometry.camera import Camera
@@ -20,7 +21,7 @@ from cadalign.solvers.marginal.equations import POSE, force_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
 from cadalign.solvers.marginal.search import search_view
 from cadalign.solvers.marginal.slopes import slopes_of
-from cadalign.torch.keypoints import GivenTensors, KeypointBatch, as_array, in_threads
+from cadalign.torch.keypoints import GivenTensors, as_array
 from cadalign.torch.library import torch
 from cadalign.torch.poses import PoseBatch
 

@@ -42,8 +42,9 @@ def named(page: Path) -> str:
 @pytest.mark.long
 @pytest.mark.parametrize("page", [p for p in pages() if blocks(p, "python")], ids=named)
 def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    if any("cadalign.torch" in block for block in blocks(page, "python")):
-        pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
+    for extra in ("torch", "jax"):
+        if any(f"cadalign.{extra}" in block for block in blocks(page, "python")):
+            pytest.importorskip(extra, reason=f'needs pip install -e ".[{extra}]"')
     monkeypatch.chdir(tmp_path)  # where some of them write
     names: dict[str, Any] = {}
     for block in blocks(page, "python"):

@@ -1,0 +1,316 @@
+"""Fits of a batch with their derivatives: what layers of PyTorch and JAX share.
+
+The forward pass is the search of `cadalign.fit_batch`; a Newton step removes what its tolerance
+leaves. The backward pass solves one linear system for each problem, vectorised over the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from cadalign.arrays import BoolArray, FloatArray, IntArray, worker_count
+from cadalign.errors import InputError
+from cadalign.estimation.focal import log_focal_range
+from cadalign.estimation.options import LOSSES, FitOptions
+from cadalign.estimation.problems import Problems, rays_of
+from cadalign.estimation.solve import solve
+from cadalign.estimation.uncertainty.derivatives import (
+    UNKNOWNS,
+    Optima,
+    PriorTerms,
+    SeenKeypoints,
+)
+from cadalign.estimation.uncertainty.sensitivity import lens_slopes
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotations_from_vectors
+from cadalign.solvers.constants import OK
+
+T = TypeVar("T")
+
+_LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
+_AT_BOUND = 1e-9
+_HELD = 1e12  # information about a log focal length at its bound
+_NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 1, 1, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointBatch:
+    """Keypoints of B problems in arrays: what is absent or not finite is 0.
+
+    ``pixels`` (B, n, 2), ``sigmas`` (B, n) [px], ``present`` (B, n), rays (B, n, 2), and
+    ``by_pixels`` (B, n, 2, 2), derivatives of the rays by the pixels.
+    """
+
+    pixels: FloatArray
+    sigmas: FloatArray
+    present: BoolArray
+    rays: FloatArray
+    by_pixels: FloatArray
+    cameras: tuple[Camera, ...]
+
+    @classmethod
+    def of(
+        cls,
+        pixels: FloatArray,
+        sigmas: FloatArray,
+        present: BoolArray,
+        cameras: tuple[Camera, ...],
+    ) -> KeypointBatch:
+        """The batch of checked arrays.
+
+        Raises InputError for wide lenses.
+        """
+        if any(each.is_wide for each in cameras):
+            what = "wide lenses have no gradients"
+            raise InputError(what, where="camera", fix="undistort keypoints and camera first")
+        present = present & np.isfinite(pixels).all(axis=2) & np.isfinite(sigmas) & (sigmas > 0)
+        pixels = np.where(present[..., None], pixels, 0.0)
+        sigmas = np.where(present, sigmas, 1.0)
+        rays, by_pixels = np.zeros_like(pixels), np.zeros((*present.shape, 2, 2))
+        for b, camera in enumerate(cameras):
+            own = slice(None) if len(cameras) == 1 else slice(b, b + 1)
+            flat = np.ascontiguousarray(pixels[own].reshape(-1, 2))
+            if camera.distortion:
+                flat[~present[own].ravel()] = camera.cx, camera.cy
+            seen = rays_of(flat, camera)
+            rays[own] = seen.reshape(rays[own].shape)
+            by_pixels[own] = lens_slopes(seen, camera).reshape(by_pixels[own].shape)
+        return cls(pixels, sigmas, present, rays, by_pixels, cameras)
+
+    @property
+    def counts(self) -> IntArray:
+        """Numbers of present keypoints (B,)."""
+        return np.asarray(self.present.sum(axis=1))
+
+    @property
+    def information(self) -> FloatArray:
+        """Information (B, n, 2, 2) of the rays; 0 for those that are absent."""
+        to_pixels = np.linalg.inv(self.by_pixels)
+        weights = self.present / self.sigmas**2
+        return np.asarray(weights[..., None, None] * (to_pixels.swapaxes(-1, -2) @ to_pixels))
+
+    def camera(self, problem: int) -> Camera:
+        """The camera of a problem."""
+        return self.cameras[problem if len(self.cameras) > 1 else 0]
+
+
+@dataclass(frozen=True, eq=False)
+class FitTask:
+    """Input of a batch's fits beside arrays: one camera, or one for each problem."""
+
+    cameras: tuple[Camera, ...]
+    options: FitOptions
+    exact: bool
+    workers: int
+
+
+class Minima(NamedTuple):
+    """Poses (B, 15) and focal lengths (B,) of what a search found, and for which problems (B,)."""
+
+    poses: FloatArray
+    focals: FloatArray
+    found: BoolArray
+
+
+class FitValues(NamedTuple):
+    """Fits of B problems; the covariance (B, 10, 10) is that of all unknowns."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    scale: FloatArray
+    focal: FloatArray
+    covariance: FloatArray
+    valid: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Fits of a batch in the parts that threads have shared."""
+
+    parts: Sequence[_Part]
+
+    @property
+    def values(self) -> FitValues:
+        """The fits."""
+        return FitValues(*_joined(part.values for part in self.parts))
+
+    @property
+    def minima(self) -> Minima:
+        """What the search found, from which the fits follow without another one."""
+        return Minima(*_joined(part.minima for part in self.parts))
+
+    def pulled_back(
+        self,
+        by_rotation: FloatArray,
+        by_translation: FloatArray,
+        by_scale: FloatArray,
+        by_focal: FloatArray,
+    ) -> tuple[FloatArray, ...]:
+        """Slopes by points, pixels and sigmas from those by `FitValues`."""
+        ends = np.cumsum([len(part.minima.found) for part in self.parts])[:-1]
+        slopes = by_rotation, by_translation, by_scale, by_focal
+        given = zip(self.parts, *(np.split(each, ends) for each in slopes), strict=True)
+        return _joined(part.pulled_back(*own) for part, *own in given)
+
+
+def _joined(parts: Iterable[tuple[Any, ...]]) -> tuple[Any, ...]:
+    return tuple(map(np.concatenate, zip(*parts, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Fits of some problems, their optima before the polish, and which of them are valid (B,).
+
+    ``by_pixels`` (B, n, 2, 2) are the derivatives of the optima's rays by the pixels.
+    """
+
+    minima: Minima
+    optima: Optima
+    by_pixels: FloatArray
+    sigmas: FloatArray
+    rotation: FloatArray
+    translation: FloatArray
+    scale: FloatArray
+    focals: FloatArray
+    valid: BoolArray
+
+    @property
+    def values(self) -> FitValues:
+        free = self.optima.free
+        covariance = np.zeros((len(self.valid), UNKNOWNS, UNKNOWNS))
+        covariance[:, free[:, None], free] = self.optima.inverse  # of the Hessian
+        covariance[~self.valid] = 0.0
+        pose = self.rotation, self.translation, self.scale
+        return FitValues(*pose, self.focals, covariance, self.valid)
+
+    def pulled_back(
+        self,
+        by_rotation: FloatArray,
+        by_translation: FloatArray,
+        by_scale: FloatArray,
+        by_focal: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        slopes = np.empty((len(by_focal), UNKNOWNS))
+        slopes[:, :3] = np.cross(self.rotation, by_rotation, axis=1).sum(axis=2)
+        slopes[:, 3:6] = by_translation
+        slopes[:, 6:9] = by_scale * self.scale
+        slopes[:, 9] = by_focal * self.focals
+        slopes[~self.valid] = 0.0
+        pulled = self.optima.pull_back(slopes)
+        by_pixels = (pulled.by_rays[..., None, :] @ self.by_pixels)[..., 0, :]
+        return pulled.by_points, by_pixels, pulled.by_log_sigma / self.sigmas
+
+
+def fits_of(
+    task: FitTask,
+    points: FloatArray,
+    pixels: FloatArray,
+    sigmas: FloatArray,
+    mask: BoolArray,
+    minima: Minima | None = None,
+) -> Fits:
+    """The fits of a batch, from ``minima`` where these are known.
+
+    Points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n). Raises InputError for cameras that
+    the derivatives don't know.
+    """
+    options = task.options
+    if options.focal == "estimate":
+        if len({(each.width, each.height) for each in task.cameras}) > 1:
+            what = "with an unknown focal length all images must have one size"
+            raise InputError(what, where="camera", fix="call fit for each size")
+        if any(each.distortion for each in task.cameras):
+            what = "an unknown focal length and lens distortion have no gradients together"
+            raise InputError(what, where="focal", fix="undistort keypoints and camera first")
+        options = options.for_camera(task.cameras[0])
+
+    @np.errstate(all="ignore")  # holds for one thread only
+    def run(first: int, last: int) -> _Part:
+        some = slice(first, last)
+        cameras = task.cameras if len(task.cameras) == 1 else task.cameras[some]
+        present = mask[some] & np.isfinite(points[some]).all(axis=2)
+        batch = KeypointBatch.of(pixels[some], sigmas[some], present, cameras)
+        known = np.where(batch.present[..., None], points[some], 0.0)
+        if minima is None:
+            found = _searched(known, batch, options)
+        else:
+            found = Minima(minima.poses[some], minima.focals[some], minima.found[some])
+        return _polished(known, batch, options, found, exact=task.exact)
+
+    return Fits(in_threads(run, len(points), task.workers))
+
+
+def _polished(
+    points: FloatArray, batch: KeypointBatch, options: FitOptions, minima: Minima, *, exact: bool
+) -> _Part:
+    """The fits of some problems, polished by a Newton step.
+
+    The derivatives are those before it: it is far below the noise.
+    """
+    poses, focals, valid = minima
+    pose = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:12], poses[:, 12:]
+    given = np.array([camera.fx for camera in batch.cameras])
+    ratio = (focals / given)[:, None, None]
+    prior = PriorTerms(options.scale_prior)
+    rays, information, by_pixels = batch.rays, batch.information, batch.by_pixels
+    if options.focal == "estimate":
+        rays, by_pixels = rays / ratio, by_pixels / ratio[..., None]
+        information = information * ratio[..., None] ** 2
+        low, high, mean, weight = log_focal_range(batch.cameras[0], options.focal_prior)
+        logs = np.log(focals)
+        is_held = (logs < low + _AT_BOUND) | (logs > high - _AT_BOUND)
+        weights = np.where(is_held, _HELD, weight)
+        prior = PriorTerms(options.scale_prior, np.where(is_held, 0.0, logs - mean), weights)
+    loss, bend = LOSSES[options.loss], options.loss_scale
+    keypoints = SeenKeypoints(points, rays, information, loss, bend)
+    optima = Optima(keypoints, *pose, prior, options.estimated_unknowns, exact)
+    step = optima.newton_step
+    size = np.abs(step[:, [0, 1, 2, 6, 7, 8, 9]]).max(axis=1)
+    step[~(valid & (size < _LARGEST_POLISH))] = 0.0
+    return _Part(
+        minima,
+        optima,
+        by_pixels,
+        batch.sigmas,
+        rotations_from_vectors(step[:, :3]) @ pose[0],
+        pose[1] + step[:, 3:6],
+        pose[2] * np.exp(step[:, 6:9]),
+        focals * np.exp(step[:, 9]),
+        valid & optima.determined,
+    )
+
+
+def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> Minima:
+    """The best minima of some problems."""
+    present, cameras = batch.present, batch.cameras
+    offsets = np.concatenate([[0], np.cumsum(batch.counts)]).astype(np.int64)
+    problems = Problems(points[present], batch.pixels[present], offsets, cameras)
+    sigmas, each = batch.sigmas[present], None
+    if len(cameras) > 1 or options.focal == "estimate":
+        each = [sigmas[problems.rows(b)] for b in range(len(points))]
+    else:  # those of all problems, one after the other
+        options = replace(options, sigma=sigmas)
+    found = solve(problems, options, each)
+    valid = (found.statuses == OK) & np.isfinite(found.poses[:, 0]).all(axis=1)
+    valid[list(found.errors)] = False
+    poses = np.where(valid[:, None], found.poses[:, 0], _NO_POSE)
+    focals = np.array([camera.fx for camera in cameras]) * np.ones(len(points))
+    if found.focals is not None:
+        focals = np.where(valid, found.focals[:, 0], focals)
+    return Minima(poses, focals, valid)
+
+
+def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T]:
+    """Results of ``run(first, last)`` over parts of so many problems, shared among threads."""
+    bounds = np.linspace(0, count, min(worker_count(workers), max(count, 1)) + 1).astype(int)
+    parts = list(pairwise(bounds.tolist()))
+    if len(parts) == 1:
+        return [run(*parts[0])]
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return list(pool.map(run, *zip(*parts, strict=True)))

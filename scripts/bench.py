@@ -22,7 +22,7 @@ import tyro
 from benchmarks.accuracy import Coverage, Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
 from benchmarks.cameras import PhotoLenses, Scenes
-from benchmarks.gradients import NoiseOfDetector, TorchLayer
+from benchmarks.gradients import GradientErrors, NoiseOfDetector, TorchLayer
 from benchmarks.masks import MaskAlone, Masks
 from benchmarks.photo import Photos
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
@@ -60,6 +60,7 @@ SECTIONS: dict[str, type[Section]] = {
     "unseen_retrieval": UnseenRetrieval,
     "similar": Similar,
     "torch": TorchLayer,
+    "gradients": GradientErrors,
     "noise": NoiseOfDetector,
     "tracks": Tracks,
 }

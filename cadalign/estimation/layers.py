@@ -91,9 +91,11 @@ class KeypointBatch:
     @property
     def information(self) -> FloatArray:
         """Information (B, n, 2, 2) of the rays; 0 for those that are absent."""
-        to_pixels = np.linalg.inv(self.by_pixels)
-        weights = self.present / self.sigmas**2
-        return np.asarray(weights[..., None, None] * (to_pixels.swapaxes(-1, -2) @ to_pixels))
+        (a, b), (c, d) = self.by_pixels.transpose(2, 3, 0, 1)
+        weights = self.present / (self.sigmas * (a * d - b * c)) ** 2
+        mixed = -weights * (a * c + b * d)  # of the inverse's columns; NumPy's takes thrice as long
+        rows = [weights * (c * c + d * d), mixed], [mixed, weights * (a * a + b * b)]
+        return np.ascontiguousarray(np.array(rows).transpose(2, 3, 0, 1))
 
     def camera(self, problem: int) -> Camera:
         """The camera of a problem."""

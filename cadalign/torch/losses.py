@@ -6,7 +6,7 @@ does, where the stretch keeps the symmetry: the stretches across an axis are equ
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -112,14 +112,12 @@ def reprojection_loss(
     [9.5]
     """
     own, true = _points(found, points_3d), _points(truth, points_3d)
-    seen = found.project(own, camera)
-    losses = []
-    for motion in _motions(symmetry, true):
-        wanted = truth.project(true @ motion[:3, :3].T + motion[:3, 3], camera)
-        lengths = torch.sqrt(((seen - wanted) ** 2).sum(dim=-1) + _TINY)
-        bent = torch.where(lengths < beta, lengths**2 / (2 * beta), lengths - beta / 2)
-        losses.append(bent.mean(dim=1))
-    return _of_valid(torch.stack(losses).amin(dim=0), found)
+
+    def distances(points: Tensor) -> Tensor:
+        lengths = _lengths(found.project(own, camera) - truth.project(points, camera))
+        return torch.where(lengths < beta, lengths**2 / (2 * beta), lengths - beta / 2)
+
+    return _of_valid(_least(distances, true, symmetry), found)
 
 
 def box_loss(
@@ -161,22 +159,29 @@ def box_loss(
     if found.points_3d is not None:
         own = torch.stack([found.points_3d.amin(dim=1), found.points_3d.amax(dim=1)], dim=1)
     corners, true = found.apply(_corners(own)), _corners(bounds)
-    lengths = (bounds[..., 1, :] - bounds[..., 0, :]) * truth.scale
-    losses = []
-    for motion in _motions(symmetry, true):
-        wanted = truth.apply(true @ motion[:3, :3].T + motion[:3, 3])
-        losses.append(torch.sqrt(((corners - wanted) ** 2).sum(dim=-1) + _TINY).mean(dim=1))
-    return _of_valid(torch.stack(losses).amin(dim=0) / lengths.norm(dim=-1), found)
+    least = _least(lambda points: _lengths(corners - truth.apply(points)), true, symmetry)
+    extents = (bounds[..., 1, :] - bounds[..., 0, :]) * truth.scale
+    return _of_valid(least / extents.norm(dim=-1), found)
 
 
 def _points(poses: PoseBatch, points_3d: Tensor) -> Tensor:
     return points_3d if poses.points_3d is None else poses.points_3d
 
 
-def _motions(symmetry: Symmetry | None, like: Tensor) -> Tensor:
-    """Motions (g, 4, 4) of a symmetry, the identity first."""
+def _least(
+    distances: Callable[[Tensor], Tensor], points: Tensor, symmetry: Symmetry | None
+) -> Tensor:
+    """The least of the mean distances (B,) over a symmetry's motions, which move ``points``."""
     motions = np.eye(4)[None] if symmetry is None else symmetry.poses(max_step=_STEP)
-    return torch.as_tensor(motions).to(like)
+    means = [
+        distances(points @ motion[:3, :3].T + motion[:3, 3]).mean(dim=1)
+        for motion in torch.as_tensor(motions).to(points)
+    ]
+    return torch.stack(means).amin(dim=0)
+
+
+def _lengths(vectors: Tensor) -> Tensor:
+    return torch.sqrt((vectors**2).sum(dim=-1) + _TINY)
 
 
 def _corners(bounds: Tensor) -> Tensor:

@@ -1,10 +1,11 @@
-"""Gradients in PyTorch: time of fits with gradients; coverage of calibrated detectors' noise."""
+"""Gradients in PyTorch: their time and errors; coverage of calibrated detectors' noise."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,10 @@ from cadalign.errors import CadalignError
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.shapes.model import ShapeModel
 
 _LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6
+_WELL_KNOWN_DEG = 10.0
 
 
 @dataclass
@@ -139,6 +142,100 @@ def gauss_newton(points: Any, pixels: Any, camera: Camera, start: Any, iteration
         right = (jacobian.transpose(1, 2) @ error[..., None])[..., 0]
         unknowns = unknowns - torch.linalg.solve(normal, right)
     return unknowns
+
+
+@dataclass
+class GradientErrors:
+    """Gradients beside finite differences, of well-determined problems of every kind.
+
+    The gradient of a random combination of pose, stretch and focal length, along random steps of
+    all pixels, relative to the root mean square of such products. Well-determined are problems
+    whose rotation is known to 10 degrees; of learned shapes, all with a solution.
+    """
+
+    problems: int = 1000
+    """Problems of each kind."""
+    points: int = 12
+    """Keypoints of each."""
+    step: float = 1e-4
+    """Step of the differences [px]."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        """Measure every kind."""
+        try:
+            import torch
+        except ImportError:
+            raise NotGivenError("pip install -e '.[torch]'") from None
+        from cadalign.torch import align, fit
+
+        rng = np.random.default_rng(given.seed)
+        drawn = [
+            simulate_problem(rng, points=self.points, noise_px=1.0) for _ in range(self.problems)
+        ]
+        points = torch.tensor(np.array([each.points_3d for each in drawn]))
+        pixels = torch.tensor(np.array([each.points_2d for each in drawn]))
+        camera = drawn[0].camera
+        kinds: dict[str, dict[str, Any]] = {
+            "stretch": {},
+            "no stretch": {"stretch": "none"},
+            "prior on the stretch": {"stretch_sigma": 0.2},
+            "huber": {"loss": "huber"},
+            "cauchy": {"loss": "cauchy"},
+            "unknown focal length": {"focal": "estimate"},
+        }
+        rows = [
+            self._row(name, partial(fit, points, camera=camera, **options), pixels, rng)
+            for name, options in kinds.items()
+        ]
+        mean = rng.uniform(-1, 1, (self.points, 3))
+        modes = 0.1 * rng.standard_normal((3, self.points, 3))
+        shape = ShapeModel.from_basis(mean, modes, np.ones(3), residual_sigma=0.01)
+        weights = rng.standard_normal((self.problems, 3, 1, 1))
+        objects = mean + (weights * modes).sum(axis=1)
+        seen = np.array(
+            [
+                camera.project(replace(each.alignment, scale=np.ones(3)).apply(own))
+                for each, own in zip(drawn, objects, strict=True)
+            ]
+        )
+        noisy = torch.tensor(seen + rng.standard_normal(seen.shape))
+        for name, loss in (("learned shape", "linear"), ("learned shape, cauchy", "cauchy")):
+            layer = partial(align, shape, camera=camera, loss=loss)
+            rows.append(self._row(name, layer, noisy, rng))
+        yield RatioTable("Gradients beside finite differences, relative errors", rows)
+
+    def _row(
+        self, name: str, layer: Callable[..., Any], pixels: Any, rng: np.random.Generator
+    ) -> Row:
+        import torch
+
+        def parts(seen: Any) -> tuple[Any, Any]:
+            found = layer(points_2d=seen)
+            focal = [] if found.focal is None else [found.focal[:, None] / 100.0]
+            flat = found.rotation.flatten(1), found.translation, found.scale, *focal
+            return torch.cat(flat, dim=1), found
+
+        seen = pixels.clone().requires_grad_()
+        values, found = parts(seen)
+        weights = torch.tensor(rng.standard_normal(tuple(values.shape)))
+        (values * weights).sum().backward()
+        steps = torch.tensor(rng.standard_normal(tuple(pixels.shape)))
+        after, before = (parts(pixels + sign * self.step * steps) for sign in (1.0, -1.0))
+        expected = ((after[0] - before[0]) * weights).sum(dim=1) / (2.0 * self.step)
+        slopes = (seen.grad * steps).sum(dim=(1, 2))
+        size = seen.grad.flatten(1).norm(dim=1)
+        known = found.valid & after[1].valid & before[1].valid
+        if found.covariance is not None:
+            turn = found.covariance.diagonal(dim1=1, dim2=2)[:, :3].sum(dim=1).sqrt()
+            known &= turn < np.radians(_WELL_KNOWN_DEG)
+        errors = ((slopes - expected).abs() / size)[known].detach().numpy()
+        return {
+            "kind": name,
+            "problems": int(known.sum()),
+            "median": float(np.median(errors)),
+            "99 %": float(np.quantile(errors, 0.99)),
+            "worst": float(errors.max()),
+        }
 
 
 @dataclass

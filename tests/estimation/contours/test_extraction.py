@@ -21,7 +21,7 @@ def offsets_and_bias(mask: np.ndarray, pose: Alignment) -> tuple[np.ndarray, np.
     """How far the rims of a pose lie outside of a mask's contour, and the bias of these."""
     contour, caster = contour_of(mask), caster_of(BOX)
     rims = find_rims(caster, CAMERA, pose, contour, 8.0)
-    bias = extraction_bias(caster, CAMERA, pose, mask_image(mask), contour, rims)
+    bias = extraction_bias(caster, CAMERA, pose, mask_image(mask, contour), contour, rims)
     assert rims.found.mean() > 0.9
     return rims.offset[rims.found], bias[rims.found]
 

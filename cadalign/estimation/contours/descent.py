@@ -316,10 +316,15 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
 
 
 class Approached(NamedTuple):
-    """Place after the first steps from a start, and the contours' mean distance [px] there."""
+    """Place after the first steps from a start.
+
+    ``residuals`` (S,) are the contours' distances from the rims there [px], without the offset that
+    all of a contour has in common, and at most ``reach``.
+    """
 
     state: State
-    misfit: float
+    residuals: FloatArray
+    reach: float
 
 
 def approached(masked: Masked, state: State) -> Approached | None:
@@ -329,10 +334,13 @@ def approached(masked: Masked, state: State) -> Approached | None:
     found = _approach(masked, Place(state, own), reach)
     if found is None:
         return None
-    place = found[0]
+    place, noises = found[:2]
     look = rims_at(masked, place, reach, is_fine=False)
-    distances = [np.where(each.found, np.abs(each.offset), reach) for each in look.rims]
-    return Approached(place.state, float(np.minimum(np.concatenate(distances), reach).mean()))
+    residuals = [
+        np.where(rims.found, np.abs(rims.offset + own_offset * noise.offset), reach)
+        for rims, own_offset, noise in zip(look.rims, place.own[:, 0], noises, strict=True)
+    ]
+    return Approached(place.state, np.minimum(np.concatenate(residuals), reach), reach)
 
 
 def settle_with(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -22,26 +23,32 @@ from cadalign.io.meshes.load import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import TrainingShapes
 
-_MOST_STARTS = 40
-_FEW_STARTS = 12  # that are enough where one of them meets the mask
-_MOST_SIMILAR_STARTS = 12  # of models that are only similar, whose surfaces are warped
+_SEARCHES = ((False, 12), (True, 24))  # whole silhouettes, then what lines leave; starts of each
+_SEARCHES_OF_SIMILAR = ((False, 12),)  # whose surfaces are warped, and meet no mask
 _MOST_MESHES = 4  # of a learned shape's training models
 _MOST_COMPARED = 100  # of these
-_MEETS = 0.003  # misfit of such a start, relative to the mask's size
+_MEETS = 0.003  # standard deviation of a contour that meets the rim, relative to its size
 _MEETS_PX = 0.5
 _FAR = 0.01  # misfit, relative to the mask's size, of a model that may be another
 _FAR_PX = 2.0
-_MOST_PROPOSALS = 4
-_CLOSE = 3.0  # misfit, relative to the least, at which a proposal is still one
-_CLOSE_PX = 3.0
+_MOST_PROPOSALS = 5
+_LEAST_SIGMA = 0.3  # [px]
+_FIRST_SHARE, _LARGEST_SHARE = 0.8, 0.99  # of a contour that is the model's
+_ROUNDS = 30
+_CLOSE = 1.1  # cost above the least, of a contour's sample, at which a proposal is still one
 _WHERE = "views[0].mask"
 
 
 class _Proposal(NamedTuple):
-    """A minimum near the mask, and the mean distance [px] of the mask's contour from its rim."""
+    """A minimum near the mask.
+
+    The ``misfit`` is the mean distance [px] of the mask's contour from the rim, the ``cost`` the
+    mean of the samples' -log probability density [1/px].
+    """
 
     minimum: Minimum
     misfit: float
+    cost: float
 
 
 class MaskProposals(NamedTuple):
@@ -76,47 +83,52 @@ def minima_of_mask(problem: JointProblem, model: Model | ShapeModel) -> MaskProp
             fix="give a calibrated camera, or keypoints",
         )
     contour = contour_view(0, view, _WHERE, camera)
-    silhouetted = _silhouetted(problem, model)
     is_exact = isinstance(model, Model) and model.shape_sigma is None
     proposals: list[_Proposal] = []
-    steps, starts, least = 0, 0, np.inf
-    for each in silhouetted:
-        found, iterations = _approached(problem, each, contour)
-        steps += iterations
-        if found is not None:
-            proposals.append(found)
-        starts += 1
-        least = min((each.misfit for each in proposals), default=np.inf)
-        is_met = least < max(_MEETS_PX, _MEETS * contour.contour.size)
-        if is_exact and is_met and starts >= _FEW_STARTS:
+    steps, starts = 0, 0
+    for is_cut, count in _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR:
+        for each in _silhouetted(problem, model, count, is_cut=is_cut):
+            found, iterations = _approached(problem, each, contour)
+            starts, steps = starts + 1, steps + iterations
+            if found is not None:
+                proposals.append(found)
+        if _is_met(proposals, contour):
             break
+    proposals.sort(key=lambda proposal: proposal.cost)
+    misfit = proposals[0].misfit if proposals else np.inf
     mistake = None
     if not is_exact:
         mistake = (
             f"{_WHERE} alone does not tell the pose of an object that is only similar: the "
             "estimate is a proposal, as its alternatives are, and three keypoints settle it"
         )
-    elif least > max(_FAR_PX, _FAR * contour.contour.size):
+    elif misfit > max(_FAR_PX, _FAR * contour.contour.size):
         mistake = (
-            f"{_WHERE}: no pose found brings the outline closer to the mask's than "
-            f"{least:.1f} px on average: the model may be another, the mask incomplete, or the "
-            "pose wrong"
+            f"{_WHERE}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
+            "average: the object may be partly hidden, the model another, or the pose wrong"
         )
     chosen = [each.minimum for each in _chosen(proposals)]
     return MaskProposals(chosen, steps, starts, mistake)
 
 
-def _silhouetted(problem: JointProblem, model: Model | ShapeModel) -> list[_Silhouetted]:
+def _is_met(proposals: Sequence[_Proposal], contour: ViewContour) -> bool:
+    """True if the best proposal is as likely as one whose whole outline meets the contour."""
+    sigma = max(_MEETS_PX, _MEETS * contour.contour.size)
+    cost = min((proposal.cost for proposal in proposals), default=np.inf)
+    return bool(cost < np.log(np.sqrt(2 * np.pi * np.e) * sigma))
+
+
+def _silhouetted(
+    problem: JointProblem, model: Model | ShapeModel, count: int, *, is_cut: bool
+) -> list[_Silhouetted]:
     """Alignments whose silhouettes resemble the mask, of all meshes, the best first."""
     (view,), camera = problem.views, problem.lenses.cameras[0]
     free = np.asarray(problem.prior.scales.free > 0)
     mask = cast(FloatArray, view.mask_image)
-    is_exact = isinstance(model, Model) and model.shape_sigma is None
-    count = _MOST_STARTS if is_exact else _MOST_SIMILAR_STARTS
     found = [
         _Silhouetted(each, surface)
         for mesh, surface in _meshes_of(model)
-        for each in resembling_poses(mesh, mask, camera, free=free, count=count)
+        for each in resembling_poses(mesh, mask, camera, free=free, count=count, is_cut=is_cut)
     ]
     return sorted(found, key=lambda each: -each.resembling.iou)[:count]
 
@@ -133,7 +145,26 @@ def _approached(
     found = approached(masked, best.state)
     if found is None:
         return None, iterations
-    return _Proposal(best._replace(state=found.state), found.misfit), iterations
+    misfit, cost = float(found.residuals.mean()), _cost_of(found.residuals, found.reach)
+    return _Proposal(best._replace(state=found.state), misfit, cost), iterations
+
+
+def _cost_of(residuals: FloatArray, reach: float) -> float:
+    """The mean of -log density of a contour's distances (S,) from a rim, at most ``reach`` [px].
+
+    Part of the contour is an occluder's, and lies anywhere within the reach; the rest is Gaussian.
+    Its share and standard deviation are the likeliest, by expectation and maximisation (Dempster,
+    Laird and Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977).
+    """
+    squares, elsewhere = residuals**2, 1 / (2 * reach)
+    share, variance = _FIRST_SHARE, max(float(np.median(squares)), _LEAST_SIGMA**2)
+    for _ in range(_ROUNDS):
+        own = share * np.exp(-squares / (2 * variance)) / np.sqrt(2 * np.pi * variance)
+        density = own + (1 - share) * elsewhere
+        belongs = own / density
+        share = min(float(belongs.mean()), _LARGEST_SHARE)
+        variance = max(float(belongs @ squares / max(belongs.sum(), 1e-9)), _LEAST_SIGMA**2)
+    return float(-np.log(density).mean())
 
 
 def _meshes_of(model: Model | ShapeModel) -> list[tuple[Mesh, Surface]]:
@@ -171,10 +202,10 @@ def _mesh_at(path: Path) -> Mesh:
 
 
 def _chosen(proposals: list[_Proposal]) -> list[_Proposal]:
-    """The distinct proposals that come about as close to the mask as the best."""
+    """The distinct ones of sorted proposals that are about as likely as the best."""
     kept: list[_Proposal] = []
-    for each in sorted(proposals, key=lambda proposal: proposal.misfit):
-        if kept and each.misfit > max(_CLOSE * kept[0].misfit, kept[0].misfit + _CLOSE_PX):
+    for each in proposals:
+        if kept and each.cost > kept[0].cost + _CLOSE:
             break
         (pose,) = poses_of(each.minimum.evidence, each.minimum.state)
         known = [poses_of(other.minimum.evidence, other.minimum.state)[0] for other in kept]

@@ -4,33 +4,38 @@ Seen from afar, a stretched model under any pose is an affine image of the model
 along one direction of the model differ by an affine map of the plane: whitened by their second
 moments, by a turn or a reflection. So silhouettes along directions all around are rendered once for
 a model, compared with the mask's at all turns, and each that resembles it gives an affine camera.
+Where a part of the object may be hidden or outside of the image, those that lines cut off are, too.
 Of ``M = R[:2] S / Z``, for the rows of ``M S^-1`` are orthogonal and of one length, the stretch
 follows by two linear equations in the inverse squares of its scales.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.contours.contour import Image, sampled
-from cadalign.estimation.contours.surface import caster_of, corners_of
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.estimation.contours.atlas import (
+    Atlas,
+    Whitened,
+    atlas_of,
+    cut_atlas_of,
+    overlaps,
+    turn_of,
+    whitened,
+)
+from cadalign.estimation.contours.contour import Image
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.projection import model_rays
-from cadalign.geometry.raycaster import RayCaster
 
-_DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
-_CELLS = 80  # of a silhouette's image
-_TURNS = 64
-_RINGS = 24
-_OUTERMOST = 3.0  # [standard deviations], of the rings
+_CELLS = 80  # of a mask's image
+_LINE_ANGLES = 16  # of what hides a part
+_HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
 _LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
 _MOST_AFFINE = 200  # cameras of which the silhouettes are rendered
 _ITERATIONS = 8
@@ -41,104 +46,31 @@ _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
 
 
-class Whitened(NamedTuple):
-    """A silhouette by its first and second moments.
-
-    ``mean`` (2,) and ``spread`` (2, 2), the square root of the covariance, and ``rings``
-    (`_RINGS`, `_TURNS`): the share that is covered at these radii and angles, after both are
-    removed.
-    """
-
-    mean: FloatArray
-    spread: FloatArray
-    rings: FloatArray
-
-
-def _whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
-    """The silhouette (h, w), whose cell (0, 0) lies at ``corner``."""
-    rows, columns = np.nonzero(image > 0.5)
-    points = np.column_stack([columns, rows]).astype(float)
-    mean = points.mean(axis=0)
-    values, vectors = np.linalg.eigh(np.cov(points.T) + 1e-3 * np.eye(2))
-    spread = (vectors * np.sqrt(values)) @ vectors.T
-    angles = 2 * np.pi * np.arange(_TURNS) / _TURNS
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    places = mean + (_radii()[:, None, None] * circle) @ spread
-    padded = np.asarray(np.pad(image, 1), dtype=np.float32)
-    rings = sampled(padded, places.reshape(-1, 2) + 1).reshape(_RINGS, _TURNS)
-    return Whitened(corner + cell * mean, cell * spread, rings)
-
-
-def _radii() -> FloatArray:
-    return np.asarray(_OUTERMOST * (np.arange(_RINGS) + 0.5) / _RINGS)
-
-
-class Atlas(NamedTuple):
-    """A model's silhouettes along directions, ``base`` (2, 3) the axes of each one's image."""
-
-    caster: RayCaster
-    corners: FloatArray
-    bases: FloatArray
-    views: list[Whitened]
-    spectra: npt.NDArray[np.complex128]
-    areas: FloatArray
-
-
-@lru_cache(maxsize=16)
-def atlas_of(mesh: Mesh) -> Atlas:
-    """The silhouettes of a mesh, rendered once."""
-    caster, corners = caster_of(mesh), corners_of(mesh)
-    middle = corners.mean(axis=0)
-    reach = float(np.linalg.norm(corners - middle, axis=1).max())
-    bases, views = [], []
-    for direction in _half_sphere(_DIRECTIONS):
-        base = np.linalg.svd(direction[None])[2][1:]
-        across = (corners - middle) @ base.T
-        low, high = across.min(axis=0), across.max(axis=0)
-        cell = float((high - low).max()) / _CELLS or 1.0
-        places = low[:, None] + cell * np.arange(_CELLS + 1)
-        grid = np.stack(np.meshgrid(places[0], places[1]), axis=-1).reshape(-1, 2)
-        # Rays from afar: their origin is one point, so that they are almost parallel.
-        eye = middle - 60 * reach * direction
-        rays = (grid / (60 * reach)) @ base + direction
-        image = caster.covered(eye, rays).reshape(_CELLS + 1, _CELLS + 1).astype(np.float32)
-        if image.sum() < 4:
-            continue
-        whitened = _whitened(image, low, cell)
-        bases.append(base)
-        views.append(whitened._replace(mean=whitened.mean + base @ middle))
-    rings = np.array([view.rings for view in views])
-    areas = (rings * _radii()[:, None]).sum(axis=(1, 2))
-    return Atlas(caster, corners, np.array(bases), views, np.fft.rfft(rings, axis=2), areas)
-
-
-def _half_sphere(count: int) -> FloatArray:
-    """Directions (count, 3) spread evenly: a Fibonacci lattice."""
-    k = np.arange(count) + 0.5
-    z = 1 - k / count
-    angle = np.pi * (1 + 5**0.5) * k
-    radius = np.sqrt(1 - z**2)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
-
-
 class Resembling(NamedTuple):
-    """An alignment, and the intersection over union of its silhouette and the mask."""
+    """An alignment, and the intersection over union of its silhouette, or a part, and the mask."""
 
     alignment: Alignment
     iou: float
 
 
 def resembling_poses(
-    mesh: Mesh, mask: FloatArray | BoolArray, camera: Camera, *, free: BoolArray, count: int
+    mesh: Mesh,
+    mask: FloatArray | BoolArray,
+    camera: Camera,
+    *,
+    free: BoolArray,
+    count: int,
+    is_cut: bool = False,
 ) -> list[Resembling]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
-    ``free`` (3,) marks the scales that are unknown.
+    ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
+    lies beyond a line.
     """
-    atlas, view = atlas_of(mesh), _facing(mask, camera)
-    query = _whitened(view.image, view.corner, view.cell)
+    atlas, view = cut_atlas_of(mesh) if is_cut else atlas_of(mesh), _facing(mask, camera)
+    query = whitened(view.image, view.corner, view.cell)
     poses = [_pose_of(*each, atlas, free) for each in _affine_cameras(atlas, query)]
-    found = [Resembling(pose, _overlap(atlas, view, pose)) for pose in poses]
+    found = [Resembling(pose, _overlap(atlas, view, pose, is_cut=is_cut)) for pose in poses]
     found.sort(key=lambda each: -each.iou)
     kept: list[Resembling] = []
     for each in found:
@@ -152,10 +84,12 @@ def resembling_poses(
 class _Facing(NamedTuple):
     """A mask as a camera sees it that looks at its middle.
 
-    Cells of ``image`` (n, n) lie on the plane at depth 1, from ``corner`` (2,) on.
+    Cells of ``image`` (n, n) lie on the plane at depth 1, from ``corner`` (2,) on; those that
+    ``is_seen`` (n * n,) marks lie in the photo.
     """
 
     image: Image
+    is_seen: BoolArray
     corner: FloatArray
     cell: float
     camera_from_facing: FloatArray
@@ -184,7 +118,9 @@ def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
     low, high = flat.min(axis=0), flat.max(axis=0)
     middle, width = (low + high) / 2, _MARGIN * float((high - low).max())
     cell = width / (_CELLS - 1)
-    empty = _Facing(np.zeros((_CELLS, _CELLS), np.float32), middle - width / 2, cell, turn)
+    everywhere = np.ones(_CELLS * _CELLS, dtype=bool)
+    blank = np.zeros((_CELLS, _CELLS), np.float32)
+    empty = _Facing(blank, everywhere, middle - width / 2, cell, turn)
     in_camera = empty.rays @ turn.T
     pixels = camera.project(np.where(in_camera[:, 2:] > 1e-6, in_camera, [0, 0, 1]))
     single = np.clip(pixels, -1e6, 1e6).astype(np.float32).reshape(_CELLS, _CELLS, 2)
@@ -198,33 +134,24 @@ def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
     )
-    return empty._replace(image=np.asarray(image, dtype=np.float32))
+    return empty._replace(
+        image=np.asarray(image, dtype=np.float32), is_seen=camera.contains(pixels)
+    )
 
 
 def _affine_cameras(atlas: Atlas, query: Whitened) -> list[tuple[FloatArray, FloatArray]]:
     """Maps ``M x + b`` of the model to the query's plane, those of the best overlaps."""
-    weights = _radii()[:, None]
-    area = float((query.rings * weights).sum())
-    candidates = []
-    mirrored = np.roll(query.rings[:, ::-1], 1, axis=1)
-    for flip, rings in ((1.0, query.rings), (-1.0, mirrored)):
-        spectrum = np.fft.rfft(weights * rings, axis=1)
-        common = np.fft.irfft((spectrum * atlas.spectra.conj()).sum(axis=1), _TURNS, axis=1)
-        overlap = common / (atlas.areas[:, None] + area - common)
-        # A whitened silhouette may fit at several turns.
-        is_peak = (overlap >= np.roll(overlap, 1, 1)) & (overlap >= np.roll(overlap, -1, 1))
-        is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=1, keepdims=True)
-        for row, turn in zip(*np.nonzero(is_peak), strict=True):
-            candidates.append((float(overlap[row, turn]), int(row), int(turn), flip))
-    candidates.sort(reverse=True)
+    overlap = overlaps(atlas.views, query)
+    # A whitened silhouette may fit at several turns.
+    is_peak = (overlap >= np.roll(overlap, 1, 2)) & (overlap >= np.roll(overlap, -1, 2))
+    is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=2, keepdims=True)
+    peaks = np.nonzero(is_peak)
+    best = np.argsort(-overlap[peaks])[:_MOST_AFFINE]
     found = []
-    for _, row, turn, flip in candidates[:_MOST_AFFINE]:
-        angle = 2 * np.pi * turn / _TURNS
-        cosine, sine = np.cos(angle), np.sin(angle)
-        turned = np.diag([1.0, flip]) @ np.array([[cosine, -sine], [sine, cosine]])
-        view = atlas.views[row]
-        plane = query.spread @ turned @ np.linalg.inv(view.spread)
-        found.append((plane @ atlas.bases[row], query.mean - plane @ view.mean))
+    for flip, row, turn in zip(*(each[best].tolist() for each in peaks), strict=True):
+        turned = turn_of(turn, mirrored=bool(flip))
+        plane = query.spread[0] @ turned @ np.linalg.inv(atlas.views.spread[row])
+        found.append((plane @ atlas.bases[row], query.mean[0] - plane @ atlas.views.mean[row]))
     return found
 
 
@@ -263,12 +190,34 @@ def _stretch_of(matrix: FloatArray, free: BoolArray) -> FloatArray:
     return np.asarray(np.exp(logs))
 
 
-def _overlap(atlas: Atlas, view: _Facing, pose: Alignment) -> float:
-    """Intersection over union of a pose's silhouette and the mask."""
+@cache
+def _line_bins() -> IntArray:
+    """Numbers (`_LINE_ANGLES`, n * n) of the cells' places along directions, all around."""
+    angles = 2 * np.pi * np.arange(_LINE_ANGLES) / _LINE_ANGLES
+    places = np.arange(_CELLS) - (_CELLS - 1) / 2
+    x, y = np.meshgrid(places, places)
+    along = np.cos(angles)[:, None] * x.ravel() + np.sin(angles)[:, None] * y.ravel()
+    return np.asarray(np.rint(along + _CELLS), dtype=np.int64)
+
+
+def _overlap(atlas: Atlas, view: _Facing, pose: Alignment, *, is_cut: bool) -> float:
+    """Intersection over union of a pose's silhouette and the mask.
+
+    If it ``is_cut``, of what the best line leaves of the silhouette, less where it leaves less.
+    """
     origin, model_from_ray = model_rays(pose)
-    seen = atlas.caster.covered(origin, view.rays @ model_from_ray.T).reshape(view.image.shape)
-    common = float(view.image[seen].sum())
-    return common / (float(view.image.sum()) + float(seen.sum()) - common)
+    seen = atlas.caster.covered(origin, view.rays @ model_from_ray.T) & view.is_seen
+    mask = view.image.ravel()
+    both, total = mask[seen], float(mask.sum())
+    if not is_cut:
+        return float(both.sum()) / (total + len(both) - float(both.sum()))
+    best = 0.0
+    for bins in _line_bins()[:, seen]:
+        count = np.cumsum(np.bincount(bins, minlength=1))
+        common = np.cumsum(np.bincount(bins, weights=both, minlength=1))
+        share = count / max(float(count[-1]), 1.0)
+        best = max(best, float((common / (total + count - common) * share**_HIDDEN_POWER).max()))
+    return best
 
 
 def differ(one: Alignment, other: Alignment) -> bool:

@@ -101,7 +101,7 @@ class AnnotationDocument:
                 return replace(
                     own,
                     priors=replace(own.priors, stretch=self.priors.stretch),
-                    evidence=replace(own.evidence, lengths=self.evidence.lengths),
+                    evidence=self.evidence.shared_with(own.evidence),
                     name=self.name,
                 )
         return None
@@ -119,7 +119,7 @@ class AnnotationDocument:
             self,
             further_views=tuple(views),
             priors=replace(self.priors, stretch=document.priors.stretch),
-            evidence=replace(self.evidence, lengths=document.evidence.lengths),
+            evidence=document.evidence.shared_with(self.evidence),
             name=document.name,
         )
 

@@ -26,6 +26,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.scene import SceneObject, focal_prior_by_others
 from cadalign.estimation.uncertainty.misfit import Rows, find_outliers
 from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import Size
@@ -33,6 +34,8 @@ from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 
 LEAST_SIGMA = 1.0  # of clicks [px]
+LEAST_PAIRS, LEAST_JOINT_PAIRS = 4, 3
+"""Pairs of an alignment without evidence beside them, and with it."""
 LIKELY_STRETCH = 0.25
 """Standard deviation of the logarithm of each scale about 1, until another one is chosen."""
 _ROBUST_ROUNDS = 3
@@ -64,6 +67,7 @@ class Known:
     """Photos whose focal length is neither known nor estimated, this one by an empty name."""
     estimates_focal: bool = False  # estimate the focal lengths of all photos
     focal_prior: FocalPrior | None = None  # on these
+    uses_photos: bool = False  # as evidence
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
         """The model that `cadalign fit` aligns to the observation."""
@@ -158,21 +162,23 @@ class LiveProblem:
     noise: str
     estimates_focal: bool
     focal_prior: FocalPrior | None
+    init: Alignment | None = None
 
     @classmethod
     def of(cls, known: Known, observation: Observation) -> LiveProblem:
         """The problem of an observation."""
         model = known.model_for(observation)
-        views = views_of(observation, model, sigma=known.sigma)
+        views = views_of(observation, model, sigma=known.sigma, with_photos=known.uses_photos)
         own = any(view.sigma is not None for view in observation.views)
         noise = "given"
-        if known.shape is None and known.sigma is None:
+        if known.shape is None and known.sigma is None and any(len(v.keypoint_ids) for v in views):
             if known.stretch is not None and (observation.is_plain or not own):
                 noise = "settled"
             elif known.stretch is None and observation.is_plain:
                 noise = "scaled"
         focal = known.estimates_focal
-        return cls(model, views, observation.size, noise, focal, known.focal_prior)
+        prior = known.focal_prior
+        return cls(model, views, observation.size, noise, focal, prior, observation.init)
 
     @property
     def exact(self) -> Model | None:
@@ -186,7 +192,8 @@ class LiveProblem:
         Each comes with what it assumes, where ``{reason}`` stands for why the ones before fail.
         """
         problem = self
-        yield problem, ""
+        if not (self.is_by_mask and self.estimates_focal):  # which a mask alone does not tell
+            yield problem, ""
         if self.estimates_focal:
             problem = problem.at_focal([view.camera for view in self.views])
             yield problem, _FOCAL_ASSUMED
@@ -216,7 +223,32 @@ class LiveProblem:
         """Call `cadalign.align`; raises a CadalignError if that is impossible."""
         if self.estimates_focal:
             options |= {"focal": "estimate", "focal_prior": self.focal_prior}
-        return align(self.model, self.views, size=self.size, **options)
+        init = self.init
+        if init is None and self.is_by_mask and len(self.views[0].keypoint_ids):
+            init = self._by_mask()
+        return align(self.model, self.views, size=self.size, init=init, **options)
+
+    @property
+    def is_by_mask(self) -> bool:
+        """True if the search begins at what the mask of the only view allows."""
+        view = self.views[0]
+        few = len(self.views) == 1 and len(view.keypoint_ids) < LEAST_JOINT_PAIRS
+        return few and view.mask is not None and self.exact is not None
+
+    def _by_mask(self) -> Alignment:
+        """The alignment by the mask that agrees best with the few pairs."""
+        (view,) = self.views
+        alone = replace(view, points_2d=(), ids=None, sigma=1.0, depth=None, image=None)
+        result = align(self.model, alone, size=self.size)
+        assert self.exact is not None
+        rows = {each: row for row, each in enumerate(self.exact.ids or ())}
+        points = np.asarray(self.exact.points_3d)[[rows[each] for each in view.keypoint_ids]]
+
+        def off(alignment: Alignment) -> float:
+            seen = view.camera.project(alignment.apply(points))
+            return float(np.linalg.norm(seen - np.asarray(view.points_2d)))
+
+        return min([result.alignment, *(each.alignment for each in result.alternatives)], key=off)
 
     def solve(self) -> tuple[Result, float, Mapping[str, Any]]:
         """Align at the noise that is due; with its factor [px] and the options of the fit."""
@@ -286,8 +318,8 @@ class LiveProblem:
         sides = [max(view.camera.width, view.camera.height) for view in self.views]
         expected = _EXPECTED_NOISE * sum(sides) / len(sides)
         factor = _FIRST_NOISE * expected
-        # Without masks and with the focal lengths of the first round, which take most of the time.
-        bare = tuple(replace(view, mask=None, mask_sigma=None) for view in self.views)
+        # Without masks and photos and with the focal lengths of the first round, which take long.
+        bare = tuple(replace(view, mask=None, mask_sigma=None, image=None) for view in self.views)
         near = replace(self, views=bare)
         for _ in range(_NOISE_ROUNDS):
             try:

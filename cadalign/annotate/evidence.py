@@ -12,6 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DataError, InputError
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
@@ -19,6 +20,7 @@ from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
 
 Point2 = tuple[float, float]
+Point3 = tuple[float, float, float]
 Segment = tuple[Point2, Point2]
 
 _LABELS = {
@@ -45,6 +47,8 @@ class FurtherEvidence:
     """Stored standard deviation of all keypoints in place of their own [px]."""
     symmetry: Symmetry | None = None  # the model's; kept, but without effect while pairs are marked
     up_axis: str | None = "y"  # the model's
+    photo: bool = False  # the photos themselves count
+    init: Alignment | None = None  # where the search begins
 
     @classmethod
     def of(cls, observation: Observation, photo: Path, *, where: Path) -> FurtherEvidence:
@@ -62,6 +66,8 @@ class FurtherEvidence:
             sigma if isinstance(sigma, float) else None,
             observation.symmetry,
             observation.up_axis,
+            bool(options.get("image", False)),
+            observation.init,
         )
 
     def added_to_image(self, photo: ObservedImage) -> ObservedImage:
@@ -90,6 +96,8 @@ def evidence_labels(observation: Observation) -> tuple[str, ...]:
     if any(view.depths is not None for view in views):
         given.add("depth")
     labels = [label for name, label in _LABELS.items() if name in given]
+    if observation.fit_options.get("image") and any(not view.evidence.mask for view in views):
+        labels.append("photo")
     count = len(views) - 1
     if count:
         labels.append(f"{count} other view{'s' if count > 1 else ''}")
@@ -179,11 +187,33 @@ class MarkedLengths:
 
 
 @dataclass(frozen=True)
+class ChosenStart:
+    """An alignment that was chosen among those that a mask allows."""
+
+    rotation: tuple[Point3, Point3, Point3]
+    translation: Point3
+    scale: Point3
+
+    @classmethod
+    def of(cls, alignment: Alignment) -> ChosenStart:
+        """An alignment as a document holds it."""
+        first, second, third = (tuple(row) for row in alignment.rotation.tolist())
+        translation, scale = alignment.translation.tolist(), alignment.scale.tolist()
+        return cls((first, second, third), tuple(translation), tuple(scale))
+
+    @property
+    def alignment(self) -> Alignment:
+        """The alignment."""
+        return Alignment(np.array(self.rotation), np.array(self.translation), np.array(self.scale))
+
+
+@dataclass(frozen=True)
 class MarkedEvidence:
     """Marks in a photo beside its pairs.
 
     ``up`` is the model's up axis in the camera, with its standard deviation [degrees], from a file;
-    vertical edges take its place.
+    vertical edges take its place. ``photo`` says that the photos themselves count, ``start`` is
+    where the search begins while there are few pairs.
     """
 
     mask: MaskDrawing | None = None
@@ -191,6 +221,8 @@ class MarkedEvidence:
     up: tuple[float, float, float] | None = None
     up_sigma_deg: float | None = None
     lengths: MarkedLengths | None = None
+    photo: bool = False
+    start: ChosenStart | None = None
 
     @classmethod
     def of(cls, further: FurtherEvidence) -> Self:
@@ -202,7 +234,13 @@ class MarkedEvidence:
             up=None if image.up is None else (x, y, z),
             up_sigma_deg=image.up_sigma_deg,
             lengths=MarkedLengths.of(further.size),
+            photo=further.photo,
+            start=None if further.init is None else ChosenStart.of(further.init),
         )
+
+    def shared_with(self, other: Self) -> Self:
+        """The evidence of another photo, with what is known of the object."""
+        return replace(other, lengths=self.lengths, photo=self.photo)
 
     def added_to(
         self, further: FurtherEvidence, camera: Camera, drawn: Path | None

@@ -236,7 +236,8 @@ class AnnotationFiles:
         """Warn of stored options of the fit that the page does not use."""
         ours = {"sigma": further.sigma, "shape_sigma": None if shape is None else shape.sigma}
         stored = dict(observation.fit_options)
-        stored.pop("focal_prior", None)
+        for name in ("focal_prior", "image"):
+            stored.pop(name, None)
         if shape is None and stored.pop("stretch_sigma", None) is not None:
             stored.pop("sigma", None)  # the annotator's own
         others = [

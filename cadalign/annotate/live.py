@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from cadalign.annotate.estimate import LEAST_SIGMA, Known, LiveEstimate
+from cadalign.annotate.estimate import (
+    LEAST_JOINT_PAIRS,
+    LEAST_PAIRS,
+    LEAST_SIGMA,
+    Known,
+    LiveEstimate,
+)
 from cadalign.annotate.evidence import evidence_labels
 from cadalign.annotate.model import Wireframe, box_lines
 from cadalign.annotate.models import KeypointRegistry
@@ -24,8 +30,6 @@ from cadalign.geometry.projection import projected_covariances
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.keypoint_layer import confidence_regions
 from cadalign.shapes.model import ShapeModel
-
-_LEAST_PAIRS, _LEAST_JOINT_PAIRS = 4, 3  # without and with evidence beside them
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +118,19 @@ def live_alignment(
     )
 
 
+class Candidate(NamedTuple):
+    """An alignment that a mask alone allows, with its likelihood over the best one's."""
+
+    alignment: Alignment
+    likelihood: float
+
+
+def candidates_of(result: Result) -> list[Candidate]:
+    """The alignments that the evidence cannot tell apart, the best first."""
+    others = (Candidate(each.alignment, each.relative_likelihood) for each in result.alternatives)
+    return [Candidate(result.alignment, 1.0), *others]
+
+
 def known_points(shape: ObjectShape | None, points: Sequence[ModelKeypoint]) -> BoolArray:
     """The points (n,) of which pairs count."""
     return np.array([shape is None or shape.knows(point) for point in points], dtype=bool)
@@ -126,7 +143,7 @@ def missing_text(
 
     ``counts`` (n,) are the complete pairs that count, ``is_plain`` says that nothing else is used.
     """
-    missing = (_LEAST_PAIRS if is_plain else _LEAST_JOINT_PAIRS) - int(counts.sum())
+    missing = (LEAST_PAIRS if is_plain else LEAST_JOINT_PAIRS) - int(counts.sum())
     if missing <= 0:
         return ""
     text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
@@ -174,7 +191,7 @@ def drawing_of(
     assert lines is not None
     drawing: dict[str, Any] = {
         "box": box_of(live),
-        "lines": _flat(lines.seen_in(live.camera, live.alignment)),
+        "lines": flat(lines.seen_in(live.camera, live.alignment)),
         "keypoints": [],
         "regions": [],
         "faint_regions": [],
@@ -204,10 +221,10 @@ def box_of(live: LiveAlignment) -> list[float]:
     """The box of an estimate alone, as x1, y1, x2, y2, ...; empty without an estimate."""
     if live.result is None:
         return []
-    return _flat(box_lines(live.result.bounds, live.camera, live.alignment))
+    return flat(box_lines(live.result.bounds, live.camera, live.alignment))
 
 
-def _flat(lines: FloatArray) -> list[float]:
+def flat(lines: FloatArray) -> list[float]:
     """Lines (k, 2, 2) as x1, y1, x2, y2, ... to a tenth of a pixel."""
     inside = lines[(np.abs(lines) < 1e6).all(axis=(1, 2))]
     return np.round(inside, 1).ravel().tolist()

@@ -10,6 +10,7 @@ import numpy as np
 from cadalign.annotate.document import AnnotationDocument, FocalChoice, FurtherView, Pair, Priors
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import (
+    ChosenStart,
     FurtherEvidence,
     MarkedEvidence,
     MarkedLengths,
@@ -19,6 +20,7 @@ from cadalign.annotate.evidence import (
 )
 from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.history import History
+from cadalign.annotate.live import candidates_of
 from cadalign.annotate.masks import cut_out, decode_runs, encode_runs
 from cadalign.annotate.models import KeypointRegistry, OpenedModel
 from cadalign.annotate.names import object_file, object_number
@@ -237,7 +239,7 @@ def _add_view(session: Session, owner: PhotoState, photo: int) -> PhotoState:
         AnnotationDocument(
             focal=like.document.focal,
             priors=Priors(shared.priors.stretch, like.intrinsics.likely_focal),
-            evidence=MarkedEvidence(lengths=shared.evidence.lengths),
+            evidence=shared.evidence.shared_with(MarkedEvidence()),
             name=shared.name,
         )
     )
@@ -357,8 +359,40 @@ def lengths(
     return _record(replace(state.document.evidence, lengths=given.checked()), state)
 
 
+def use_photo(session: Session, state: PhotoState, *, on: bool) -> ActionOutcome:
+    """Choose whether the photos themselves count; the photo takes the place of its mask.
+
+    What the mask alone has found is where the search in the photo begins.
+    """
+    evidence = replace(state.document.evidence, photo=on)
+    if not on or evidence.mask is None:
+        return _record(evidence, state)
+    live, _ = session.live(state)
+    if live.result is not None and state.lead is None:
+        evidence = replace(evidence, start=ChosenStart.of(live.alignment))
+    outcome = _record(replace(evidence, mask=None), state)
+    return replace(outcome, message="The photo takes the place of the mask; undo brings it back.")
+
+
+def begin_at(
+    session: Session, state: PhotoState, *, candidate: Index | None = None
+) -> ActionOutcome:
+    """Begin at one of the alignments that the mask allows, 0 for the one shown; None for none."""
+    if candidate is None:
+        return _record(replace(state.document.evidence, start=None), state)
+    live, _ = session.live(state)
+    known = [] if live.result is None else candidates_of(live.result)
+    if candidate >= len(known):
+        raise InputError(
+            f"there is no candidate {candidate}", where="candidate", fix="reload the page"
+        )
+    start = ChosenStart.of(known[candidate].alignment)
+    return _record(replace(state.document.evidence, start=start), state)
+
+
 EVIDENCE_ACTIONS = (
     *(focal, prior, mask_paint, mask_load, mask_cut, mask_clear, vertical, gravity_clear, lengths),
+    *(use_photo, begin_at),
 )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
-from cadalign.annotate.estimate import LiveEstimate
+from cadalign.annotate.estimate import LEAST_JOINT_PAIRS, LiveEstimate
 from cadalign.annotate.evidence import FurtherEvidence, MaskDrawing
 from cadalign.annotate.files import AnnotationFiles, written_unfinished, written_view
 from cadalign.annotate.history import History
@@ -210,10 +210,20 @@ class Observer:
             fields["shape"] = self.shape.path
             if self.shape.sigma is not None:
                 options["shape_sigma"] = self.shape.sigma
+        if document.evidence.photo:
+            options["image"] = True
+        if self.begins(state):
+            assert document.evidence.start is not None
+            fields["init"] = document.evidence.start.alignment
         if to_write:
             fields["unfinished"] = self._unfinished(state)
         image = self._keypoints(state, to_write=to_write)
         return further.added_to(image, fit_options=options, **fields)
+
+    def begins(self, state: PhotoState) -> bool:
+        """True if the search begins where the user chose, for there are too few pairs."""
+        pairs = known_pairs(state.document, state.model.registry, self.shape)
+        return state.document.evidence.start is not None and len(pairs) < LEAST_JOINT_PAIRS
 
     def further(self, state: PhotoState, *, to_write: bool = False) -> FurtherEvidence:
         """The evidence beside a photo's pairs; photos without anything that counts are left out."""

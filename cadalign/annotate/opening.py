@@ -284,7 +284,7 @@ def _with_view(
         stored.document,
         focal=focal,
         priors=Priors(document.priors.stretch, intrinsics.likely_focal),
-        evidence=replace(MarkedEvidence.of(view.further), lengths=document.evidence.lengths),
+        evidence=document.evidence.shared_with(MarkedEvidence.of(view.further)),
     )
     return replace(document, further_views=(*document.further_views, FurtherView(view.key, own)))
 
@@ -295,6 +295,8 @@ def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
     mask = None if drawn.mask is None else state.mask_file(drawn.mask.base)
     ours = drawn.added_to(further, state.camera, mask if further.image.mask is not None else None)
     if (ours.image.mask, ours.image.mask_sigma) != (further.image.mask, further.image.mask_sigma):
+        return False
+    if state.lead is None and drawn.photo != further.photo:
         return False
     if state.lead is None and MarkedLengths.of(ours.size) != MarkedLengths.of(further.size):
         return False

@@ -12,7 +12,7 @@ import numpy as np
 from cadalign.annotate.actions import MIRRORED
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import MarkedLengths, MaskDrawing, find_up
-from cadalign.annotate.live import LiveAlignment, box_of, drawing_of
+from cadalign.annotate.live import LiveAlignment, box_of, candidates_of, drawing_of, flat
 from cadalign.annotate.masks import draw_mask
 from cadalign.annotate.objects import PhotoState, label_of, shown_objects
 from cadalign.annotate.result_text import facts_of, name_of, next_best_text, notes_of
@@ -77,6 +77,7 @@ def page_state(
             "proposals": _proposals(state),
             "shape": _shape(session, state),
             "alignment": _alignment(session, state, live),
+            "by_mask": _candidates(session, state, live),
             "suggestion": _suggestion(state, suggestion),
             **_objects(session, state),
         }
@@ -95,6 +96,29 @@ def _evidence(session: Session, state: PhotoState) -> dict[str, Any]:
         "gravity_sigma": None if sigma is None else round(sigma, 1),
         "lengths": {name: getattr(lengths, name) for name in LENGTHS},
         "length_sigma": lengths.sigmas[0] if lengths.sigmas else None,
+        "photo": state.owner.document.evidence.photo,
+    }
+
+
+def _candidates(session: Session, state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
+    """Alignments that a mask alone allows, as lines x1, y1, x2, y2, ... [px], while no pair tells.
+
+    ``chosen`` says that the user has decided for one.
+    """
+    result, lines = live.result, live.wireframe
+    chosen = session.observer.begins(state) if state.lead is None else False
+    if result is None or lines is None or chosen or state.document.complete_pairs:
+        return {"chosen": chosen, "candidates": []}
+    found = candidates_of(result)
+    return {
+        "chosen": chosen,
+        "candidates": [
+            {
+                "lines": flat(lines.seen_in(live.camera, each.alignment)),
+                "likelihood": each.likelihood,
+            }
+            for each in (found if len(found) > 1 else [])
+        ],
     }
 
 

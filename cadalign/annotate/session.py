@@ -174,11 +174,17 @@ class Session:
         """Say what the first alignment needs; empty if nothing."""
         observation, _ = self.observed(state)
         pairs = state.document.complete_pairs
+        views = observation.views
+        is_enough = observation.evidence.mask is not None or (
+            observation.init is not None and "image" in observation.fit_options
+        )
+        if self.shape is None and len(views) == 1 and is_enough:
+            return ""
         return missing_text(
             known_points(self.shape, [state.model.registry[pair.keypoint or 0] for pair in pairs]),
             self.shape,
             is_plain=observation.is_plain and self.shape is None,
-            has_others=len(observation.views) > 1,
+            has_others=len(views) > 1,
         )
 
     def _alone(self, state: PhotoState) -> LiveEstimate:
@@ -241,6 +247,7 @@ class Session:
             assumed_focal=() if is_estimated else tuple(names),
             estimates_focal=is_estimated,
             focal_prior=owner.document.priors.focal,
+            uses_photos=owner.document.evidence.photo,
         )
 
     def _used_views(self, state: PhotoState) -> list[PhotoState]:

@@ -234,7 +234,10 @@ class Observation(ObservedImage):
         written = [
             write_image_fields(view, folder, states_origins=states_origins) for view in self.views
         ]
-        data: dict[str, Any] = {"views": written} if self.others else written[0]
+        # A file of one image has keypoints; one of several may have a mask alone.
+        is_of_mask = not len(self.points_2d) and self.evidence.mask is not None
+        listed = bool(self.others) or is_of_mask
+        data: dict[str, Any] = {"views": written} if listed else written[0]
         for name, path in (("model", self.model), ("shape", self.shape)):
             if path is not None:
                 data[name] = written_path(path, folder=folder)

@@ -10,6 +10,7 @@ export class EvidencePanel {
     this.act = act;
     this.mask = h("span");
     this.gravity = h("span");
+    this.photo = h("input", { type: "checkbox", onchange: () => act({ do: "use_photo", on: this.photo.checked }) });
     this.clearMask = button("Clear", () => act({ do: "mask_clear" }), { "aria-label": "Clear the mask" });
     this.clearGravity = button("Clear", () => act({ do: "gravity_clear" }), { "aria-label": "Clear the vertical edges" });
     const file = h("input", {
@@ -33,7 +34,18 @@ export class EvidencePanel {
       ),
       h("p", { class: "soft" }, "Mask and vertical edges are drawn in the photo: choose what a click marks there."),
     );
-    this.root = h("div", {}, this.count, this.body);
+    this.root = h(
+      "div",
+      {},
+      h(
+        "label",
+        { class: "photo", title: "The model's outline is sought in the photo, by the colours about it (I)" },
+        this.photo,
+        " Fit to the photo itself",
+      ),
+      this.count,
+      this.body,
+    );
   }
 
   toggle() {
@@ -69,6 +81,7 @@ export class EvidencePanel {
 
   show({ evidence, image }) {
     this.size = image;
+    this.photo.checked = evidence.photo;
     const { mask, verticals, gravity, gravity_sigma: sigma, lengths, length_sigma: relative } = evidence;
     this.mask.textContent = mask === null ? "none" : "drawn";
     this.clearMask.disabled = mask === null;

@@ -61,6 +61,9 @@ function plain(app, event) {
     case "f":
     case "F":
       return app.fit();
+    case "i":
+    case "I":
+      return app.usePhoto();
     case "l":
     case "L":
       return app.magnify();

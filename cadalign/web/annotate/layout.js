@@ -23,6 +23,7 @@ const KEYS = [
   ["P B G X U", "what a click in the photo marks: points; the mask by brush, polygon, box; a vertical edge"],
   ["Shift while marking", "takes away from the mask"],
   ["C", "closes the polygon"],
+  ["I", "fits to the photo itself, too, or no more: the outline is sought in it"],
   ["Right button", "pans the photo while the mask is drawn"],
   ["H held", "hides the alignment over the photo"],
   ["R", "shows the aligned model before the photo in 3D, or the model to click on again"],

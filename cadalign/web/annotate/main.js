@@ -279,6 +279,12 @@ class App {
     return true;
   }
 
+  /** Let the photo itself count, or no more. */
+  usePhoto() {
+    this.act({ do: "use_photo", on: !this.state.evidence.photo });
+    return true;
+  }
+
   /** Magnify about the pointer, or no more. */
   magnify(on = !this.photo.loupe.on) {
     this.photo.loupe.on = this.model.loupe.on = on;

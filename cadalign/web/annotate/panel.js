@@ -1,6 +1,7 @@
 // The lower half: what the alignment is, what to mark next, and the list of pairs.
 import { button, h } from "../common/dom.js";
 import { addressOf } from "./api.js";
+import { Candidates } from "./candidates.js";
 import { EvidencePanel } from "./evidence_panel.js";
 
 const FORMS = [
@@ -15,6 +16,7 @@ export class Panel {
     this.focal = this.makeFocal();
     this.priors = this.makePriors();
     this.evidence = new EvidencePanel(handlers);
+    this.candidates = new Candidates(handlers);
     this.advice = h("div", { class: "advice" });
     this.ranking = h("div", { class: "ranking" });
     this.keypoints = h("ul", { class: "keypoints" });
@@ -24,7 +26,7 @@ export class Panel {
     this.root = h(
       "section",
       { class: "panel", "aria-label": "Results" },
-      card("Alignment", this.focal, this.priors, this.evidence.root, this.alignment),
+      card("Alignment", this.focal, this.priors, this.evidence.root, this.candidates.root, this.alignment),
       card("Next keypoint", this.details, this.advice, this.ranking),
       card("Pairs", this.makeTable()),
     );
@@ -36,6 +38,7 @@ export class Panel {
     this.showFocal(state.focal, state.shape);
     this.showPriors(state.priors);
     this.evidence.show(state);
+    this.candidates.show(state);
     this.showAdvice(state);
     this.showKeypoints(state.keypoints, state.image.model_number);
     this.showPairs(state, selected);

@@ -1,0 +1,115 @@
+"""A mask alone and the photo itself on the page: aligned, chosen, saved, undone, reopened."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from support.annotating import Case, flat, place_all
+
+from cadalign.annotate.actions import perform
+from cadalign.annotate.masks import encode_runs
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session
+from cadalign.cli import main
+from cadalign.errors import InputError
+from cadalign.metrics import rotation_error
+from cadalign.render import cast_geometry
+
+pytestmark = pytest.mark.long
+
+
+def draw_true_mask(session: Session, case: Case) -> None:
+    instance = case.instance
+    assert instance.scene is not None
+    mask = cast_geometry(instance.scene, instance.camera, instance.cam_from_model).mask
+    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+
+
+def agree_with_fit(session: Session, case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None, live.message
+    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    command, page = json.loads(capsys.readouterr().out), live.result.to_dict()
+    for name in ("alignment", "covariance"):
+        np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-6, atol=1e-9)
+
+
+def test_a_mask_alone_is_aligned_and_a_candidate_chosen(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session = case.open()
+    draw_true_mask(session, case)
+    page, truth = page_state(session, 0), case.instance.cam_from_model
+    assert page["alignment"]["status"] == "done", page["alignment"]
+    live, _ = session.live(session.photos[0])
+    assert rotation_error(est=live.alignment, gt=truth) < 0.5
+    agree_with_fit(session, case, capsys)
+    shown = page["by_mask"]["candidates"]
+    assert len(shown) == (1 + len(live.result.alternatives) if live.result.alternatives else 0)
+
+    perform(session, 0, {"do": "begin_at", "candidate": 0})
+    assert page_state(session, 0)["by_mask"] == {"chosen": True, "candidates": []}
+    again, _ = session.live(session.photos[0])
+    assert rotation_error(est=again.alignment, gt=truth) < 0.5
+    assert "init" in json.loads(case.observation.read_text())
+    agree_with_fit(session, case, capsys)
+    reopened = case.open()
+    assert page_state(reopened, 0)["by_mask"]["chosen"]
+    perform(session, 0, {"do": "undo"})
+    assert not page_state(session, 0)["by_mask"]["chosen"]
+    with pytest.raises(InputError, match="candidate: there is no candidate 9; reload the page"):
+        perform(session, 0, {"do": "begin_at", "candidate": 9})
+
+
+def test_the_photo_takes_the_place_of_a_mask(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session, truth = case.open(), case.instance.cam_from_model
+    draw_true_mask(session, case)
+    outcome = perform(session, 0, {"do": "use_photo", "on": True})
+    assert outcome.message == "The photo takes the place of the mask; undo brings it back."
+    page = page_state(session, 0)
+    assert page["evidence"]["mask"] is None
+    assert page["alignment"]["also_used"] == "photo"
+    live, _ = session.live(session.photos[0])
+    assert rotation_error(est=live.alignment, gt=truth) < 1.0
+    agree_with_fit(session, case, capsys)
+    perform(session, 0, {"do": "undo"})
+    page = page_state(session, 0)
+    assert page["evidence"]["mask"] is not None
+    assert not page["evidence"]["photo"]
+
+
+def test_one_pair_beside_a_mask_counts(case: Case) -> None:
+    session = case.open()
+    draw_true_mask(session, case)
+    place_all(session, case, count=1)
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None, live.message
+    assert rotation_error(est=live.alignment, gt=case.instance.cam_from_model) < 0.5
+    assert np.abs(live.residuals).max() < 5
+    assert page_state(session, 0)["by_mask"]["candidates"] == []
+
+
+def test_the_photo_counts_when_it_is_chosen(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    session = case.open()
+    place_all(session, case, count=5)
+    before, _ = session.live(session.photos[0])
+    perform(session, 0, {"do": "use_photo", "on": True})
+    page = page_state(session, 0)
+    assert page["evidence"]["photo"]
+    assert page["alignment"]["also_used"] == "photo"
+    live, _ = session.live(session.photos[0])
+    assert [each.kind for each in live.result.evidence] == ["keypoints", "photo"]
+    truth = case.instance.cam_from_model
+    assert rotation_error(est=live.alignment, gt=truth) < rotation_error(
+        est=before.alignment, gt=truth
+    )
+    assert json.loads(case.observation.read_text())["fit"]["image"] is True
+    agree_with_fit(session, case, capsys)
+    assert page_state(case.open(), 0)["evidence"]["photo"]
+    perform(session, 0, {"do": "undo"})
+    assert not page_state(session, 0)["evidence"]["photo"]
+    assert "image" not in json.loads(case.observation.read_text())["fit"]

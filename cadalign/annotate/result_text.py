@@ -67,7 +67,7 @@ def notes_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[str
             "it."
         )
     others = len(result.alternatives)
-    if others:
+    if others and len(live.counts):  # those of a mask alone are shown
         notes.append(
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
             f"{'as well' if shape is None else 'nearly as well'}: one more pair tells them apart"

@@ -83,9 +83,11 @@ class Case:
         return session
 
 
-def make_case(root: Path, folder: Path, *, model_id: str = "sample_chair_000") -> Case:
-    """Render the photo of a chair and write camera and keypoints."""
-    model = KeypointNet(root)["chair", model_id]
+def make_case(
+    root: Path, folder: Path, *, category: str = "chair", model_id: str = "sample_chair_000"
+) -> Case:
+    """Render the photo of a model and write camera and keypoints."""
+    model = KeypointNet(root)[category, model_id]
     instance = make_instance(
         model, noise_px=1.0, min_visible=6, seed=0, view_index=0, scene=load_scene(model)
     )

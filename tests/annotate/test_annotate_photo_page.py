@@ -1,0 +1,79 @@
+"""The page in Chromium: a box cuts an object out, a candidate is chosen, the photo is fitted to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from support.annotating import IDLE, Case, make_case, opened_page, place_of_pixel, wait
+
+from cadalign.annotate.session import Session
+from cadalign.geometry.alignment import Alignment
+from cadalign.metrics import rotation_error
+from cadalign.render import cast_geometry
+
+pytestmark = pytest.mark.long
+
+
+def draw_box(page: Page, case: Case) -> None:
+    """Drag a box about the object."""
+    instance = case.instance
+    assert instance.scene is not None
+    mask = cast_geometry(instance.scene, instance.camera, instance.cam_from_model).mask
+    rows, columns = np.nonzero(mask)
+    page.keyboard.press("x")
+    first = float(columns.min() - 8), float(rows.min() - 8)
+    last = float(columns.max() + 8), float(rows.max() + 8)
+    page.mouse.move(*place_of_pixel(page, first))
+    page.mouse.down()
+    page.mouse.move(*place_of_pixel(page, last), steps=4)
+    page.mouse.up()
+    page.wait_for_timeout(50)
+    wait(page, IDLE)
+
+
+def shown(session: Session) -> Alignment:
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None, live.message
+    return live.alignment
+
+
+def test_a_box_and_one_key_align_to_the_photo(browser: Browser, case: Case) -> None:
+    session, truth = case.open(), case.instance.cam_from_model
+    with opened_page(browser, session) as page:
+        draw_box(page, case)
+        assert page.evaluate("annotator.state.alignment.status") == "done"
+        assert rotation_error(est=shown(session), gt=truth) < 1.0
+        expect(page.get_by_text("The mask allows several")).to_be_hidden()
+        page.keyboard.press("i")
+        wait(page, f"{IDLE} && annotator.state.evidence.photo")
+        expect(page.get_by_label("Fit to the photo itself")).to_be_checked()
+        expect(page.get_by_text("The photo takes the place of the mask")).to_be_visible()
+        assert page.evaluate("annotator.state.alignment.also_used") == "photo"
+        assert rotation_error(est=shown(session), gt=truth) < 1.0
+        page.keyboard.press("Control+z")
+        wait(page, f"{IDLE} && !annotator.state.evidence.photo")
+        assert page.evaluate("annotator.state.alignment.also_used") == "mask"
+
+
+def test_one_of_several_alignments_is_chosen(
+    browser: Browser, sample_root: Path, tmp_path: Path
+) -> None:
+    case = make_case(sample_root, tmp_path, category="bottle", model_id="sample_bottle_000")
+    session = case.open()
+    with opened_page(browser, session) as page:
+        draw_box(page, case)
+        first = shown(session)
+        pictures = page.get_by_role("button", name="as likely")
+        assert pictures.count() >= 1
+        expect(page.get_by_role("button", name="Alignment 1, likeliest")).to_be_visible()
+        assert pictures.first.locator("path").get_attribute("d").startswith("M")
+        pictures.first.click()
+        wait(page, f"{IDLE} && annotator.state.by_mask.chosen")
+        assert rotation_error(est=shown(session), gt=first) > 1.0
+        page.get_by_role("button", name="Choose again").click()
+        wait(page, f"{IDLE} && !annotator.state.by_mask.chosen")
+        assert rotation_error(est=shown(session), gt=first) < 0.01
+        assert pictures.count() >= 1

@@ -229,7 +229,7 @@ def accept(
 ) -> ActionOutcome:
     """Place pairs at a detector's proposals for some keypoints, or for all that are left."""
     document, number = state.document, None
-    for proposal in state.proposals:
+    for proposal in session.proposals(state):
         keypoint = proposal.keypoint
         if (keypoints is None or keypoint in keypoints) and keypoint not in document.keypoints:
             number = document.next_number

@@ -22,6 +22,7 @@ from cadalign.export.photo_sets import AnnotatedPhoto, write_photo_set
 from cadalign.io.files import write_text
 
 _MARKED = 2  # COCO's flag of a keypoint that is labelled and visible
+_FIRST_TRACK = 1  # the object whose photos are frames of one video
 
 
 def coco_of(session: Session) -> dict[str, Any]:
@@ -44,9 +45,14 @@ def coco_of(session: Session) -> dict[str, Any]:
                 for model in models
             ],
             [
-                _coco_object(row, state, models.index(state.model), _marked(session, state.model))
+                replace(
+                    _coco_object(
+                        row, state, models.index(state.model), _marked(session, state.model)
+                    ),
+                    track=_FIRST_TRACK if session.track is not None and not slot else None,
+                )
                 for row, objects in enumerate(kept)
-                for state in objects
+                for slot, state in enumerate(objects)
                 if state.document.complete_pairs
             ],
         )

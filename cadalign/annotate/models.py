@@ -137,11 +137,12 @@ class KeypointRegistry:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A keypoint of the model, where a detector has found it [px], and how sure it is."""
+    """A keypoint of the model, where a detector or the other frames put it [px], and how sure."""
 
     keypoint: int
     uv: tuple[float, float]
     score: float | None = None
+    sigma: float | None = None  # standard deviation of a prediction [px]
 
 
 def read_proposals(

@@ -74,7 +74,7 @@ def page_state(
             "priors": _priors(session, state),
             "pairs": _pairs(session, state, live),
             "keypoints": _keypoints(state),
-            "proposals": _proposals(state),
+            "proposals": _proposals(session, state),
             "shape": _shape(session, state),
             "alignment": _alignment(session, state, live),
             "by_mask": _candidates(session, state, live),
@@ -226,12 +226,12 @@ def _keypoints(state: PhotoState) -> list[dict[str, Any]]:
     ]
 
 
-def _proposals(state: PhotoState) -> list[dict[str, Any]]:
-    """A detector's proposals for keypoints that are not used yet."""
+def _proposals(session: Session, state: PhotoState) -> list[dict[str, Any]]:
+    """Proposals of a detector or of other frames for keypoints that are not used yet."""
     used = state.document.keypoints
     return [
         {**asdict(proposal), "name": state.model.registry[proposal.keypoint].name}
-        for proposal in state.proposals
+        for proposal in session.proposals(state)
         if proposal.keypoint not in used
     ]
 

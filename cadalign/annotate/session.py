@@ -17,11 +17,12 @@ from cadalign.annotate.history import history_path, write_history
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import LiveAlignment, known_points, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.models import KeypointRegistry, Models
+from cadalign.annotate.models import KeypointRegistry, Models, Proposal
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects import Deletions, Observer, PhotoState, label_of, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
+from cadalign.annotate.track import Track
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import simulate_problem
@@ -51,6 +52,7 @@ class Session:
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
     reserve: Callable[[Sequence[Path]], None] = lambda paths: None
     """Keeps other annotators off an object's files; raises a CadalignError if one has them."""
+    track: Track | None = None  # where the photos are frames of one video
 
     def __post_init__(self) -> None:
         self.lock = threading.RLock()
@@ -124,6 +126,13 @@ class Session:
             if state in states:
                 return number, states.index(state)
         raise LookupError(state.key)
+
+    def proposals(self, state: PhotoState) -> tuple[Proposal, ...]:
+        """Keypoints of a detector, and of the other frames, that could be taken."""
+        number, slot = self.place_of(state)
+        if self.track is None or slot:
+            return state.proposals
+        return (*state.proposals, *self.track.proposals(self, number))
 
     def work_state(self, state: PhotoState) -> State:
         """State of the annotation of a photo."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from cadalign.annotate.options import LOOPBACK, FileOptions, SessionOptions
+from cadalign.annotate.options import LOOPBACK, VIDEOS, FileOptions, SessionOptions
 from cadalign.cli.options import UsageError, flag_of, make_folder, new_console
 from cadalign.io.files import write_json, writing
 
@@ -33,11 +33,14 @@ class Annotate(FileOptions):
     """
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, _FILES] = ()
-    """A photo, or a folder of photos; and the model, an OBJ, PLY, GLB, glTF, STL or OFF file."""
+    """A photo, a folder of photos, or a video; and the model, an OBJ, PLY, GLB, glTF, STL or OFF
+    file."""
     image: Path | None = None
     """The photo or folder, in place of PHOTO."""
     model: Path | None = None
     """The model, in place of MODEL."""
+    every: int = 1
+    """Take every so many frames of a video; they are written as photos to <video>_frames."""
     port: int = 0
     """Port to listen on; 0 for a free one."""
     host: str = "127.0.0.1"
@@ -80,7 +83,18 @@ class Annotate(FileOptions):
         rest: dict[str, Any] = {
             field.name: getattr(self, field.name) for field in fields(FileOptions)
         }
+        if found["image"].suffix.lower() in VIDEOS:
+            rest["track"] = True
+            found["image"] = self._frames(found["image"])
         return SessionOptions(**(found | rest))
+
+    def _frames(self, video: Path) -> Path:
+        """The folder with the frames of a video, which are written if they are not there yet."""
+        from cadalign.annotate.track import write_frames
+
+        folder = (self.out or video.parent) / f"{video.stem}_frames"
+        with new_console().status("reading the video"):
+            return write_frames(video, folder, every=self.every)
 
     def run(self) -> int:
         """Serve until interrupted; returns the exit code."""

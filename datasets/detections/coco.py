@@ -233,15 +233,20 @@ class CocoObject:
     rectangle: FloatArray  # (4,), left, top, right and bottom
     pose: Alignment | None = None
     """From the model's axes to the camera's, with the model's scale [m]."""
+    track: int | None = None  # of the object through the images of a video
 
     def annotation(self, number: int) -> dict[str, Any]:
         """The annotation of a number."""
         left, top, right, bottom = self.rectangle.tolist()
         pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
         rows = zip(pixels, self.flags.tolist(), strict=True)
-        pose = {} if self.pose is None else {"pose": _written_pose(self.pose)}
+        further: dict[str, Any] = {}
+        if self.pose is not None:
+            further["pose"] = _written_pose(self.pose)
+        if self.track is not None:
+            further["track_id"] = self.track
         return {
-            **pose,
+            **further,
             "id": number,
             "image_id": self.image,
             "category_id": 1 + self.category,

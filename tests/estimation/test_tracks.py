@@ -201,3 +201,19 @@ def test_times_that_do_not_tell_the_frames_are_refused() -> None:
         Motion(angular_sigma=-1.0)
     with pytest.raises(InputError, match="time: 'now' is not a finite number"):
         replace(views[0], time="now")  # type: ignore[arg-type]
+
+
+def test_few_frames_with_keypoints_tell_how_strong_the_motion_is() -> None:
+    # The first path is straight between them, as if nothing ever changed there.
+    between, stated = [], []
+    for seed in range(6):
+        track = track_of(seed, frames=60)
+        views = [
+            view if number % 10 == 0 else replace(view, points_2d=(), ids=None, sigma=1.0)
+            for number, view in enumerate(track.views)
+        ]
+        result = align(CATEGORY, views, motion="smooth")
+        assert result.rms < 4
+        between.append(errors(result, track))
+        stated.append([view.std.rotation_deg for view in result.views if view.std is not None])
+    assert 0.4 < np.sqrt(np.mean(np.square(between)) / np.mean(np.square(stated))) < 2

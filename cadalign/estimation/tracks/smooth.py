@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_robust import whitened_lengths, with_loss, with_sightings
@@ -186,7 +186,8 @@ def smoothed(
     Where errors of successive frames ``may_correlate``, it is estimated whether they do.
     """
     seconds = np.diff(times)
-    unknown = _first_strength(path, seconds)
+    seen = np.unique(evidence.rig.pose[evidence.sightings.image])
+    unknown = _first_strength(path, times, seen)
     prior = MotionPrior(seconds, motion.strength(unknown))
     inliers = np.ones(len(evidence.sightings.point), dtype=bool)
     used = evidence if limits is None else with_loss(evidence, CAUCHY)
@@ -211,9 +212,16 @@ def smoothed(
     return Smoothed(used, inliers, path, prior, spent, correlation)
 
 
-def _first_strength(path: Path, seconds: FloatArray) -> FloatArray:
-    """Strengths (2,) of the changes of a first path's velocity."""
-    changes = np.diff(path.velocities, axis=0) / np.sqrt(seconds)[:, None]
+def _first_strength(path: Path, times: FloatArray, seen: IntArray) -> FloatArray:
+    """Strengths (2,) of the changes of a first path's velocity, between frames ``seen`` (n,).
+
+    In others the first path is a straight line, which would say that nothing ever changes.
+    """
+    seconds, velocities = np.diff(times), path.velocities
+    if 1 < len(seen) < len(times):
+        velocities = velocities_of(path.state.poses[seen], times[seen])
+        times = times[seen]
+    changes = np.diff(velocities, axis=0) / np.sqrt(np.diff(times))[:, None]
     sizes = np.array([np.median(np.abs(part)) for part in np.split(changes, 2, axis=1)])
     speeds = np.array([np.abs(part).mean() for part in np.split(path.velocities, 2, axis=1)])
     least = _LEAST_STRENGTH * (speeds + _LEAST_SPEED) / np.sqrt(seconds.sum())

@@ -145,7 +145,9 @@ export class Panel {
   /** What a detector proposes; nothing if it proposes nothing. */
   proposed(proposals) {
     if (!proposals.length) return "";
-    const count = `${proposals.length} keypoint${proposals.length === 1 ? "" : "s"} of a detector`;
+    const sigmas = proposals.filter(({ sigma }) => sigma !== null).map(({ sigma }) => sigma);
+    const source = sigmas.length ? `predicted from other frames, ± ${Math.max(...sigmas).toPrecision(2)} px at most` : "of a detector";
+    const count = `${proposals.length} keypoint${proposals.length === 1 ? "" : "s"} ${source}`;
     return h(
       "p",
       {},

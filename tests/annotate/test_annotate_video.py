@@ -1,0 +1,151 @@
+"""Frames of a video: what is marked in some of them is proposed in the others."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.annotating import Case
+
+from cadalign.annotate.actions import perform
+from cadalign.annotate.opening import open_session
+from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.page_state import page_state
+from cadalign.annotate.session import Session
+from cadalign.annotate.track import write_frames
+from cadalign.arrays import FloatArray
+from cadalign.cli import main
+from cadalign.cli.annotate import Annotate
+from cadalign.datasets import read_image_keypoints
+from cadalign.errors import DataError, InputError
+from cadalign.geometry import resized_camera
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.render import RaycastRenderer, visible_keypoints
+from cadalign.render.drawing.movie import write_movie
+
+pytestmark = pytest.mark.long
+
+FRAMES = 60
+KEY_FRAMES = (0, 20, 40, 59)
+CLOSE = 3.0  # [px]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A video of a turning chair, and the chair's poses in its frames."""
+
+    case: Case
+    path: Path
+    camera: Camera
+    poses: list[Alignment]
+
+    def options(self, out: Path, **changes: Any) -> SessionOptions:
+        """Options of a session as the command makes them."""
+        out.mkdir(exist_ok=True)
+        camera = out / "camera.json"
+        camera.write_text(json.dumps(self.camera.to_dict()))
+        command = Annotate(
+            files=(self.path, self.case.model),
+            camera=camera,
+            keypoints=self.case.keypoints,
+            out=out,
+            **changes,
+        )
+        return command.session
+
+    def seen(self, session: Session, frame: int) -> dict[int, FloatArray]:
+        """Pixels of the visible keypoints by their numbers."""
+        scene, pose = self.case.instance.scene, self.poses[frame]
+        assert scene is not None
+        numbers, points = zip(*session.registry, strict=True)
+        xyz = np.array([point.xyz for point in points])
+        shown = visible_keypoints(scene, xyz, self.camera, pose)
+        pixels = self.camera.project(pose.apply(xyz))
+        return {numbers[k]: pixels[k] for k in np.flatnonzero(shown)}
+
+
+@pytest.fixture(scope="module")
+def clip(original: Case, tmp_path_factory: pytest.TempPathFactory) -> Clip:
+    instance = original.instance
+    camera, scene = resized_camera(instance.camera, 320, 240), instance.scene
+    assert scene is not None
+    start, poses = instance.cam_from_model, []
+    for share in np.linspace(0.0, 1.0, FRAMES):
+        turn = rotation_from_vector(np.array([0.0, 1.2 * share, 0.0]))
+        away = np.array([0.2 * share - 0.1, 0.05 * np.sin(3 * share), 0.3 * share])
+        poses.append(Alignment(start.rotation @ turn, start.translation + away, start.scale))
+    renderer = RaycastRenderer()
+    frames = (renderer.render(scene, camera, pose).composite() for pose in poses)
+    path = tmp_path_factory.mktemp("clip") / "chair.mp4"
+    assert write_movie(path, frames, fps=30) == FRAMES
+    return Clip(original, path, camera, poses)
+
+
+def test_a_video_is_a_work_list_of_its_frames(clip: Clip, tmp_path: Path) -> None:
+    options = clip.options(tmp_path / "out", every=20)
+    assert options.track
+    assert [each.name for each in sorted(options.image.iterdir())] == [
+        "frame_000000.png",
+        "frame_000020.png",
+        "frame_000040.png",
+    ]
+    kept = options.image / "frame_000020.png"
+    kept.write_bytes((options.image / "frame_000000.png").read_bytes())
+    clip.options(tmp_path / "out", every=20)
+    assert kept.read_bytes() == (options.image / "frame_000000.png").read_bytes()
+    with pytest.raises(InputError, match="--every: 0 is not positive"):
+        clip.options(tmp_path / "out", every=0)
+    damaged = tmp_path / "no.mp4"
+    damaged.write_text("no video")
+    with pytest.raises(DataError, match="not a video that can be read"):
+        write_frames(damaged, tmp_path / "frames", every=1)
+
+
+def test_keypoints_of_four_frames_are_proposed_in_all_others(clip: Clip, tmp_path: Path) -> None:
+    session = open_session(clip.options(tmp_path / "out"))
+    session.warm_up()
+    assert len(session.photos) == FRAMES
+    assert page_state(session, 5)["proposals"] == []
+    rng = np.random.default_rng(0)
+    clicks = 0
+    for frame in KEY_FRAMES:
+        for number, uv in clip.seen(session, frame).items():
+            click = (uv + rng.normal(0, 1, 2)).tolist()
+            perform(session, frame, {"do": "place_uv", "uv": click})
+            perform(session, frame, {"do": "place_keypoint", "keypoint": number})
+            clicks += 2
+    by_hand, wrong, missing, sigmas, gaps = 0, 0, 0, [], []
+    for frame in (k for k in range(FRAMES) if k not in KEY_FRAMES):
+        seen = clip.seen(session, frame)
+        given = {each["keypoint"]: each for each in page_state(session, frame)["proposals"]}
+        for number, uv in seen.items():
+            by_hand += 2
+            missing += number not in given
+            if number in given:
+                gap = np.linalg.norm(np.array(given[number]["uv"]) - uv)
+                wrong += gap > CLOSE
+                gaps.append(gap)
+                sigmas.append(given[number]["sigma"])
+    needed = FRAMES - len(KEY_FRAMES) + wrong + 2 * missing  # one key for a frame, and corrections
+    assert needed + clicks < (by_hand + clicks) / 4
+    assert np.mean(np.array(gaps) > CLOSE) < 0.02
+    assert 0.3 < np.sqrt(np.mean(np.square(gaps))) / np.sqrt(2 * np.mean(np.square(sigmas))) < 2
+
+    perform(session, 10, {"do": "accept"})
+    document = session.photos[10].document
+    assert len(document.complete_pairs) >= 5
+    assert page_state(session, 10)["proposals"] == []
+    reopened = open_session(clip.options(tmp_path / "out"))
+    assert len(reopened.photos[10].document.complete_pairs) == len(document.complete_pairs)
+    written = tmp_path / "keypoints.json"
+    command = ["annotate", str(clip.path), str(clip.case.model), "--out", str(tmp_path / "out")]
+    command += ["--camera", str(tmp_path / "out" / "camera.json"), "--export", str(written)]
+    assert main([*command, "--keypoints", str(clip.case.keypoints)]) == 0
+    found = read_image_keypoints(written)
+    assert [each.track for each in found] == ["1"] * (len(KEY_FRAMES) + 1)

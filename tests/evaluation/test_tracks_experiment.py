@@ -13,9 +13,12 @@ from support.refusals import refusal_line
 
 import cadalign
 from cadalign import Result, ShapeModel, View
+from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.tracks import METHODS, SPEC, TracksOptions
 from cadalign.evaluation.instances.tracks import SimulatedVideo, track_errors
 from cadalign.evaluation.methods.tracks import TrackEstimate
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.run import Progress
 
 SYNSET = "03001627"
 BASE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -82,6 +85,27 @@ def test_mistakes_of_the_detector_are_found(root: Path) -> None:
     table = cadalign.evaluate(root, "tracks", methods=["smooth"], workers=0, **options)
     assert table.flips.tolist() == [0]
     assert table.rotation_error_deg.max() < 5
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    def kill(progress: Progress) -> None:
+        if progress.done:
+            raise Killed
+
+    options = TracksOptions(root, frames=12, methods=("smooth", "online"))
+    whole, broken = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "broken")
+    run(options, whole, workers=0, dask=None)
+    with pytest.raises(Killed):
+        run(options, broken, workers=0, dask=None, on_progress=kill)
+    assert broken.parts.is_dir()
+    assert not broken.results.exists()
+    run(options, broken, workers=0, dask=None)
+    assert broken.results.read_bytes() == whole.results.read_bytes()
+    assert broken.config_file.read_bytes() == whole.config_file.read_bytes()
 
 
 def test_videos_follow_from_seed_and_name() -> None:

@@ -36,7 +36,7 @@ from cadalign.annotate.photos import (
     read_camera,
 )
 from cadalign.annotate.session import Session
-from cadalign.annotate.track import Track
+from cadalign.annotate.track import FrameTrack
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
@@ -154,7 +154,9 @@ def open_session(
             objects.append(place)
         place.append(view)
     worklist = WorkList.open(folder)
-    track = Track.of([objects[k][0] for k in range(len(files.photos))]) if options.track else None
+    track = (
+        FrameTrack.of([objects[k][0] for k in range(len(files.photos))]) if options.track else None
+    )
     return Session(
         models, objects, before_saving, worklist, shape, choice, reserve=reserve, track=track
     )

@@ -22,7 +22,7 @@ from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects import Deletions, Observer, PhotoState, label_of, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
-from cadalign.annotate.track import Track
+from cadalign.annotate.track import FrameTrack
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import simulate_problem
@@ -52,7 +52,7 @@ class Session:
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
     reserve: Callable[[Sequence[Path]], None] = lambda paths: None
     """Keeps other annotators off an object's files; raises a CadalignError if one has them."""
-    track: Track | None = None  # where the photos are frames of one video
+    track: FrameTrack | None = None  # where the photos are frames of one video
 
     def __post_init__(self) -> None:
         self.lock = threading.RLock()

@@ -52,7 +52,7 @@ def write_frames(video: Path, folder: Path, *, every: int) -> Path:
 
 
 @dataclass(eq=False)
-class Track:
+class FrameTrack:
     """The first object of each photo as one object in successive frames of a video."""
 
     times: tuple[float, ...]  # of the photos [s]
@@ -61,7 +61,7 @@ class Track:
     )
 
     @classmethod
-    def of(cls, photos: list[PhotoState]) -> Track:
+    def of(cls, photos: list[PhotoState]) -> FrameTrack:
         """The track of photos whose frames are numbered by their names."""
         names = [state.photo.path.name for state in photos]
         numbers = frame_numbers(names)

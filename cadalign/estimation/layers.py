@@ -112,7 +112,7 @@ class FitTask:
     workers: int
 
 
-class Minima(NamedTuple):
+class BatchMinima(NamedTuple):
     """Poses (B, 15) and focal lengths (B,) of what a search found, and for which problems (B,)."""
 
     poses: FloatArray
@@ -132,7 +132,7 @@ class FitValues(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Fits:
+class BatchFits:
     """Fits of a batch in the parts that threads have shared."""
 
     parts: Sequence[_Part]
@@ -143,9 +143,9 @@ class Fits:
         return FitValues(*_joined(part.values for part in self.parts))
 
     @property
-    def minima(self) -> Minima:
-        """What the search found, from which the fits follow without another one."""
-        return Minima(*_joined(part.minima for part in self.parts))
+    def minima(self) -> BatchMinima:
+        """Minima of the search, from which the fits follow without another one."""
+        return BatchMinima(*_joined(part.minima for part in self.parts))
 
     def pulled_back(
         self,
@@ -172,7 +172,7 @@ class _Part:
     ``by_pixels`` (B, n, 2, 2) are the derivatives of the optima's rays by the pixels.
     """
 
-    minima: Minima
+    minima: BatchMinima
     optima: Optima
     by_pixels: FloatArray
     sigmas: FloatArray
@@ -215,8 +215,8 @@ def fits_of(
     pixels: FloatArray,
     sigmas: FloatArray,
     mask: BoolArray,
-    minima: Minima | None = None,
-) -> Fits:
+    minima: BatchMinima | None = None,
+) -> BatchFits:
     """The fits of a batch, from ``minima`` where these are known.
 
     Points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n). Raises InputError for cameras that
@@ -242,14 +242,19 @@ def fits_of(
         if minima is None:
             found = _searched(known, batch, options)
         else:
-            found = Minima(minima.poses[some], minima.focals[some], minima.found[some])
+            found = BatchMinima(minima.poses[some], minima.focals[some], minima.found[some])
         return _polished(known, batch, options, found, exact=task.exact)
 
-    return Fits(in_threads(run, len(points), task.workers))
+    return BatchFits(in_threads(run, len(points), task.workers))
 
 
 def _polished(
-    points: FloatArray, batch: KeypointBatch, options: FitOptions, minima: Minima, *, exact: bool
+    points: FloatArray,
+    batch: KeypointBatch,
+    options: FitOptions,
+    minima: BatchMinima,
+    *,
+    exact: bool,
 ) -> _Part:
     """The fits of some problems, polished by a Newton step.
 
@@ -288,7 +293,7 @@ def _polished(
     )
 
 
-def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> Minima:
+def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> BatchMinima:
     """The best minima of some problems."""
     present, cameras = batch.present, batch.cameras
     offsets = np.concatenate([[0], np.cumsum(batch.counts)]).astype(np.int64)
@@ -305,7 +310,7 @@ def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> 
     focals = np.array([camera.fx for camera in cameras]) * np.ones(len(points))
     if found.focals is not None:
         focals = np.where(valid, found.focals[:, 0], focals)
-    return Minima(poses, focals, valid)
+    return BatchMinima(poses, focals, valid)
 
 
 def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T]:

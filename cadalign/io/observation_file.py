@@ -41,7 +41,7 @@ Declared = TypeVar("Declared", bound=Document)
 
 
 class SeenKeypoint(Labelled, kw_only=True):
-    """What a photo says of a keypoint."""
+    """Fields of a keypoint that a photo, or its detector, gives."""
 
     sigma: Positive | None = None
     score: NotNegative | None = None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.layers import FitTask, FitValues, Minima, fits_of
+from cadalign.estimation.layers import BatchMinima, FitTask, FitValues, fits_of
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
 
@@ -167,7 +167,7 @@ def _layer(task: FitTask, dtype: Any) -> Callable[..., Any]:
 
         pose = each(3, 3), each(3), each(3), each()
         values = FitValues(*pose, each(10, 10), each(kind=bool))
-        minima = Minima(each(15), each(), each(kind=bool))
+        minima = BatchMinima(each(15), each(), each(kind=bool))
         found = on_processor(run, [*values, *minima], *given)
         return tuple(found[: len(values)]), (given, found[len(values) :])
 
@@ -176,7 +176,7 @@ def _layer(task: FitTask, dtype: Any) -> Callable[..., Any]:
 
         def run(*arrays: Any) -> tuple[Any, ...]:
             points, pixels, sigmas, mask, *rest = arrays
-            fits = fits_of(task, points, pixels, sigmas, mask, Minima(*rest[:3]))
+            fits = fits_of(task, points, pixels, sigmas, mask, BatchMinima(*rest[:3]))
             return fits.pulled_back(*rest[3:])
 
         kinds = [jax.ShapeDtypeStruct(each.shape, dtype) for each in given[:3]]

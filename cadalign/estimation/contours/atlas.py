@@ -97,7 +97,7 @@ def atlas_of(mesh: Mesh) -> Atlas:
 
 @lru_cache(maxsize=16)
 def cut_atlas_of(mesh: Mesh) -> Atlas:
-    """What straight lines leave of a mesh's silhouettes, rendered once."""
+    """Parts of a mesh's silhouettes that straight lines leave, rendered once."""
     return _atlas(mesh, _CUT_EVERY, _cuts)
 
 
@@ -177,7 +177,7 @@ def _cuts(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _sampled(
     image: Image, moments: FloatArray, lines: FloatArray, corner: FloatArray, cell: float
 ) -> Whitened:
-    """What lines (N, 3) leave of an image, by its moments (N, 6)."""
+    """Moments (N, 6) of the parts of an image that lines (N, 3) leave."""
     count = moments[:, 0]
     mean = moments[:, 1:3] / count[:, None]
     xx, xy, yy = (moments[:, 3:] / count[:, None]).T

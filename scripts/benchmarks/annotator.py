@@ -12,8 +12,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 from playwright.sync_api import Browser, Page
-from support.annotating import Case, make_case, place, place_of_pixel, place_twenty, served
+from support.annotating import (
+    Case,
+    make_case,
+    opened_page,
+    place,
+    place_of_pixel,
+    place_twenty,
+    served,
+)
 from support.chromium import chromium
+from support.clips import CLOSE, FRAMES, make_clip, mark_clip
 from support.killing import kill_at_random
 from support.panels import (
     AXE,
@@ -91,11 +100,12 @@ class Annotator:
     - list: a folder of 200 photos: the list, its thumbnails, and going from photo to photo;
     - panels: a session by keys alone through every panel: layout shifts, and what axe-core finds;
     - kills: annotators killed at random moments, and what the next ones had lost;
+    - clip: a video of 60 frames, some marked by hand, the others' predictions taken by a key;
     - pictures: models white, black, with doubled faces, thin, transparent, textured, huge and tiny,
       light and dark, on desktop, laptop and phone, as contact sheets.
     """
 
-    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "pictures")
+    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "clip", "pictures")
     """What to measure."""
     clicks: int = 30
     """Clicks that are timed."""
@@ -111,6 +121,7 @@ class Annotator:
             "list": self._list,
             "panels": _panels,
             "kills": self._kills,
+            "clip": _clips,
             "pictures": _pictures,
         }
         with tempfile.TemporaryDirectory() as folder, chromium() as browser:
@@ -221,6 +232,28 @@ def _page(
 ) -> Page:
     width, height = SCREENS[screen]
     return open_page(browser, url, width=width, height=height, scheme=scheme, scripts=scripts)
+
+
+def _clips(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+    """Clicks and keys until all keypoints of a clip are marked, and errors of its predictions."""
+    clip = make_clip(_case(given, folder), folder)
+    for count in (3, 4, 7):
+        key_frames = np.linspace(0, FRAMES - 1, count).round().astype(int).tolist()
+        session = open_session(clip.options(folder / str(count)))
+        session.warm_up()
+        with opened_page(browser, session, width=1600, height=1400) as page:
+            clicks = mark_clip(page, session, clip, key_frames)
+        yield {
+            "frames by hand": count,
+            "clicks": clicks.marked,
+            "keys": clicks.keys,
+            "corrections": clicks.corrected,
+            "in all": clicks.marked + clicks.keys + clicks.corrected,
+            "all by hand": clicks.by_hand,
+            "within 3 px, %": 100 * float(np.mean(clicks.gaps < CLOSE)),
+            "off by, rms px": float(np.sqrt(np.mean(clicks.gaps**2))),
+            "stated, rms px": float(np.sqrt(2 * np.mean(clicks.stated**2))),
+        }
 
 
 def _timed_clicks(

@@ -2,89 +2,23 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case
+from support.clips import CLOSE, FRAMES, Clip
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.opening import open_session
-from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.session import Session
 from cadalign.annotate.track import write_frames
-from cadalign.arrays import FloatArray
 from cadalign.cli import main
-from cadalign.cli.annotate import Annotate
 from cadalign.datasets import read_image_keypoints
 from cadalign.errors import DataError, InputError
-from cadalign.geometry import resized_camera
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.render import RaycastRenderer, visible_keypoints
-from cadalign.render.drawing.movie import write_movie
 
 pytestmark = pytest.mark.long
 
-FRAMES = 60
 KEY_FRAMES = (0, 20, 40, 59)
-CLOSE = 3.0  # [px]
-
-
-@dataclass(frozen=True)
-class Clip:
-    """A video of a turning chair, and the chair's poses in its frames."""
-
-    case: Case
-    path: Path
-    camera: Camera
-    poses: list[Alignment]
-
-    def options(self, out: Path, **changes: Any) -> SessionOptions:
-        """Options of a session as the command makes them."""
-        out.mkdir(exist_ok=True)
-        camera = out / "camera.json"
-        camera.write_text(json.dumps(self.camera.to_dict()))
-        command = Annotate(
-            files=(self.path, self.case.model),
-            camera=camera,
-            keypoints=self.case.keypoints,
-            out=out,
-            **changes,
-        )
-        return command.session
-
-    def seen(self, session: Session, frame: int) -> dict[int, FloatArray]:
-        """Pixels of the visible keypoints by their numbers."""
-        scene, pose = self.case.instance.scene, self.poses[frame]
-        assert scene is not None
-        numbers, points = zip(*session.registry, strict=True)
-        xyz = np.array([point.xyz for point in points])
-        shown = visible_keypoints(scene, xyz, self.camera, pose)
-        pixels = self.camera.project(pose.apply(xyz))
-        return {numbers[k]: pixels[k] for k in np.flatnonzero(shown)}
-
-
-@pytest.fixture(scope="module")
-def clip(original: Case, tmp_path_factory: pytest.TempPathFactory) -> Clip:
-    instance = original.instance
-    camera, scene = resized_camera(instance.camera, 320, 240), instance.scene
-    assert scene is not None
-    start, poses = instance.cam_from_model, []
-    for share in np.linspace(0.0, 1.0, FRAMES):
-        turn = rotation_from_vector(np.array([0.0, 1.2 * share, 0.0]))
-        away = np.array([0.2 * share - 0.1, 0.05 * np.sin(3 * share), 0.3 * share])
-        poses.append(Alignment(start.rotation @ turn, start.translation + away, start.scale))
-    renderer = RaycastRenderer()
-    frames = (renderer.render(scene, camera, pose).composite() for pose in poses)
-    path = tmp_path_factory.mktemp("clip") / "chair.mp4"
-    assert write_movie(path, frames, fps=30) == FRAMES
-    return Clip(original, path, camera, poses)
 
 
 def test_a_video_is_a_work_list_of_its_frames(clip: Clip, tmp_path: Path) -> None:

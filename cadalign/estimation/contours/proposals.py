@@ -115,7 +115,7 @@ def _is_met(proposals: Sequence[_Proposal], contour: ViewContour) -> bool:
     """True if the best proposal is as likely as one whose whole outline meets the contour."""
     sigma = max(_MEETS_PX, _MEETS * contour.contour.size)
     cost = min((proposal.cost for proposal in proposals), default=np.inf)
-    return bool(cost < np.log(np.sqrt(2 * np.pi * np.e) * sigma))
+    return bool(cost < np.log(sigma) + 0.5 * (1.0 + np.log(2 * np.pi)))
 
 
 def _silhouetted(

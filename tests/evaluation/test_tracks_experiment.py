@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +21,6 @@ from cadalign.evaluation.experiments.tracks import METHODS, SPEC, TracksOptions
 from cadalign.evaluation.instances.tracks import SimulatedVideo, track_errors
 from cadalign.evaluation.methods.tracks import TrackEstimate
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.run import Progress
 
 SYNSET = "03001627"
 BASE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -87,20 +89,30 @@ def test_mistakes_of_the_detector_are_found(root: Path) -> None:
     assert table.rotation_error_deg.max() < 5
 
 
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from cadalign.evaluation.api import run
+from cadalign.evaluation.experiments.tracks import TracksOptions
+from cadalign.evaluation.runs.folder import RunFolder
+
+def kill(progress):
+    if progress.done:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+root, out = map(Path, sys.argv[1:])
+options = TracksOptions(root, frames=12, methods=("smooth", "online"))
+run(options, RunFolder(out), workers=0, dask=None, on_progress=kill)
+"""
+
+
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> None:
-    class Killed(Exception):
-        pass
-
-    def kill(progress: Progress) -> None:
-        if progress.done:
-            raise Killed
-
     options = TracksOptions(root, frames=12, methods=("smooth", "online"))
     whole, broken = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "broken")
     run(options, whole, workers=0, dask=None)
-    with pytest.raises(Killed):
-        run(options, broken, workers=0, dask=None, on_progress=kill)
+    command = [sys.executable, "-c", _KILLED, str(root), str(broken.path)]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     assert broken.parts.is_dir()
     assert not broken.results.exists()
     run(options, broken, workers=0, dask=None)

@@ -22,6 +22,7 @@ import tyro
 from benchmarks.accuracy import Coverage, Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
 from benchmarks.cameras import PhotoLenses, Scenes
+from benchmarks.clicks import Clicks, OutlineMethods
 from benchmarks.gradients import GradientErrors, NoiseOfDetector, TorchLayer
 from benchmarks.masks import MaskAlone, Masks
 from benchmarks.photo import Photos
@@ -51,6 +52,8 @@ SECTIONS: dict[str, type[Section]] = {
     "masks": Masks,
     "mask_alone": MaskAlone,
     "photo": Photos,
+    "clicks": Clicks,
+    "outlines": OutlineMethods,
     "align": Align,
     "retrieval": Retrieval,
     "evaluation": Evaluation,
@@ -64,7 +67,10 @@ SECTIONS: dict[str, type[Section]] = {
     "noise": NoiseOfDetector,
     "tracks": Tracks,
 }
-ON_REQUEST = ("mask_alone", "photo", "detections", "unseen_retrieval", "similar", "tracks")
+ON_REQUEST = (
+    *("mask_alone", "photo", "clicks", "outlines"),
+    *("detections", "unseen_retrieval", "similar", "tracks"),
+)
 STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2
 

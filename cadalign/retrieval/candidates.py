@@ -104,7 +104,7 @@ def gather_candidates(
 ) -> CandidateSet:
     """Gather the candidates of a query, without the models to ``exclude``."""
     threads = worker_count(workers)
-    chosen = _chosen_models(table, options.category, exclude)
+    chosen = chosen_models(table, options.category, exclude)
     _check_known(table, observed.query.ids, chosen, options.category)
     models, candidates, labelings = _candidates(table, chosen, options.symmetries)
     bounds, gains, shared = _bound_in_pieces(observed.query, candidates, threads)
@@ -150,10 +150,13 @@ def _bound_in_pieces(
     return np.concatenate(bounds), np.concatenate(gains), np.concatenate(shared)
 
 
-def _chosen_models(
+def chosen_models(
     table: ModelTable, category: str | None, exclude: Collection[ModelKey]
 ) -> IntArray:
-    """Select the rows of the models to compare, in the table's order."""
+    """Select the rows of the models to compare, in the table's order.
+
+    Raises InputError if there are none, or the category is unknown.
+    """
     if not len(table):
         raise InputError("the library is empty", where="library")
     rows = np.arange(len(table))

@@ -6,7 +6,7 @@ import logging
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy.typing as npt
 
@@ -24,6 +24,9 @@ from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable, read_a
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import make_matches, rank
 from cadalign.shapes.model import ShapeModel
+
+if TYPE_CHECKING:
+    from cadalign.retrieval.by_mask import OutlineStore
 
 logger = logging.getLogger("cadalign")
 
@@ -61,6 +64,7 @@ class Library:
 
     def __init__(self, table: ModelTable) -> None:
         self._table = table
+        self._outlines: OutlineStore | None = None
 
     @classmethod
     def from_models(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> Library:
@@ -164,9 +168,9 @@ class Library:
     @renamed(semantic_ids="ids")
     def retrieve(
         self,
-        points_2d: npt.ArrayLike,
-        ids: npt.ArrayLike,
-        camera: Camera,
+        points_2d: npt.ArrayLike | None = None,
+        ids: npt.ArrayLike | None = None,
+        camera: Camera | None = None,
         *,
         shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
         focal_prior: FocalPrior | None = None,
@@ -184,11 +188,16 @@ class Library:
         exhaustive search, and up to 768 more models are searched to fill the list. Ties are broken
         by category and id.
 
+        A mask alone, ``retrieve(mask=mask, camera=camera)``, ranks models with meshes by their
+        silhouettes, whatever pose and stretch: the 8 whose outlines resemble it most are aligned
+        with it, and compared by the likelihood of its contour; see `cadalign.retrieval.by_mask`.
+        The first query renders the models' outlines, which the library keeps while it is open.
+
         Parameters
         ----------
         points_2d : (n, 2) float
-            Keypoints in the image [px]; integers are pixel centres.
-        semantic_ids : (n,) int
+            Keypoints in the image [px]; integers are pixel centres. None for a mask alone.
+        ids : (n,) int
             Semantic ids of the keypoints, without repetition. Ids differ by category: without
             ``category`` each model reads them in its own category's sense.
         camera : Camera
@@ -228,7 +237,7 @@ class Library:
         InputError
             If the library is empty, shapes don't match, a value is NaN or infinite, a semantic id
             is unknown or occurs twice, an option is invalid, or the focal length is unknown without
-            ``shape``.
+            ``shape``; without keypoints, if there is no mask, or no model has a mesh.
         DegenerateError
             If no model shares at least 4 keypoints with the image, or none can be aligned.
         """
@@ -236,6 +245,17 @@ class Library:
             chosen = RetrievalOptions(**options)
         except TypeError as error:
             raise InputError(f"unknown option ({error})", where="options") from None
+        if camera is None:
+            raise InputError("no camera is given", where="camera", fix="give a cadalign.Camera")
+        if points_2d is None or ids is None:
+            others = (points_2d, ids, shape, image)
+            if mask is None or any(each is not None for each in others):
+                raise InputError(
+                    "keypoints are missing",
+                    where="points_2d" if points_2d is None else "ids",
+                    fix="give keypoints with their ids, or mask= and camera= alone",
+                )
+            return self._retrieve_by_mask(mask, camera, chosen, exclude, workers)
         if shape is None:
             if isinstance(camera, Camera) and not camera.focal_known:
                 raise InputError(
@@ -269,3 +289,27 @@ class Library:
         from cadalign.retrieval.silhouettes import mask_of, rerank
 
         return rerank(matches, mask_of(mask, image, matches, camera), camera)
+
+    def _retrieve_by_mask(
+        self,
+        mask: npt.ArrayLike,
+        camera: Camera,
+        options: RetrievalOptions,
+        exclude: Collection[ModelKey],
+        workers: int,
+    ) -> list[Match]:
+        from cadalign.retrieval.by_mask import OutlineStore, rank_by_mask
+        from cadalign.retrieval.silhouettes import mask_of
+
+        if self._outlines is None:
+            self._outlines = OutlineStore(self._table)
+        inside = mask_of(mask, None, (), camera)
+        return rank_by_mask(
+            self._table,
+            self._outlines,
+            inside,
+            camera,
+            options,
+            exclude=exclude,
+            workers=workers,
+        )

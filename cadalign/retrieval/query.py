@@ -61,7 +61,8 @@ class ObservationRetrieval:
     ) -> list[Match]:
         """Rank the library's models by an observation, which messages call ``where``.
 
-        ``mask`` and ``workers`` are as for `Library.retrieve`.
+        ``mask`` and ``workers`` are as for `Library.retrieve`. An observation without keypoints is
+        ranked by its mask alone.
 
         Raises
         ------
@@ -71,6 +72,10 @@ class ObservationRetrieval:
         """
         library, shape = self.opened()
         camera, ids = seen.camera, _semantic_ids(seen, where)
+        if not len(ids):
+            if mask is None and seen.evidence.mask is not None:
+                mask = read_mask(seen.evidence.mask, camera)
+            return library.retrieve(mask=mask, camera=camera, workers=workers, **vars(self.ranking))
         if shape is None and not camera.focal_known:
             raise InputError(
                 "the focal length is unknown, without which no model's pose is searched",
@@ -138,6 +143,8 @@ def read_query(path: Path) -> Observation:
 
 
 def _semantic_ids(query: Observation, where: str) -> IntArray:
+    if not len(query.points_2d):
+        return np.empty(0, dtype=np.int64)
     if query.ids is None:
         fix = "give each the id of the library's models for it"
         with in_file(where):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -109,14 +110,16 @@ class PhotoCase:
     kind: str = ""
     symmetry: Symmetry | None = None
 
-    def clicked(self, rng: np.random.Generator, *, stretched: bool) -> PhotoClicks:
+    def clicked(
+        self, rng: np.random.Generator, *, stretched: bool, count: int = _CLICKS
+    ) -> PhotoClicks:
         """Rough clicks on points spread over the visible surface."""
         scale = np.exp(rng.normal(0, _STRETCH_SIGMA, 3) * [0, 1, 1]) if stretched else np.ones(3)
         truth = Alignment(self.truth.rotation, self.truth.translation, scale)
         mesh = Mesh(self.mesh.vertices / scale, self.mesh.faces)
         scene = Scene(mesh)
         geometry = cast_geometry(scene, self.camera, truth)
-        places = _spread(geometry.mask, rng)
+        places = _spread(geometry.mask, rng, count)
         rays = self.camera.normalize(places.astype(float))
         depths = geometry.depth[places[:, 1], places[:, 0]]
         seen = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
@@ -144,8 +147,17 @@ class PhotoClicks:
 
     def aligned(self, *, with_photo: bool) -> Result:
         """The estimate by the clicks alone, or with the photo."""
-        image = self.case.pixels if with_photo else None
-        return align(self.model, View(self.case.camera, self.pixels, sigma=self.sigma, image=image))
+        return self.aligned_with(image=self.case.pixels if with_photo else None)
+
+    def aligned_with(self, **evidence: Any) -> Result:
+        """The estimate by the clicks, and further evidence of the view."""
+        return align(self.model, View(self.case.camera, self.pixels, sigma=self.sigma, **evidence))
+
+    def first(self, count: int) -> PhotoClicks:
+        """The first clicks."""
+        assert self.model.points_3d is not None
+        model = replace(self.model, points_3d=np.asarray(self.model.points_3d)[:count])
+        return replace(self, model=model, pixels=self.pixels[:count])
 
     def outcome(self) -> PhotoOutcome:
         """Both estimates compared with the truth."""
@@ -189,14 +201,14 @@ class PhotoClicks:
         return first, second
 
 
-def _spread(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Pixels (n, 2) inside a mask, far from each other."""
+def _spread(mask: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
+    """Pixels (count, 2) inside a mask, each far from those before it."""
     inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8))
-    rows, columns = np.nonzero(inside if inside.sum() > 10 * _CLICKS else mask)
+    rows, columns = np.nonzero(inside if inside.sum() > 10 * count else mask)
     places = np.column_stack([columns, rows])
     some = places[rng.permutation(len(places))[:400]]
     chosen = [some[0]]
-    for _ in range(_CLICKS - 1):
+    for _ in range(count - 1):
         gaps = np.linalg.norm(some[:, None] - np.array(chosen), axis=2).min(axis=1)
         # Among the farthest: people click on what is marked, not on the extremes alone.
         likely = np.argsort(-gaps)[: max(len(some) // 50, 1)]

@@ -30,6 +30,8 @@ _CELL_VARIANCE = 1e-3  # that every silhouette has at least
 _CUT_EVERY = 2  # directions, of which the silhouettes are cut
 _CUT_SHARES = (0.15, 0.3)  # of the area that lies beyond a line
 _CUT_ANGLES = 12
+_OUTLINE_CELLS = 40
+_OUTLINE_EVERY = 2  # directions, and rings and turns
 
 
 class Whitened(NamedTuple):
@@ -60,18 +62,19 @@ def whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
 
 
 def overlaps(views: Whitened, query: Whitened) -> FloatArray:
-    """Intersections over unions (2, N, `_TURNS`) of silhouettes and one that is turned.
+    """Intersections over unions (2, N, turns) of silhouettes and one that is turned.
 
     The query's mirror image comes second.
     """
-    weights = np.repeat(radii(), _TURNS)
     rings = query.rings[0].astype(np.float32) / 255
-    around = (np.arange(_TURNS)[:, None] + np.arange(_TURNS)) % _TURNS
+    count, turns = rings.shape
+    weights = np.repeat(_radii(count), turns)
+    around = (np.arange(turns)[:, None] + np.arange(turns)) % turns
     mirrored = np.roll(rings[:, ::-1], 1, axis=1)
-    turned = [each[:, around].transpose(0, 2, 1).reshape(-1, _TURNS) for each in (rings, mirrored)]
+    turned = [each[:, around].transpose(0, 2, 1).reshape(-1, turns) for each in (rings, mirrored)]
     weighted = np.hstack(turned) * weights[:, None].astype(np.float32)
     flat = views.rings.reshape(len(views.rings), -1).astype(np.float32) / 255
-    common = (flat @ weighted).reshape(len(flat), 2, _TURNS).transpose(1, 0, 2)
+    common = (flat @ weighted).reshape(len(flat), 2, turns).transpose(1, 0, 2)
     areas = flat @ weights.astype(np.float32)
     return np.asarray(common / (areas[:, None] + weighted[:, 0].sum() - common), dtype=np.float64)
 
@@ -84,9 +87,8 @@ def turn_of(number: int, *, mirrored: bool) -> FloatArray:
     return np.diag([1.0, -1.0]) @ turn if mirrored else turn
 
 
-def radii() -> FloatArray:
-    """Radii of the rings [standard deviations]."""
-    return np.asarray(_OUTERMOST * (np.arange(_RINGS) + 0.5) / _RINGS)
+def _radii(count: int) -> FloatArray:
+    return np.asarray(_OUTERMOST * (np.arange(count) + 0.5) / count)
 
 
 @lru_cache(maxsize=16)
@@ -101,8 +103,24 @@ def cut_atlas_of(mesh: Mesh) -> Atlas:
     return _atlas(mesh, _CUT_EVERY, _cuts)
 
 
+def outline_of(mesh: Mesh) -> Whitened:
+    """Coarse silhouettes of a mesh, to be compared with many others' by `coarse` ones."""
+    return coarse(_atlas(mesh, _OUTLINE_EVERY, _uncut, cells=_OUTLINE_CELLS).views)
+
+
+def coarse(views: Whitened) -> Whitened:
+    """Silhouettes with fewer rings and turns: means of neighbours."""
+    count, rings, turns = len(views.rings), _RINGS // _OUTLINE_EVERY, _TURNS // _OUTLINE_EVERY
+    parts = views.rings.reshape(count, rings, _OUTLINE_EVERY, turns, _OUTLINE_EVERY)
+    return views._replace(rings=np.rint(parts.mean(axis=(2, 4))).astype(np.uint8))
+
+
 def _atlas(
-    mesh: Mesh, every: int, parts_of: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+    mesh: Mesh,
+    every: int,
+    parts_of: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
+    *,
+    cells: int = _CELLS,
 ) -> Atlas:
     """Silhouettes along directions, and the parts of each by their moments and lines."""
     caster, corners = caster_of(mesh), corners_of(mesh)
@@ -113,13 +131,13 @@ def _atlas(
         base = np.linalg.svd(direction[None])[2][1:]
         across = (corners - middle) @ base.T
         low, high = across.min(axis=0), across.max(axis=0)
-        cell = float((high - low).max()) / _CELLS or 1.0
-        places = low[:, None] + cell * np.arange(_CELLS + 1)
+        cell = float((high - low).max()) / cells or 1.0
+        places = low[:, None] + cell * np.arange(cells + 1)
         grid = np.stack(np.meshgrid(places[0], places[1]), axis=-1).reshape(-1, 2)
         # Rays from afar: their origin is one point, so that they are almost parallel.
         eye = middle - 60 * reach * direction
         rays = (grid / (60 * reach)) @ base + direction
-        image = caster.covered(eye, rays).reshape(_CELLS + 1, _CELLS + 1).astype(np.float32)
+        image = caster.covered(eye, rays).reshape(cells + 1, cells + 1).astype(np.float32)
         points = _cells(image)
         if len(points) < _LEAST_CELLS:
             continue
@@ -187,7 +205,7 @@ def _sampled(
     spread = (axes * np.sqrt(np.maximum(variances, _CELL_VARIANCE))[:, None]) @ axes.mT
     angles = 2 * np.pi * np.arange(_TURNS) / _TURNS
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    rays = (radii()[:, None, None] * circle).reshape(-1, 2)
+    rays = (_radii(_RINGS)[:, None, None] * circle).reshape(-1, 2)
     places = mean[:, None] + rays @ spread
     padded = np.asarray(np.pad(image, 1), dtype=np.float32)
     covered = sampled(padded, places.reshape(-1, 2) + 1).reshape(len(mean), -1)

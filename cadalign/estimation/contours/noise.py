@@ -37,7 +37,28 @@ _EDGE = 30.0  # samples of an edge
 _OF_PIXELS = 3.0  # samples that count as one where pixels alone displace them
 _FIRST_CORRELATION = 10.0  # samples, of a surface that is only similar
 _LEAST_INFORMATION = 1e-12  # about an unknown, relative
+_LEAST_OWN = 0.3  # [px], standard deviation of the part that is the model's
+_FIRST_SHARE, _LARGEST_SHARE = 0.8, 0.99  # of a contour, that is the model's
+_ROUNDS = 30
 _ALIKE = 0.2  # change of a variance's logarithm
+
+
+def cost_of_contour(residuals: FloatArray, reach: float) -> float:
+    """The mean of -log density of a contour's distances (S,) from a rim, at most ``reach`` [px].
+
+    Part of the contour is an occluder's, and lies anywhere within the reach; the rest is Gaussian.
+    Its share and standard deviation are the likeliest, by expectation and maximisation (Dempster,
+    Laird and Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977).
+    """
+    squares, elsewhere = residuals**2, 1 / (2 * reach)
+    share, variance = _FIRST_SHARE, max(float(np.median(squares)), _LEAST_OWN**2)
+    for _ in range(_ROUNDS):
+        own = share * np.exp(-squares / (2 * variance)) / np.sqrt(2 * np.pi * variance)
+        density = own + (1 - share) * elsewhere
+        belongs = own / density
+        share = min(float(belongs.mean()), _LARGEST_SHARE)
+        variance = max(float(belongs @ squares / max(belongs.sum(), 1e-9)), _LEAST_OWN**2)
+    return float(-np.log(density).mean())
 
 
 class Noise(NamedTuple):

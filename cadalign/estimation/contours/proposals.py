@@ -12,6 +12,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.descent import Masked, approached
+from cadalign.estimation.contours.noise import cost_of_contour
 from cadalign.estimation.contours.silhouettes import Resembling, differ, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import ViewContour, contour_view
@@ -32,9 +33,6 @@ _MEETS_PX = 0.5
 _FAR = 0.01  # misfit, relative to the mask's size, of a model that may be another
 _FAR_PX = 2.0
 _MOST_PROPOSALS = 5
-_LEAST_SIGMA = 0.3  # [px]
-_FIRST_SHARE, _LARGEST_SHARE = 0.8, 0.99  # of a contour that is the model's
-_ROUNDS = 30
 _CLOSE = 1.1  # cost above the least, of a contour's sample, at which a proposal is still one
 _WHERE = "views[0].mask"
 
@@ -115,7 +113,7 @@ def _is_met(proposals: Sequence[_Proposal], contour: ViewContour) -> bool:
     """True if the best proposal is as likely as one whose whole outline meets the contour."""
     sigma = max(_MEETS_PX, _MEETS * contour.contour.size)
     cost = min((proposal.cost for proposal in proposals), default=np.inf)
-    return bool(cost < np.log(sigma) + 0.5 * (1.0 + np.log(2 * np.pi)))
+    return bool(cost < np.log(sigma) + (1 + np.log(2 * np.pi)) / 2)
 
 
 def _silhouetted(
@@ -145,26 +143,8 @@ def _approached(
     found = approached(masked, best.state)
     if found is None:
         return None, iterations
-    misfit, cost = float(found.residuals.mean()), _cost_of(found.residuals, found.reach)
+    misfit, cost = float(found.residuals.mean()), cost_of_contour(found.residuals, found.reach)
     return _Proposal(best._replace(state=found.state), misfit, cost), iterations
-
-
-def _cost_of(residuals: FloatArray, reach: float) -> float:
-    """The mean of -log density of a contour's distances (S,) from a rim, at most ``reach`` [px].
-
-    Part of the contour is an occluder's, and lies anywhere within the reach; the rest is Gaussian.
-    Its share and standard deviation are the likeliest, by expectation and maximisation (Dempster,
-    Laird and Rubin, "Maximum likelihood from incomplete data via the EM algorithm", 1977).
-    """
-    squares, elsewhere = residuals**2, 1 / (2 * reach)
-    share, variance = _FIRST_SHARE, max(float(np.median(squares)), _LEAST_SIGMA**2)
-    for _ in range(_ROUNDS):
-        own = share * np.exp(-squares / (2 * variance)) / np.sqrt(2 * np.pi * variance)
-        density = own + (1 - share) * elsewhere
-        belongs = own / density
-        share = min(float(belongs.mean()), _LARGEST_SHARE)
-        variance = max(float(belongs @ squares / max(belongs.sum(), 1e-9)), _LEAST_SIGMA**2)
-    return float(-np.log(density).mean())
 
 
 def _meshes_of(model: Model | ShapeModel) -> list[tuple[Mesh, Surface]]:

@@ -22,6 +22,7 @@ from cadalign.estimation.contours.atlas import (
     Atlas,
     Whitened,
     atlas_of,
+    coarse,
     cut_atlas_of,
     overlaps,
     turn_of,
@@ -79,6 +80,12 @@ def resembling_poses(
     return [
         each._replace(alignment=_turned(each.alignment, view.camera_from_facing)) for each in kept
     ]
+
+
+def outline_of_mask(mask: FloatArray | BoolArray, camera: Camera) -> Whitened:
+    """A mask (h, w) in the form of the outlines of `cadalign.estimation.contours.atlas`."""
+    view = _facing(mask, camera)
+    return coarse(whitened(view.image, view.corner, view.cell))
 
 
 class _Facing(NamedTuple):

@@ -1,0 +1,101 @@
+"""Ranking by a mask alone: the object's own model, the table, the command, refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign import Alignment, Camera, Library
+from cadalign.cli import main
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DegenerateError, InputError
+from cadalign.io.images import write_image
+from cadalign.metrics import rotation_error
+from cadalign.render import Scene, cast_geometry, look_at
+from cadalign.retrieval import LibraryModel
+
+pytestmark = pytest.mark.slow
+
+CAMERA = Camera(320, 240, 467, 467, 159.5, 119.5)
+
+
+@pytest.fixture(scope="module")
+def library(sample_root: Path) -> Library:
+    dataset = KeypointNet(sample_root)
+    kept = [key for key in sorted(dataset.ids()) if key[1].endswith(("_000", "_001"))]
+    return Library.from_models([dataset[key] for key in kept if key[0] in ("car", "chair")])
+
+
+def masked(library: Library, key: tuple[str, str]) -> tuple[np.ndarray, Alignment]:
+    """The mask of a stretched model, and its alignment."""
+    pose = look_at(azimuth=40.0, elevation=20.0, distance=2.2)
+    truth = Alignment(pose.rotation, pose.translation, np.array([1.0, 1.2, 0.85]))
+    return cast_geometry(Scene(library[key].load_mesh()), CAMERA, truth).mask, truth
+
+
+@pytest.mark.parametrize("category", ["chair", "car"])
+def test_the_stretched_model_is_found(library: Library, category: str) -> None:
+    key = next(key for key in library.keys if key[0] == category)
+    mask, truth = masked(library, key)
+    matches = library.retrieve(mask=mask, camera=CAMERA)
+    assert (matches[0].category, matches[0].model_id) == key
+    assert rotation_error(est=matches[0].alignment, gt=truth) < 2
+    assert matches[0].silhouette_iou is not None
+    assert matches[0].silhouette_iou > 0.98
+    assert matches[0].shared == 0
+    scores = [match.score for match in matches]
+    assert scores == sorted(scores, reverse=True)
+    assert sum(scores) == pytest.approx(1)
+    again = library.retrieve(mask=mask, camera=CAMERA, exclude=[key], top=2)
+    assert len(again) <= 2
+    assert key not in [(match.category, match.model_id) for match in again]
+
+
+def test_an_observation_of_a_mask_is_ranked_by_it(
+    library: Library, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key = next(key for key in library.keys if key[0] == "chair")
+    mask, _ = masked(library, key)
+    write_image(tmp_path / "mask.png", np.where(mask, 255, 0).astype(np.uint8))
+    library.save(tmp_path / "models.cadalign")
+    view = {"camera": CAMERA.to_dict(), "mask": "mask.png"}
+    (tmp_path / "seen.json").write_text(json.dumps({"views": [view]}))
+    command = ["retrieve", str(tmp_path / "seen.json"), "--library"]
+    assert main([*command, str(tmp_path / "models.cadalign"), "--json"]) == 0
+    first = json.loads(capsys.readouterr().out)[0]
+    assert (first["category"], first["model_id"]) == key
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mask": None}, "points_2d: keypoints are missing; give keypoints with their ids, or"),
+        ({"points_2d": np.zeros((4, 2))}, "ids: keypoints are missing"),
+        ({"camera": None}, "camera: no camera is given; give a cadalign.Camera"),
+        (
+            {"camera": Camera.without_focal(320, 240)},
+            "camera: a mask alone does not tell the focal length; give a calibrated camera, or",
+        ),
+        ({"mask": np.zeros((240, 320), dtype=bool)}, "mask: "),
+    ],
+)
+def test_refusals(library: Library, change: dict[str, Any], message: str) -> None:
+    key = next(key for key in library.keys if key[0] == "chair")
+    given: dict[str, Any] = {"mask": masked(library, key)[0], "camera": CAMERA} | change
+    with pytest.raises((InputError, DegenerateError)) as refused:
+        library.retrieve(**given)
+    assert str(refused.value).startswith(message)
+
+
+def test_models_without_meshes_cannot_be_ranked_by_a_mask(library: Library) -> None:
+    key = next(key for key in library.keys if key[0] == "chair")
+    mask, _ = masked(library, key)
+    xyz = np.random.default_rng(0).uniform(-0.3, 0.3, (6, 3))
+    bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
+    bare = Library.from_models([LibraryModel("box", "a", xyz, np.arange(6), bounds)])
+    with pytest.raises(InputError, match="library: no model has a mesh, without which a mask"):
+        bare.retrieve(mask=mask, camera=CAMERA)

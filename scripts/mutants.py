@@ -3,9 +3,14 @@
     python scripts/mutants.py --count 200              # what `make mutants` runs
     python scripts/mutants.py --rooms geometry io      # of two rooms
     python scripts/mutants.py --whole                  # by the whole suite
+    python scripts/mutants.py --coverage .coverage     # by the tests that run the changed line
 
 Each mutant swaps an operator, a comparison, a condition or a number at one place of a copy of the
 checkout. Survivors are printed as differences: each wants a test, or changes nothing that matters.
+
+`pytest --cov --cov-context=test` writes the data for ``--coverage``. A test that does not run a
+line cannot notice its change, so this asks the whole suite at a hundredth of its time. Lines of
+compiled kernels are not in the data: their mutants are tested by the room, long tests included.
 """
 
 from __future__ import annotations
@@ -21,6 +26,8 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
+from itertools import zip_longest
 from pathlib import Path
 
 import tyro
@@ -56,6 +63,10 @@ class Arguments:
     """Rooms to mutate, such as geometry; by default all."""
     whole: bool = False
     """Run the whole suite on each mutant rather than the tests of its room."""
+    coverage: Path | None = None
+    """Data of pytest-cov with a context per test: run the tests that run the changed line."""
+    most: int = 150
+    """With coverage data, the number of tests per mutant: at first those of the room."""
     timeout: float = 900.0
     """Seconds after which a mutant counts as caught: it hangs."""
 
@@ -119,7 +130,11 @@ def places_of(path: Path) -> Iterator[tuple[Path, int]]:
 
 
 def unmutated(tree: ast.AST) -> Iterator[ast.AST]:
-    """Nodes inside annotations, texts and conditions about types, which no test can notice."""
+    """Nodes that no test should notice: annotations, texts, types, and settings.
+
+    Settings are the flags of decorators, `zip(strict=)`, and the numbers that modules name at their
+    top: thresholds chosen by judgement, which a test could only repeat.
+    """
     for node in ast.walk(tree):
         parts: list[ast.AST | None] = []
         if isinstance(node, ast.JoinedStr):
@@ -127,7 +142,14 @@ def unmutated(tree: ast.AST) -> Iterator[ast.AST]:
         elif isinstance(node, ast.arg | ast.AnnAssign):
             parts = [node.annotation]
         elif isinstance(node, ast.FunctionDef):
-            parts = [node.returns]
+            parts = [node.returns, *node.decorator_list]
+        elif isinstance(node, ast.ClassDef):
+            parts = list(node.decorator_list)
+        elif isinstance(node, ast.keyword) and node.arg == "strict":
+            parts = [node.value]
+        elif isinstance(node, ast.Module):
+            named = [each for each in node.body if isinstance(each, ast.Assign | ast.AnnAssign)]
+            parts = [each.value for each in named]
         elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
             parts = [node]
         for part in parts:
@@ -184,15 +206,12 @@ def copy_to(checkout: Path) -> None:
 def caught(checkout: Path, mutant: Mutant, arguments: Arguments) -> bool:
     """True if a test fails on the mutant; the copy is as before afterwards."""
     target = checkout / mutant.path
-    tests = checkout / "tests" / room_of(mutant.path)
-    chosen = ["tests"] if arguments.whole or not tests.is_dir() else [f"tests/{tests.name}"]
-    marks = "not timing" if arguments.whole else "not long and not timing"
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", marks]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
     environment = {**os.environ, "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1"}
     target.write_text(mutant.text, encoding="utf-8")
     try:
         done = subprocess.run(
-            [*command, *chosen],
+            [*command, *tests_of(mutant, arguments)],
             cwd=checkout,
             env=environment,
             capture_output=True,
@@ -204,6 +223,46 @@ def caught(checkout: Path, mutant: Mutant, arguments: Arguments) -> bool:
     finally:
         shutil.copy2(ROOT / mutant.path, target)
     return done.returncode != 0
+
+
+def tests_of(mutant: Mutant, arguments: Arguments) -> list[str]:
+    """Arguments of pytest that choose the tests of a mutant."""
+    room = f"tests/{room_of(mutant.path)}"
+    if arguments.coverage is not None:
+        covering = covering_tests(arguments.coverage).get((str(mutant.path), mutant.line), [])
+        if covering:
+            return ["-m", "not timing", *in_turns(covering, f"{room}/")[: arguments.most]]
+    is_known = (ROOT / room).is_dir() and room != "tests/"
+    chosen = "tests" if arguments.whole or not is_known else room
+    is_long = arguments.whole or arguments.coverage is not None
+    return ["-m", "not timing" if is_long else "not long and not timing", chosen]
+
+
+def in_turns(names: list[str], room: str) -> list[str]:
+    """Tests taken from one file after the other, those of the room first."""
+    files: dict[str, list[str]] = {}
+    for name in sorted(set(names), key=lambda name: (not name.startswith(room), name)):
+        files.setdefault(name.split("::")[0], []).append(name)
+    rounds = zip_longest(*files.values())
+    return [name for each in rounds for name in each if name is not None]
+
+
+@cache
+def covering_tests(data: Path) -> dict[tuple[str, int], list[str]]:
+    """Tests by the file and line that they run, from the data of a run with coverage."""
+    from coverage import CoverageData  # only with --coverage
+
+    found = CoverageData(str(data))
+    found.read()
+    tests: dict[tuple[str, int], list[str]] = {}
+    for file in found.measured_files():
+        parts = Path(file).parts
+        inside = next((n for n, part in enumerate(parts) if n and part in FOLDERS), 0)
+        path = str(Path(*parts[inside:]))
+        for line, contexts in found.contexts_by_lineno(file).items():
+            names = {name.split("|")[0] for name in contexts if name}
+            tests.setdefault((path, line), []).extend(sorted(names))
+    return tests
 
 
 def difference(mutant: Mutant) -> str:

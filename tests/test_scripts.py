@@ -71,6 +71,26 @@ def test_mutants_are_programs_that_differ(monkeypatch: pytest.MonkeyPatch) -> No
         assert mutants.difference(mutant).count("\n+") >= 1
 
 
+def test_mutants_leave_settings_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    mutants = importlib.import_module("mutants")
+    monkeypatch.setattr(mutants, "ROOT", tmp_path)
+    settings = "_MOST = 3\n@dataclass(frozen=True)\nclass A:\n    x: int\n"
+    (tmp_path / "a.py").write_text(settings + "def f(x):\n    return zip(x, strict=True), x + 1\n")
+    places = list(mutants.places_of(Path("a.py")))
+    found = {mutants.mutated(*place).text.splitlines()[-1].strip() for place in places}
+    changes = {"zip(x, strict=True), (x - 1)", "zip(x, strict=True), x + (2)"}
+    assert found == {f"return {change}" for change in changes}
+
+
+def test_tests_of_a_mutant_are_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    mutants = importlib.import_module("mutants")
+    names = ["tests/io/b.py::q", "tests/io/b.py::p", "tests/cli/a.py::r", "tests/io/c.py::s"]
+    chosen = mutants.in_turns(names, "tests/io/")
+    assert [name[-1] for name in chosen] == ["p", "s", "r", "q"]
+
+
 class TestComparingRatios:
     """`bench.py` with a section whose one ratio is 1.19."""
 

@@ -131,3 +131,10 @@ def test_ten_thousand_records_take_little_memory_and_time(root):
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 3 * size + 20e6
+
+
+def test_a_keypoint_at_the_border_is_marked(root):
+    marked = [[[0, 20], [-1, -1], [30, 0.5]], [[0, 22], [-1, -1], [-1, -1]]]
+    write_json(root / "pix3d.json", [entry(**{"2d_keypoints": marked})])
+    (shown,) = Pix3D(root)[0].objects
+    np.testing.assert_array_equal(shown.keypoints.points_2d, [[-0.5, 20.5], [29.5, 0.0]])

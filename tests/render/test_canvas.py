@@ -1,0 +1,36 @@
+"""The canvas of pictures: legends and dashes at their places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cadalign.render.drawing.canvas import Canvas, LegendEntry, _dashes
+
+RED = (255, 0, 0)
+NOWHERE = np.zeros((0, 2))
+
+
+def test_texts_of_a_legend_stand_beside_their_samples() -> None:
+    canvas = Canvas(np.zeros((480, 640, 3), np.uint8))
+    canvas.legend([LegendEntry("found", RED)], keep_clear=NOWHERE)
+    light = (canvas.image.min(axis=2) > 180).any(axis=0)
+    red = (canvas.image[:, :, 0].astype(int) - canvas.image[:, :, 1] > 100).any(axis=0)
+    assert np.flatnonzero(light).min() > np.flatnonzero(red).max()
+
+
+@pytest.mark.parametrize("size", [(40, 640), (640, 40)])
+def test_a_legend_that_has_no_room_is_left_out(size: tuple[int, int]) -> None:
+    before = np.full((*size, 3), 90, np.uint8)
+    canvas = Canvas(before)
+    canvas.legend([LegendEntry(f"line {n}", RED) for n in range(6)], keep_clear=NOWHERE)
+    np.testing.assert_array_equal(canvas.finished(), before)
+
+
+def test_dashes_are_spread_over_a_line_and_end_with_it() -> None:
+    parts = _dashes(np.array([[10.0, 5.0], [60.0, 5.0], [110.0, 5.0]]), 6.0, 4.0)
+    begins, ends = [part[0, 0] for part in parts], [part[-1, 0] for part in parts]
+    assert len(parts) == 10
+    assert (begins[0], ends[-1]) == pytest.approx((10.0, 110.0))
+    np.testing.assert_allclose(np.subtract(begins[1:], ends[:-1]), 4.0)
+    np.testing.assert_allclose(np.diff(begins), 10.4)

@@ -22,8 +22,14 @@ if TYPE_CHECKING:
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
     from cadalign.render.raycast.shading import Studio
     from cadalign.render.scene import Scene
-    from cadalign.render.views.viewpoints import Viewpoint, frame_object, look_at, sample_view
-    from cadalign.render.views.visibility import silhouette_iou, visible_keypoints
+    from cadalign.render.viewpoints import (
+        Viewpoint,
+        frame_object,
+        look_at,
+        sample_view,
+        silhouette_iou,
+        visible_keypoints,
+    )
 
 __all__ = [
     "Angles",

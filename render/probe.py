@@ -27,7 +27,7 @@ from cadalign.render.scene import Scene
 
 RENDERERS: dict[str, str] = {
     "pyrender": "cadalign.render.opengl.renderer:PyrenderRenderer",
-    "open3d": "cadalign.render.open3d.renderer:Open3DRenderer",
+    "open3d": "cadalign.render.raycast.renderer:Open3DRenderer",
     "raycast": "cadalign.render.raycast.renderer:RaycastRenderer",
 }
 """Module and class of each renderer."""

@@ -12,10 +12,14 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
-from cadalign.render.raycast.coincident import coincident_faces
-from cadalign.render.raycast.normals import corner_normals
-from cadalign.render.raycast.surface import SurfaceColors
+from cadalign.geometry.raycaster import (
+    EmbreeEngine,
+    FaceArray,
+    RayCaster,
+    SingleArray,
+    face_normals,
+)
+from cadalign.render.raycast.surface import SurfaceColors, coincident_faces, corner_normals
 
 T = TypeVar("T")
 
@@ -74,8 +78,6 @@ class Scene:
     @cached_property
     def open3d_caster(self) -> RayCaster:
         """The same built by Open3D, which must be importable."""
-        from cadalign.render.open3d.engine import Open3DEngine
-
         return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
     def derived(self, make: Callable[[Scene], T]) -> T:
@@ -145,3 +147,35 @@ class Scene:
     def surface(self) -> SurfaceColors:
         """The colours of the mesh."""
         return SurfaceColors(self.mesh)
+
+
+class Open3DEngine:
+    """Embree by way of Open3D, which casts with all cores by itself; see `EmbreeEngine`."""
+
+    def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
+        import open3d
+
+        self._tensor = open3d.core.Tensor
+        self._no_hit = np.uint32(open3d.t.geometry.RaycastingScene.INVALID_ID)
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices)),
+            self._tensor(np.ascontiguousarray(faces.astype(np.uint32))),
+        )
+        # The hierarchy is built on the first query; let no two threads make that one at once.
+        self.first_faces(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """See `RayEngine`."""
+        found = self._scene.cast_rays(self._rays(origins, directions))["primitive_ids"].numpy()
+        return np.asarray(np.where(found == self._no_hit, -1, found.astype(np.int32)), np.int32)
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """See `RayEngine`."""
+        rays = self._rays(origins, directions)
+        return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=reach).numpy(), bool)
+
+    def _rays(self, origins: SingleArray, directions: SingleArray) -> Any:
+        return self._tensor(np.concatenate([origins, directions], axis=1))

@@ -18,7 +18,7 @@ from cadalign.datasets.detections.coco import CocoObject, coco_document
 from cadalign.errors import InputError
 from cadalign.estimation.exporting import object_of
 from cadalign.export import AlignedObject, export_object
-from cadalign.export.photo_sets import AnnotatedPhoto, write_photo_set
+from cadalign.export.aligned_object import AnnotatedPhoto, write_photo_set
 from cadalign.io.files import write_text
 
 _MARKED = 2  # COCO's flag of a keypoint that is labelled and visible

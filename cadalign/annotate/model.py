@@ -21,9 +21,9 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray
 from cadalign.geometry.simplify import cluster, simplify
 from cadalign.render.drawing.color import bytes_from_linear
-from cadalign.render.raycast.coincident import coincident_faces
+from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene
-from cadalign.render.views.visibility import visible_keypoints
+from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.warp import warp_mesh
 
 MOST_FACES = 150_000  # that are displayed

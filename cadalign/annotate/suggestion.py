@@ -23,7 +23,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import rescaled_pixels, resized_camera
 from cadalign.geometry.projection import projected_covariances
 from cadalign.render.raycast.renderer import cast_geometry
-from cadalign.render.views.visibility import visible_keypoints
+from cadalign.render.viewpoints import visible_keypoints
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
 _BENEATH = 0.02  # depth of visible keypoints beneath the warped surface [diagonals]

@@ -23,7 +23,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.projection import projected_covariances
 from cadalign.io.images import write_image
 from cadalign.io.video import Video, frame_numbers
-from cadalign.render.views.visibility import visible_keypoints
+from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:

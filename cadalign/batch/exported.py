@@ -21,7 +21,7 @@ from cadalign.export import AlignedObject
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.result_overlay import mesh_of
+from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
 _FOLDER_ENDING = "_fit"

@@ -22,10 +22,9 @@ from cadalign.errors import CadalignError, DataError, InputError, RenderError, q
 from cadalign.estimation.result import Result
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_groups
-from cadalign.export.aligned_object import AlignedObject, ExportView, photos_of
+from cadalign.export.aligned_object import FORMS, AlignedObject, ExportView, photos_of
 from cadalign.export.camera_files import write_nerf
 from cadalign.export.formats import export_object, format_of
-from cadalign.export.photo_sets import FORMS
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import parse_json
 from cadalign.io.files import write_json, writing

@@ -25,8 +25,8 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.images import ByteImage, read_image
 from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
+from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.render.drawing.overlay import draw_overlay
-from cadalign.render.drawing.result_overlay import mesh_of
 
 NAMING = ("row", "source", "image", "object", "model", "match_category", "match_id")
 """Columns that `page_names` looks at; only a retrieval has the last ones."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from cadalign.batch.tracks import FoundTrack
 from cadalign.errors import InputError
-from cadalign.export.moving_glb import MovingObject
+from cadalign.export.glb import MovingObject
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh

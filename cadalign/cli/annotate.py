@@ -155,7 +155,7 @@ def _reach(host: str) -> str:
 def _export(options: SessionOptions, to: Path, form: str, console: Console) -> int:
     from cadalign.annotate.exporting import annotated_photos, coco_of
     from cadalign.annotate.opening import open_session
-    from cadalign.export.photo_sets import write_photo_set
+    from cadalign.export.aligned_object import write_photo_set
 
     session = open_session(options)
     if form == "coco":

@@ -185,7 +185,7 @@ def draw(
     if not picture and style is None:
         return (), ()
     from cadalign.io.meshes.load import load_mesh
-    from cadalign.render.drawing.result_overlay import draw_result, mesh_of, photo_of
+    from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
 
     photos = [
         photo_of(image, view.camera)

@@ -24,7 +24,7 @@ from cadalign.render.drawing.stills import VIEWS, Angles, draw_still, pose_in_vi
 from cadalign.render.frame import LIGHT_GREY, Renderer, check_image_size
 from cadalign.render.probe import make_renderer
 from cadalign.render.scene import Scene
-from cadalign.render.views.visibility import visible_keypoints
+from cadalign.render.viewpoints import visible_keypoints
 
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}
 _MAX_FRAMES = 10_000

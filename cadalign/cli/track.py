@@ -142,7 +142,7 @@ class TrackCommand(CameraOptions):
         """Estimate every track, and say how; also why some could not be."""
         from cadalign.batch.tracks import FoundTrack
         from cadalign.estimation.align import align
-        from cadalign.render.drawing.result_overlay import nearest_mesh
+        from cadalign.render.drawing.model_overlay import nearest_mesh
 
         found, failures, console = [], dict[str, str](), new_console(stderr=False)
         ransac = RansacOptions() if self.robust else None
@@ -173,8 +173,8 @@ class TrackCommand(CameraOptions):
         from cadalign.batch.track_video import draw_video, moving_object
         from cadalign.batch.tracks import COLUMNS, rows_of
         from cadalign.evaluation.runs.tables import write_rows
-        from cadalign.export.moving_glb import write_moving_glb
-        from cadalign.export.trajectories import write_kitti, write_tum
+        from cadalign.export.camera_files import write_kitti, write_tum
+        from cadalign.export.glb import write_moving_glb
         from cadalign.render.drawing.movie import write_movie
         from cadalign.report.track_page import write_track_page
 

@@ -18,7 +18,7 @@ from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, quote
 from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame, photos_of
 from cadalign.export.camera_files import write_nerf, write_open3d
-from cadalign.export.line_set import write_line_set
+from cadalign.export.glb import write_line_set
 from cadalign.export.usd import write_usd
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh

@@ -12,6 +12,7 @@ camera, whose aspect ratio is that of angles, no unlit materials, and colours of
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +23,15 @@ import trimesh
 from PIL import Image
 from trimesh.visual.color import srgb_to_linear
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, Frame
 from cadalign.export.scene_parts import MeshPart, PhotoPlane, parts_of, photo_depth, photo_plane
+from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.conventions import OPENGL_AXES
-from cadalign.geometry.mesh import Material
-from cadalign.io.files import write_whole
+from cadalign.geometry.mesh import Material, Mesh
+from cadalign.geometry.rotations import quat_wxyz_from_rotation
+from cadalign.io.files import write_text, write_whole
 
 _FLIP = np.diag([*OPENGL_AXES, 1.0])
 _NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
@@ -191,3 +195,173 @@ def _add_cameras(tree: dict[str, Any], cameras: Sequence[_CameraNode]) -> None:
         roots.append(len(tree["nodes"]))
         matrix = each.transform.T.ravel().tolist()
         tree["nodes"].append({"name": each.name, "camera": number, "matrix": matrix})
+
+
+_BOX_COLOR = (230, 60, 50)
+_CAMERA_COLOR = (40, 90, 200)
+_FRUSTUM = 0.25  # depth of a drawn camera over the object's distance
+_FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
+
+_Lines = tuple[FloatArray, IntArray, tuple[int, int, int]]
+
+
+def write_line_set(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
+    """Write the box of the object and a pyramid for each camera as edges of a PLY file.
+
+    ``open3d.io.read_line_set`` reads it.
+
+    Raises
+    ------
+    InputError
+        If the frame is not known, or there is neither mesh nor keypoints.
+    """
+    box = Box.from_model(exported.bounds, exported.frame_from_model(frame))
+    pieces: list[_Lines] = [(box.corners, np.array(BOX_EDGES), _BOX_COLOR)]
+    pieces += [_pyramid(exported, number, frame) for number in range(len(exported.views))]
+    points = np.concatenate([points for points, _, _ in pieces]) * exported.metres
+    starts = np.cumsum([0, *(len(points) for points, _, _ in pieces)])
+    edges = [
+        f"{a + start} {b + start} {red} {green} {blue}"
+        for (_, pairs, (red, green, blue)), start in zip(pieces, starts, strict=False)
+        for a, b in pairs.tolist()
+    ]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element edge {len(edges)}",
+        "property int vertex1",
+        "property int vertex2",
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        "end_header",
+    ]
+    vertices = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points.tolist()]
+    write_text(path, "\n".join([*header, *vertices, *edges]) + "\n")
+
+
+def _pyramid(exported: AlignedObject, number: int, frame: Frame) -> _Lines:
+    """A camera's centre and the corners of its photo."""
+    view = exported.views[number]
+    distance = float(np.linalg.norm(view.cam_from_model.translation))
+    corners = photo_plane(view.camera, None).corners * _FRUSTUM * (distance or 1.0)
+    pose = exported.frame_from_cam(frame, number)
+    points = np.vstack([np.zeros(3), corners]) @ pose[:3, :3].T + pose[:3, 3]
+    return points, np.array(_FRUSTUM_EDGES), _CAMERA_COLOR
+
+
+_FLOAT = 5126  # as glTF numbers it
+
+
+@dataclass(frozen=True, eq=False)
+class MovingObject:
+    """An object and its motion.
+
+    Parameters
+    ----------
+    name : str
+        Name of its node, other than that of all other objects.
+    mesh : Mesh
+        Its mesh, stretched.
+    times : (P,) float
+        Times of its poses [s], increasing, not negative.
+    poses : (P, 12) float
+        Rotations row by row and translations, in the camera's frame.
+    """
+
+    name: str
+    mesh: Mesh
+    times: FloatArray
+    poses: FloatArray
+
+    @property
+    def keyframes(self) -> tuple[FloatArray, FloatArray]:
+        """Translations (P, 3) and quaternions (P, 4; x, y, z, w) in glTF's axes."""
+        turns = OPENGL_AXES[:, None] * self.poses[:, :9].reshape(-1, 3, 3)
+        quaternions = np.roll([quat_wxyz_from_rotation(turn) for turn in turns], -1, axis=1)
+        # Of the two quaternions of a rotation the one nearer to that of the keyframe before.
+        turned = (quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0
+        signs = np.cumprod(np.where(turned, -1.0, 1.0))
+        quaternions[1:] *= signs[:, None]
+        return self.poses[:, 9:] * OPENGL_AXES, quaternions
+
+
+def write_moving_glb(path: Path, objects: Sequence[MovingObject]) -> None:
+    """Write objects that move as GLB with one animation.
+
+    Raises
+    ------
+    InputError
+        If there is no object, or two have one name.
+    """
+    names = [each.name for each in objects]
+    if not names or len(set(names)) < len(names):
+        raise InputError(f"{len(names)} objects, {len(set(names))} names", where="objects")
+    scene: Any = trimesh.Scene()
+    materials = {}
+    for each in objects:
+        scene.graph.update(frame_to=each.name, matrix=np.eye(4))
+        for number, part in enumerate(parts_of(each.mesh)):
+            own = f"{each.name}_{number}"
+            materials[own] = part_material(part)
+            scene.add_geometry(
+                part_mesh(part), geom_name=own, node_name=own, parent_node_name=each.name
+            )
+
+    def complete(tree: dict[str, Any]) -> None:
+        set_materials(tree, materials)
+        _animate(tree, objects)
+
+    data = _gltf.export_glb(scene, include_normals=False, tree_postprocessor=complete)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
+
+
+def _animate(tree: dict[str, Any], objects: Sequence[MovingObject]) -> None:
+    """Add the keyframes, in a buffer of their own, and the animation that reads them."""
+    nodes = {node.get("name"): number for number, node in enumerate(tree["nodes"])}
+    arrays: list[FloatArray] = []
+    channels: list[dict[str, Any]] = []
+    samplers: list[dict[str, Any]] = []
+    for each in objects:
+        node = tree["nodes"][nodes[each.name]]
+        node.pop("matrix", None)
+        clock, keyframes = len(arrays), each.keyframes
+        arrays += [np.asarray(each.times), *keyframes]
+        for offset, (kind, values) in enumerate(
+            zip(("translation", "rotation"), keyframes, strict=True), start=1
+        ):
+            node[kind] = values[0].tolist()
+            channels.append(
+                {"sampler": len(samplers), "target": {"node": nodes[each.name], "path": kind}}
+            )
+            samplers.append({"input": clock, "output": clock + offset, "interpolation": "LINEAR"})
+    first = _append(tree, arrays)
+    samplers = [{**s, "input": s["input"] + first, "output": s["output"] + first} for s in samplers]
+    tree["animations"] = [{"name": "tracks", "channels": channels, "samplers": samplers}]
+
+
+def _append(tree: dict[str, Any], arrays: Sequence[FloatArray]) -> int:
+    """Add arrays to the tree; returns the number of the first one's accessor."""
+    kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+    first, offset = len(tree["accessors"]), 0
+    buffer = len(tree["buffers"])
+    blobs = [array.astype("<f4").tobytes() for array in arrays]
+    for array, blob in zip(arrays, blobs, strict=True):
+        columns = array.astype(np.float32).reshape(len(array), -1)
+        tree["accessors"].append(
+            {
+                "bufferView": len(tree["bufferViews"]),
+                "componentType": _FLOAT,
+                "count": len(array),
+                "type": kinds[columns.shape[1]],
+                "min": columns.min(axis=0).tolist(),
+                "max": columns.max(axis=0).tolist(),
+            }
+        )
+        view = {"buffer": buffer, "byteOffset": offset, "byteLength": len(blob)}
+        tree["bufferViews"].append(view)
+        offset += len(blob)
+    data = base64.b64encode(b"".join(blobs)).decode("ascii")
+    uri = f"data:application/octet-stream;base64,{data}"
+    tree["buffers"].append({"byteLength": offset, "uri": uri})
+    return first

@@ -16,8 +16,7 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.render.raycast.renderer import RaycastRenderer
 from cadalign.render.scene import Scene
-from cadalign.render.views.viewpoints import frame_object, look_at
-from cadalign.render.views.visibility import visible_keypoints
+from cadalign.render.viewpoints import frame_object, look_at, visible_keypoints
 from cadalign.seeding import instance_rng
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel

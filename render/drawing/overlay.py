@@ -25,7 +25,7 @@ from cadalign.render.drawing.pictures import (
     veil,
 )
 from cadalign.render.frame import LIGHT_GREY, Geometry, check_image_size
-from cadalign.render.views.lens_field import within_lens_field
+from cadalign.render.raycast.posed import within_lens_field
 
 GT_COLOR: Color = (40, 205, 80)
 EST_COLOR: Color = (240, 50, 50)

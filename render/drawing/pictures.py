@@ -14,7 +14,7 @@ from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.render.drawing.canvas import CASING, Canvas, Color
 from cadalign.render.drawing.color import ByteImage, composite
 from cadalign.render.frame import Frame, Geometry
-from cadalign.render.views.visibility import seen_in_image
+from cadalign.render.viewpoints import seen_in_image
 
 _SEEN_COLOR = (255, 222, 40)
 _HIDDEN_COLOR = (150, 160, 175)

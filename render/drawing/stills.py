@@ -23,7 +23,7 @@ from cadalign.render.drawing.pictures import (
 from cadalign.render.frame import Renderer
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.scene import Scene
-from cadalign.render.views.viewpoints import frame_object, look_at
+from cadalign.render.viewpoints import frame_object, look_at
 
 VIEWS: dict[str, tuple[float, float]] = {
     "iso": (145.0, 25.0),

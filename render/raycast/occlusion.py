@@ -11,9 +11,8 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import Geometry
-from cadalign.render.raycast.posed import PosedScene, Rectangle
+from cadalign.render.raycast.posed import PosedScene, Rectangle, in_threads
 from cadalign.render.raycast.shading import Studio
-from cadalign.render.raycast.threads import in_threads
 
 SingleImage = npt.NDArray[np.float32]
 

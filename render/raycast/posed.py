@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -11,12 +15,12 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import model_rays, perspective
+from cadalign.geometry.pixels import perspective
+from cadalign.geometry.projection import model_rays
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.color import LinearArray
 from cadalign.render.raycast.shading import Studio
 from cadalign.render.scene import Scene
-from cadalign.render.views.lens_field import within_lens_field
 
 _MAX_LAYERS = 8
 # What is hidden to this share is left out.
@@ -335,3 +339,41 @@ def _outline(low: FloatArray, high: FloatArray) -> FloatArray:
     following = np.roll(corners, -1, axis=0)
     lines = [a + share * (b - a) for a, b in zip(corners, following, strict=True)]
     return np.column_stack([np.concatenate(lines), np.ones(4 * _POINTS_PER_SIDE)])
+
+
+_STEPS = 24
+
+
+def within_lens_field(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.bool_]:
+    """Find the points up to which the lens model maps outer points farther out than inner ones.
+
+    A distortion polynomial turns back at some radius and from there on folds far-off directions
+    into the image. Points beyond are not seen by the camera, wherever the model puts them.
+    For points (n, 3), tell if the camera sees them and if the distorted radius grows all the way
+    from the centre to the point, (n,) bool.
+    """
+    seen = camera.sees(points_cam)
+    if camera.is_wide or not camera.distortion:
+        return seen
+    normalized = perspective(np.where(seen[:, None], points_cam, 1.0))
+    share = np.linspace(0, 1, _STEPS + 1)
+    path = (normalized[:, None, :] * share[:, None]).reshape(-1, 2)
+    pixels = camera.pixels_from_normalized(path).reshape(len(normalized), _STEPS + 1, 2)
+    step = np.diff((pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy), axis=1)
+    growth = np.einsum("nsk,nk->ns", step, normalized)
+    return np.asarray(seen & (growth >= 0).all(axis=1))
+
+
+_MAX_THREADS = 8
+
+_Part = TypeVar("_Part")
+
+
+def in_threads(draw: Callable[[_Part], None], parts: Sequence[_Part]) -> None:
+    """Draw parts of a frame side by side; embree and NumPy let go of the interpreter lock."""
+    if len(parts) == 1:
+        draw(parts[0])
+        return
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _MAX_THREADS)) as pool:
+        # Asking for the results raises what a part has raised.
+        list(pool.map(draw, parts))

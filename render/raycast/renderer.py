@@ -9,16 +9,15 @@ import cv2
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.errors import InputError
+from cadalign.errors import InputError, RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.color import ByteImage, LinearArray, bytes_from_linear
 from cadalign.render.frame import Frame, Geometry, check_image_size
 from cadalign.render.raycast.occlusion import darken_corners
-from cadalign.render.raycast.posed import PosedScene, Rectangle, pose_scene
+from cadalign.render.raycast.posed import PosedScene, Rectangle, in_threads, pose_scene
 from cadalign.render.raycast.shading import Studio
-from cadalign.render.raycast.threads import in_threads
 from cadalign.render.scene import Scene
 
 # Small enough for the processor's caches, large enough for NumPy's overhead not to show.
@@ -141,6 +140,23 @@ class RaycastRenderer:
             color[part[:, 1], part[:, 0]] = _encode(light)
 
         in_threads(draw, [pixels[begin : begin + step] for begin in range(0, len(pixels), step)])
+
+
+class Open3DRenderer(RaycastRenderer):
+    """Draws as `RaycastRenderer` does; Open3D finds the hits."""
+
+    name = "open3d"
+
+    def __init__(self, *, studio: Studio | None) -> None:
+        try:
+            import open3d  # noqa: F401
+        except (ImportError, OSError) as error:  # OSError: a library of the system is missing
+            raise RenderError(
+                f"Open3D cannot be imported ({error})",
+                where="open3d",
+                fix="run `cadalign doctor` to see what is missing, or use the ray-cast renderer",
+            ) from None
+        super().__init__(studio=studio, caster_of=attrgetter("open3d_caster"))
 
 
 def cast_geometry(

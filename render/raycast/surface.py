@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.geometry.edges import number_rows
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray
 from cadalign.render.drawing.color import LinearArray, linear_from_bytes, linear_from_srgb
@@ -103,3 +105,76 @@ def color_channels(texture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     """Red, green and blue (h, w, 3), or grey (h, w, 1), of an image with or without opacity."""
     image = texture[:, :, None] if texture.ndim == 2 else texture
     return image[:, :, :3] if image.shape[2] >= 3 else image[:, :, :1]
+
+
+def coincident_faces(vertices: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray]:
+    """Find, for each triangle, the first with the same corners wound alike, and the other way.
+
+    Modellers such as SketchUp write every face twice, wound both ways, with the materials of its
+    front and of its back. The one to show is wound towards the viewer. Both results are (m,) int;
+    where no triangle is wound the other way, the two are the same.
+    """
+    corners = number_rows(vertices)[faces]
+    place = number_rows(np.sort(corners, axis=1))
+    a, b, c = corners.T
+    # Sorting takes an even or odd number of swaps: that is the winding.
+    winding = (((a > b) ^ (b > c)) ^ (a > c)).astype(np.int64)
+    none = len(faces)
+    first = np.full((place.max() + 1, 2), none)
+    np.minimum.at(first, (place, winding), np.arange(none))
+    alike = first[place, winding]
+    opposite = first[place, 1 - winding]
+    return alike, np.where(opposite < none, opposite, alike)
+
+
+# A point at which more triangles meet than this is left faceted: pairs grow with the square.
+_MAX_VALENCE = 1024
+_PAIRS_AT_ONCE = 1 << 20
+
+
+def corner_normals(
+    vertices: FloatArray, faces: IntArray, face_normals: FloatArray, *, crease_angle: float
+) -> FloatArray:
+    """Average, at each face's corners, the normals of faces that continue it smoothly, (m, 3, 3).
+
+    Faces meet where their vertices have the same position, whether they share the vertex or not.
+    Those that are turned the other way count with their normal reversed, since the faces of many
+    CAD models are turned at random. Each counts by its angle at the corner. Faces at a larger angle
+    than ``crease_angle`` [degrees] meet in an edge. The unit normals are on the side of their face.
+    """
+    point = number_rows(vertices)[faces].ravel()
+    weight = _corner_angles(vertices[faces]).ravel()
+    normals = np.repeat(face_normals, 3, axis=0)
+    order = np.argsort(point, kind="stable")
+    valence = np.bincount(point)
+    start = np.cumsum(valence) - valence
+    result = normals.copy()
+    for count in np.unique(valence):
+        if count < 2 or count > _MAX_VALENCE:  # no face uses a point of valence 0
+            continue
+        first = start[valence == count]
+        step = max(1, _PAIRS_AT_ONCE // int(count) ** 2)
+        for begin in range(0, len(first), step):
+            corners = order[first[begin : begin + step, None] + np.arange(count)]
+            result[corners] = _smooth(normals[corners], weight[corners], crease_angle)
+    return result.reshape(-1, 3, 3)
+
+
+def _smooth(normals: FloatArray, weight: FloatArray, crease_angle: float) -> FloatArray:
+    """Average within groups of corners (g, c, 3) that share a point."""
+    cosine = normals @ normals.transpose(0, 2, 1)
+    share = np.where(
+        np.abs(cosine) >= np.cos(np.radians(crease_angle)), np.sign(cosine) * weight[:, None, :], 0
+    )
+    total = share @ normals
+    length = np.linalg.norm(total, axis=2, keepdims=True)
+    return np.where(length > 1e-9, total / np.where(length > 0, length, 1.0), normals)
+
+
+def _corner_angles(triangles: FloatArray) -> FloatArray:
+    """The angles at the corners of triangles (m, 3, 3); (m, 3) radians."""
+    after = np.roll(triangles, -1, axis=1) - triangles
+    before = np.roll(triangles, 1, axis=1) - triangles
+    scale = np.linalg.norm(after, axis=2) * np.linalg.norm(before, axis=2)
+    cosine = np.einsum("mck,mck->mc", after, before) / np.where(scale > 0, scale, 1.0)
+    return np.asarray(np.arccos(np.clip(cosine, -1, 1)))

@@ -50,7 +50,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Material
 from cadalign.io.images import read_photo, write_image
 from cadalign.render import RaycastRenderer, Scene, cast_geometry, contact_sheet, visible_keypoints
-from cadalign.render.views.viewpoints import frame_object, look_at
+from cadalign.render.viewpoints import frame_object, look_at
 
 SCREENS = {"desktop": (1600, 1000), "laptop": (1366, 768), "phone": (390, 844)}
 SCHEMES = ("light", "dark")

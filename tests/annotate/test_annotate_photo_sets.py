@@ -21,7 +21,7 @@ from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import CadalignError
-from cadalign.export.photo_sets import FORMS, AnnotatedPhoto, write_photo_set
+from cadalign.export.aligned_object import FORMS, AnnotatedPhoto, write_photo_set
 from cadalign.io.images import read_photo
 from cadalign.render import cast_geometry
 

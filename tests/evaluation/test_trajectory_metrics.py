@@ -15,7 +15,7 @@ from cadalign.evaluation.metrics.trajectories import (
     relative_pose_error,
     rotation_jitter_deg,
 )
-from cadalign.export.trajectories import write_tum
+from cadalign.export.camera_files import write_tum
 
 ORIGIN = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
 

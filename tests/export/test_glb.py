@@ -22,7 +22,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
 from cadalign.export.scene_parts import photo_plane
 from cadalign.render import Scene, cast_geometry
-from cadalign.render.views.visibility import silhouette_iou
+from cadalign.render.viewpoints import silhouette_iou
 
 LEAST_IOU = 0.99
 FINE = 6  # pixels of the browser's picture per pixel of the photo

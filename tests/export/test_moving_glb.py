@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from cadalign.errors import InputError
-from cadalign.export.moving_glb import MovingObject, write_moving_glb
+from cadalign.export.glb import MovingObject, write_moving_glb
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.geometry.rotations import rotation_from_vector

@@ -18,10 +18,10 @@ from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation
 from cadalign.io.observed_image import ObservedImage
 from cadalign.render import Scene, cast_geometry, draw_overlay
-from cadalign.render.drawing.result_overlay import draw_result
+from cadalign.render.drawing.model_overlay import draw_result
 from cadalign.render.frame import LIGHT_GREY
 from cadalign.render.raycast.renderer import RaycastRenderer
-from cadalign.render.views.visibility import visible_keypoints
+from cadalign.render.viewpoints import visible_keypoints
 
 FISHEYE = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (0.01, -0.003, 0.0, 0.0), lens="fisheye")
 FOV = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (0.9,), lens="fov")

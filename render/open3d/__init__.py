@@ -1,1 +1,0 @@
-"""Cast rays with Open3D."""

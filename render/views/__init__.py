@@ -1,1 +1,0 @@
-"""Place cameras about an object, test visibility, compare silhouettes."""

@@ -26,7 +26,6 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import projected_covariances
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.keypoint_layer import confidence_regions
 from cadalign.shapes.model import ShapeModel
@@ -203,7 +202,7 @@ def drawing_of(
     ahead = live.camera.sees(in_camera)
     pixels = live.camera.project(in_camera[ahead])
     of_points = cast(FloatArray, result.points_cam_covariance)
-    covariances = projected_covariances(in_camera[ahead], of_points[ahead], live.camera)
+    covariances = live.camera.projected_covariances(in_camera[ahead], of_points[ahead])
     for row, uv in zip(np.flatnonzero(ahead), pixels.tolist(), strict=True):
         label = result.ids[row]
         fallback = label if isinstance(label, str) else f"keypoint {label}"

@@ -16,10 +16,8 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.edges import mesh_edges
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, cluster, mesh_edges, simplify
 from cadalign.geometry.raycaster import FaceArray
-from cadalign.geometry.simplify import cluster, simplify
 from cadalign.render.drawing.color import bytes_from_linear
 from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 from trimesh.triangles import closest_point
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.geometry.edges import mesh_edges
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, mesh_edges
 from cadalign.geometry.raycaster import RayCaster
 
 CORNER, CREASE, SMOOTH = range(3)

@@ -21,7 +21,6 @@ from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import rescaled_pixels, resized_camera
-from cadalign.geometry.projection import projected_covariances
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
@@ -119,7 +118,7 @@ def _suggest_of_shape(
         return None
     in_camera = pose.apply(result.points_3d[rows])
     of_points = result.points_cam_covariance[rows]
-    covariances = projected_covariances(in_camera, of_points, live.camera)
+    covariances = live.camera.projected_covariances(in_camera, of_points)
     gain = np.linalg.slogdet(np.eye(2) + covariances / live.sigma**2)[1]
     best = int(np.argmax(np.round(gain, 9)))
     unmarked = Unmarked(best, float(np.sqrt(np.trace(covariances[best]))))

@@ -20,7 +20,6 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import projected_covariances
 from cadalign.io.images import write_image
 from cadalign.io.video import Video, frame_numbers
 from cadalign.render.viewpoints import visible_keypoints
@@ -159,7 +158,7 @@ def _uncertainty(
         slopes[:, :, axis] = np.cross(unit, turned)
     slopes[:, :, 3:] = np.eye(3)
     in_space = slopes @ covariance[:6, :6] @ slopes.swapaxes(1, 2)
-    projected = projected_covariances(in_camera[ahead], in_space, camera)
+    projected = camera.projected_covariances(in_camera[ahead], in_space)
     found = np.full(len(points), np.inf)
     found[ahead] = np.sqrt(np.trace(projected, axis1=1, axis2=2) / 2)
     return found

@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.geometry.box import Box
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.plots import plot_box, plot_keypoints, plot_mesh, plot_photo
 from cadalign.io.images import read_photo
+from cadalign.notebook.axes import photo_axes
 from cadalign.notebook.html import card, draw_picture
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
     from cadalign.estimation.result_data import ResultData
     from cadalign.estimation.uncertainty.summary import Uncertainty
+
 
 Photo = npt.ArrayLike | str | os.PathLike[str]
 
@@ -41,14 +44,14 @@ def plot_result(
     seen = result.views[view]
     if isinstance(image, str | os.PathLike):
         image = read_photo(Path(image))
-    axes = plot_photo(seen.camera, image, axes=axes)
+    axes = photo_axes(seen.camera.width, seen.camera.height, image, axes=axes)
     known = result.known_mesh(mesh)
     if known is not None:
-        plot_mesh(axes, seen.camera, seen.alignment, known)
+        _plot_mesh(axes, seen.camera, seen.alignment, known)
     bounds = result.bounds if known is None or result.own_bounds is not None else known.bounds
-    plot_box(axes, seen.camera, Box.from_model(bounds, seen.alignment))
+    _plot_box(axes, seen.camera, Box.from_model(bounds, seen.alignment))
     residuals = np.where(np.isfinite(seen.residuals), seen.residuals, np.nan)
-    plot_keypoints(axes, seen.points_2d, residuals, seen.inliers)
+    _plot_keypoints(axes, seen.points_2d, residuals, seen.inliers)
     return axes
 
 
@@ -84,3 +87,82 @@ def _pose_rows(
         ("translation", f"({shift}) ± ({known_to})"),
         ("stretch", ", ".join(scales)),
     ]
+
+
+_LONGEST_SIDE = 480  # of the grid of rays through a drawn model
+_MODEL_COLOR = (0.94, 0.2, 0.2)
+_MODEL_OPACITY = 0.45
+_BOX_COLOR = "#f03232"
+_LINE_POINTS = 17  # lens distortion bends the edges of a box
+
+
+def _plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> None:
+    """Draw a mesh over the photo, shaded and translucent, with its outline."""
+    shade = _shade(camera, alignment, mesh)
+    seen = np.isfinite(shade)
+    if not seen.any():
+        return
+    color = np.zeros((*shade.shape, 4))
+    color[..., :3] = np.array(_MODEL_COLOR) * np.where(seen, shade, 0.0)[..., None]
+    color[..., 3] = _MODEL_OPACITY * seen
+    axes.imshow(color, extent=(-0.5, camera.width - 0.5, camera.height - 0.5, -0.5))
+    height, width = shade.shape
+    columns = (np.arange(width) + 0.5) * camera.width / width - 0.5
+    rows = (np.arange(height) + 0.5) * camera.height / height - 0.5
+    if not seen.all() and min(shade.shape) > 1:
+        axes.contour(columns, rows, seen, levels=[0.5], colors=[_MODEL_COLOR], linewidths=1.2)
+
+
+def _plot_box(axes: Axes, camera: Camera, box: Box) -> None:
+    """Draw the edges of a box in the camera frame."""
+    corners = box.corners
+    share = np.linspace(0, 1, _LINE_POINTS)[:, None]
+    for first, second in BOX_EDGES:
+        points = corners[first] + share * (corners[second] - corners[first])
+        pixels = camera.project_where_ahead(points)
+        pixels[~np.isfinite(pixels)] = np.nan
+        axes.plot(*pixels.T, color=_BOX_COLOR, linewidth=1.2, alpha=0.9)
+
+
+def _plot_keypoints(
+    axes: Axes, observed: FloatArray, residuals: FloatArray, inliers: BoolArray
+) -> None:
+    """Draw observed keypoints (n, 2) as rings, reprojected ones as crosses, residuals as lines.
+
+    Keypoints that are no inliers (n,) are grey.
+    """
+    predicted = observed + residuals
+    for start, end, kept in zip(observed, predicted, inliers, strict=True):
+        if np.isfinite(end).all():
+            color = "#ffd21f" if kept else "#999999"
+            axes.plot(*np.stack([start, end]).T, color=color, linewidth=1)
+            axes.plot(*end, "x", color=color, markersize=6, markeredgewidth=1.5)
+    for chosen, color in ((inliers, "white"), (~inliers, "#999999")):
+        x, y = observed[chosen].T
+        axes.plot(x, y, "o", color="black", markerfacecolor="none", markersize=10)
+        axes.plot(x, y, "o", color=color, markerfacecolor="none", markersize=8)
+
+
+def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
+    """Brightness (h, w) of a mesh lit from the camera on a coarse grid; NaN beside it."""
+    from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
+
+    step = max(1.0, max(camera.width, camera.height) / _LONGEST_SIDE)
+    width, height = round(camera.width / step), round(camera.height / step)
+    width, height = max(width, 1), max(height, 1)
+    across = (np.arange(width) + 0.5) * camera.width / width - 0.5
+    down = (np.arange(height) + 0.5) * camera.height / height - 0.5
+    pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+    rays, valid = camera.rays_where_valid(pixels)
+    # depth * ray = R (scale * x) + t, in the model's own coordinates
+    directions = rays @ alignment.rotation / alignment.scale
+    origin = -(alignment.translation @ alignment.rotation) / alignment.scale
+    caster = RayCaster(mesh, face_normals(mesh.triangles), engine=EmbreeEngine)
+    faces, distance = caster.first_hits(origin, directions)
+    hit = (faces >= 0) & valid & (distance > 0)
+    normals = (caster.normals(faces[hit]) / alignment.scale) @ alignment.rotation.T
+    towards = np.abs(np.einsum("nk,nk->n", normals, rays[hit]))
+    towards /= np.linalg.norm(normals, axis=1) * np.linalg.norm(rays[hit], axis=1) + 1e-300
+    shade = np.full(len(rays), np.nan)
+    shade[hit] = 0.25 + 0.75 * towards
+    return shade.reshape(height, width)

@@ -164,3 +164,12 @@ class Alignment:
         if missing:
             raise InputError(f"missing {', '.join(missing)}", where="alignment")
         return cls(*(data[key] for key in _FIELDS))
+
+
+def model_rays(cam_from_model: Alignment) -> tuple[FloatArray, FloatArray]:
+    """Camera rays in the model's frame: their origin (3,), and a matrix (3, 3) for directions.
+
+    The matrix takes (u, v, 1) to the direction whose parameter is the depth in the camera.
+    """
+    model_from_ray = cam_from_model.rotation.T / cam_from_model.scale[:, None]
+    return -model_from_ray @ cam_from_model.translation, model_from_ray

@@ -12,9 +12,8 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points, is_masked, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
-from cadalign.geometry.camera_form import CameraForm, read_form, read_matrix, write_form
+from cadalign.geometry.camera_form import read_form, read_matrix, write_form
 from cadalign.geometry.pixels import (
-    FOCAL_FIX,
     PIXEL_CENTRE,
     LensKind,
     PixelOrigin,
@@ -24,6 +23,7 @@ from cadalign.geometry.pixels import (
     largest_angle,
     perspective,
     rays_of_image,
+    require_perspective_lens,
     rescaled_pixels,
     undistort,
 )
@@ -100,11 +100,9 @@ class Camera:
             object.__setattr__(self, name, float(value))
         for name in ("fx", "fy"):
             if getattr(self, name) <= 0:
-                raise InputError(
-                    f"the focal length is {getattr(self, name):g}",
-                    where=f"camera.{name}",
-                    fix="give the calibrated focal length in pixels",
-                )
+                what = f"the focal length is {getattr(self, name):g}"
+                fix = "give the calibrated focal length in pixels"
+                raise InputError(what, where=f"camera.{name}", fix=fix)
         known: object = self.focal_known
         if not isinstance(known, bool | np.bool_):
             what = f"{quote(known)} is neither True nor False"
@@ -117,9 +115,8 @@ class Camera:
             raise InputError("not a sequence of numbers", where="camera.distortion") from None
         coefficients = checked_coefficients(self.lens, coefficients)
         object.__setattr__(self, "distortion", coefficients)
-        if self.is_wide and not self.focal_known:
-            what = f"the focal length of a {self.lens} lens is unknown"
-            raise InputError(what, where="camera.lens", fix=FOCAL_FIX)
+        if not self.focal_known:
+            require_perspective_lens(self.lens, where="camera.lens")
 
     @classmethod
     def from_fov(cls, width: int, height: int, *, fov_x: float) -> Camera:
@@ -127,8 +124,8 @@ class Camera:
 
         Parameters
         ----------
-        width, height : int
-            Image size [px].
+        width, height
+            As for `Camera`.
         fov_x : float
             Horizontal field of view [degrees], from one edge of the image to the other.
 
@@ -164,14 +161,12 @@ class Camera:
         ----------
         matrix : (3, 3) float
             ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` [px], without skew.
-        width, height : int
-            Image size [px].
+        width, height, distortion, lens
+            As for `Camera`.
         pixel_origin : {"center", "corner"}
             Where (0, 0) lies for the principal point: at the centre of the top-left pixel (OpenCV,
             Kalibr, BOP), or at the top-left corner of the image (COLMAP, PyTorch3D, many
             renderers), half a pixel away.
-        distortion, lens
-            As for `Camera`.
 
         Raises
         ------
@@ -203,12 +198,10 @@ class Camera:
 
         Parameters
         ----------
-        width, height : int
-            Image size [px].
+        width, height, distortion
+            As for `Camera`.
         cx, cy : float, optional
             Principal point [px]; the image's centre by default.
-        distortion : tuple of float, optional
-            As for `Camera`.
 
         Examples
         --------
@@ -219,22 +212,12 @@ class Camera:
         700.0
         """
         if not is_number(width) or not is_number(height) or min(width, height) < 1:
-            raise InputError(
-                f"{quote(width)} x {quote(height)} is not a size",
-                where="camera.width",
-                fix=_SIZE_FIX,
-            )
-        placeholder = float(max(width, height))
-        return cls(
-            width,
-            height,
-            placeholder,
-            placeholder,
-            (width - 1) / 2 if cx is None else cx,
-            (height - 1) / 2 if cy is None else cy,
-            distortion,
-            focal_known=False,
-        )
+            what = f"{quote(width)} x {quote(height)} is not a size"
+            raise InputError(what, where="camera.width", fix=_SIZE_FIX)
+        focal = float(max(width, height))
+        cx = (width - 1) / 2 if cx is None else cx
+        cy = (height - 1) / 2 if cy is None else cy
+        return cls(width, height, focal, focal, cx, cy, distortion, focal_known=False)
 
     def with_focal(self, focal: float) -> Camera:
         """The same camera with the horizontal focal length ``focal`` [px], known from now on.
@@ -330,11 +313,8 @@ class Camera:
             If the focal length is unknown.
         """
         if not self.focal_known:
-            raise InputError(
-                "the focal length is unknown",
-                where="camera",
-                fix='estimate it with focal="estimate", or give it: camera.with_focal(...)',
-            )
+            fix = 'estimate it with focal="estimate", or give it: camera.with_focal(...)'
+            raise InputError("the focal length is unknown", where="camera", fix=fix)
 
     def project(self, points_cam: npt.ArrayLike) -> FloatArray:
         """Project points of the camera frame into the image.
@@ -391,6 +371,20 @@ class Camera:
         lens_from_camera = self.lens_from_camera
         slopes = image_of(points_cam @ lens_from_camera.T, self.lens, self.distortion)[1]
         return np.asarray(np.array([[self.fx], [self.fy]]) * (slopes @ lens_from_camera))
+
+    def projected_covariances(self, points_cam: FloatArray, covariances: FloatArray) -> FloatArray:
+        """Covariances (n, 2, 2) [px squared] of projections of uncertain points, to first order.
+
+        The points (n, 3) are some that the camera `sees`, their covariances are (n, 3, 3).
+
+        Examples
+        --------
+        >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5)
+        >>> camera.projected_covariances(np.array([[0.0, 0.0, 5.0]]), np.eye(3)[None]).tolist()
+        [[[10000.0, 0.0], [0.0, 10000.0]]]
+        """
+        slopes = self.projection_slopes(points_cam)
+        return np.asarray(slopes @ covariances @ slopes.swapaxes(1, 2))
 
     def unproject(self, points_2d: npt.ArrayLike) -> FloatArray:
         """Directions of the rays of pixels, in the camera frame.
@@ -460,12 +454,12 @@ class Camera:
         if self.is_wide and not valid.all():
             _check_undone(self.rays_where_valid(points_2d)[1])
             behind = np.flatnonzero(~valid)
-            raise InputError(
-                f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off the "
-                f"z axis, the first is point {behind[0]}",
-                where="points_2d",
-                fix="these have no normalised coordinates; use unproject",
+            what = (
+                f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off the"
             )
+            what += f" z axis, the first is point {behind[0]}"
+            fix = "these have no normalised coordinates; use unproject"
+            raise InputError(what, where="points_2d", fix=fix)
         _check_undone(valid)
         return normalized
 
@@ -580,17 +574,7 @@ class Camera:
         if self.turn:
             what = "a camera in a turned frame has no form in files"
             raise InputError(what, where="camera", fix="write the camera that was turned")
-        form = write_form(
-            CameraForm(
-                (self.width, self.height),
-                (self.fx, self.fy) if self.focal_known else None,
-                (self.cx, self.cy),
-                self.distortion,
-                self.lens,
-            ),
-            pixel_origin,
-        )
-        return form if pixel_origin is None else {**form, "pixel_origin": pixel_origin}
+        return write_form(self, pixel_origin)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Camera:
@@ -621,22 +605,8 @@ class Camera:
         >>> Camera.from_dict({"matrix": matrix, "width": 640, "height": 480}).cx
         319.5
         """
-        form = read_form(data)
-        if form.matrix is not None:
-            return cls.from_matrix(
-                form.matrix,
-                *form.size,
-                pixel_origin=form.pixel_origin,
-                distortion=form.distortion,
-                lens=form.lens,
-            )
-        if form.focals is None:
-            cx, cy = form.center
-            if form.lens != "perspective":
-                what = f"the focal length of a {form.lens} lens is unknown"
-                raise InputError(what, where="camera.params", fix=FOCAL_FIX)
-            return cls.without_focal(*form.size, cx=cx, cy=cy, distortion=form.distortion)
-        return cls(*form.size, *form.focals, *form.center, form.distortion, lens=form.lens)
+        fields = read_form(data)
+        return cls(**fields) if "fx" in fields else cls.without_focal(**fields)
 
 
 def needs_facing(cameras: Sequence[Camera]) -> bool:
@@ -651,12 +621,9 @@ def _homogeneous(normalized: FloatArray) -> FloatArray:
 def _check_undone(valid: BoolArray) -> None:
     failed = np.flatnonzero(~valid)
     if len(failed):
-        raise InputError(
-            f"the lens distortion cannot be undone at {len(failed)} of {len(valid)} "
-            f"pixels, the first is point {failed[0]}",
-            where="points_2d",
-            fix="these lie outside the area in which the lens model is valid; drop them",
-        )
+        what = f"the lens distortion cannot be undone at {len(failed)} of {len(valid)} pixels, "
+        fix = "these lie outside the area in which the lens model is valid; drop them"
+        raise InputError(f"{what}the first is point {failed[0]}", where="points_2d", fix=fix)
 
 
 _SIZE_FIX = "give the image size in whole pixels"

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cadalign.arrays import as_floats, is_number
 from cadalign.errors import InputError, quote
-from cadalign.geometry.pixels import LensKind, PixelOrigin, shift_of
+from cadalign.geometry.pixels import LensKind, PixelOrigin, require_perspective_lens, shift_of
+
+if TYPE_CHECKING:
+    from cadalign.geometry.camera import Camera
 
 # COLMAP's camera models: the names of their parameters, in COLMAP's order.
 COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
@@ -40,37 +43,22 @@ _NO_SKEW = 1e-9  # relative to the focal length
 _FORM_FIX = 'give {"model", "width", "height", "params"} as COLMAP does'
 
 
-class CameraForm(NamedTuple):
-    """The fields of a camera, its principal point with integers at pixel centres.
-
-    ``center`` is (None, None) for the image's centre and ``focals`` None where unknown. Where
-    ``matrix`` is given, its principal point counts from ``pixel_origin``.
-    """
-
-    size: tuple[Any, Any]
-    focals: tuple[float, float] | None = None
-    center: tuple[Any, Any] = (None, None)
-    distortion: tuple[float, ...] = ()
-    lens: LensKind = "perspective"
-    matrix: Any = None
-    pixel_origin: PixelOrigin = "center"
-
-
-def write_form(form: CameraForm, pixel_origin: PixelOrigin | None) -> dict[str, Any]:
+def write_form(camera: Camera, pixel_origin: PixelOrigin | None) -> dict[str, Any]:
     """A camera in COLMAP's form; see `Camera.to_dict`."""
-    model = _WRITTEN.get((form.lens, len(form.distortion)), "FULL_OPENCV")
+    model = _WRITTEN.get((camera.lens, len(camera.distortion)), "FULL_OPENCV")
     shift = shift_of(pixel_origin or "corner")
-    names = COLMAP_PARAMS[model][4:] if form.lens != "perspective" else _DISTORTION_NAMES
-    values: dict[str, float | None]
-    values = dict(zip(names, form.distortion, strict=False))
-    values |= dict(zip(("fx", "fy"), form.focals or (None, None), strict=True))
-    values |= {"cx": form.center[0] + shift, "cy": form.center[1] + shift}
-    return {
+    names = COLMAP_PARAMS[model][4:] if camera.is_wide else _DISTORTION_NAMES
+    focals = (camera.fx, camera.fy) if camera.focal_known else (None, None)
+    values: dict[str, float | None] = dict(zip(names, camera.distortion, strict=False))
+    numbers = (*focals, camera.cx + shift, camera.cy + shift)
+    values |= zip(("fx", "fy", "cx", "cy"), numbers, strict=True)
+    form = {
         "model": model,
-        "width": form.size[0],
-        "height": form.size[1],
+        "width": camera.width,
+        "height": camera.height,
         "params": [values.get(name, 0.0) for name in COLMAP_PARAMS[model]],
     }
+    return form if pixel_origin is None else form | {"pixel_origin": pixel_origin}
 
 
 def read_matrix(matrix: Any, pixel_origin: object) -> tuple[float, float, float, float]:
@@ -80,55 +68,49 @@ def read_matrix(matrix: Any, pixel_origin: object) -> tuple[float, float, float,
     (fx, _, cx), (_, fy, cy), _ = values.tolist()
     expected = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if np.abs(values - expected).max() > _NO_SKEW * max(abs(fx), 1.0):
+        form = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+        fix = "give the matrix of a camera without skew, by rows"
         raise InputError(
-            f"{quote(values.tolist())} is not of the form [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
-            where="matrix",
-            fix="give the matrix of a camera without skew, by rows",
+            f"{quote(values.tolist())} is not of the form {form}", where="matrix", fix=fix
         )
     return fx, fy, cx - shift, cy - shift
 
 
-def read_form(data: Any) -> CameraForm:
-    """Read the fields of a camera; see `Camera.from_dict`."""
+def read_form(data: Any) -> dict[str, Any]:
+    """Read the fields of a camera, without the focal lengths where these are unknown.
+
+    They are arguments of `Camera`, or of `Camera.without_focal`; see `Camera.from_dict`.
+    """
     if not isinstance(data, Mapping):
         raise InputError(f"expected an object, got {type(data).__name__}", where="camera")
     if set(data) - {"pixel_origin"} == {"width", "height"}:
-        return CameraForm((data["width"], data["height"]))
+        return {"width": data["width"], "height": data["height"]}
     is_matrix = "matrix" in data and "params" not in data
     names = ("matrix", "width", "height") if is_matrix else ("model", "width", "height", "params")
     missing = [key for key in names if key not in data]
     if missing:
         fix = 'give {"matrix", "width", "height"}' if is_matrix else _FORM_FIX
         raise InputError(f"missing {', '.join(missing)}", where="camera", fix=fix)
-    size = data["width"], data["height"]
+    fields = {"width": data["width"], "height": data["height"]}
     origin = data.get("pixel_origin", "center" if is_matrix else "corner")
     shift = shift_of(origin, where="camera.pixel_origin")
-    if is_matrix:
-        return CameraForm(
-            size,
-            matrix=data["matrix"],
-            distortion=data.get("distortion", ()),
-            lens=data.get("lens", "perspective"),
-            pixel_origin=cast(PixelOrigin, origin),
-        )
-    return _read_params(data["model"], data["params"], size, shift)
+    if not is_matrix:
+        return fields | _read_params(data["model"], data["params"], shift)
+    fields |= zip(("fx", "fy", "cx", "cy"), read_matrix(data["matrix"], origin), strict=True)
+    lens = data.get("lens", "perspective")
+    return fields | {"distortion": data.get("distortion", ()), "lens": lens}
 
 
-def _read_params(model: Any, params: Any, size: tuple[Any, Any], shift: float) -> CameraForm:
+def _read_params(model: Any, params: Any, shift: float) -> dict[str, Any]:
     """Read COLMAP's parameters, whose top-left pixel has its centre at ``shift``."""
     if not isinstance(model, str) or model not in COLMAP_PARAMS:
-        known = ", ".join(COLMAP_PARAMS)
-        raise InputError(
-            f"unknown model {quote(model)}", where="camera.model", fix=f"known are {known}"
-        )
+        fix = f"known are {', '.join(COLMAP_PARAMS)}"
+        raise InputError(f"unknown model {quote(model)}", where="camera.model", fix=fix)
     names = COLMAP_PARAMS[model]
     params = params.tolist() if isinstance(params, np.ndarray) else params
     if not isinstance(params, list | tuple) or len(params) != len(names):
-        raise InputError(
-            f"{quote(params)} are not the parameters of {model}",
-            where="camera.params",
-            fix=f"give {', '.join(names)}",
-        )
+        what, fix = f"{quote(params)} are not the parameters of {model}", f"give {', '.join(names)}"
+        raise InputError(what, where="camera.params", fix=fix)
     values = dict(zip(names, params, strict=True))
     focals = [name for name in names if name.startswith("f")]
     is_known = any(values[name] is not None for name in focals)
@@ -137,13 +119,11 @@ def _read_params(model: Any, params: Any, size: tuple[Any, Any], shift: float) -
             what = f"{name} is {quote(value)}, not a finite number"
             raise InputError(what, where="camera.params")
     lens, distortion = _lens_of(model, values)
-    return CameraForm(
-        size,
-        focals=(values[focals[0]], values[focals[-1]]) if is_known else None,
-        center=(values["cx"] - shift, values["cy"] - shift),
-        distortion=distortion,
-        lens=lens,
-    )
+    fields = {"cx": values["cx"] - shift, "cy": values["cy"] - shift, "distortion": distortion}
+    if is_known:
+        return fields | {"fx": values[focals[0]], "fy": values[focals[-1]], "lens": lens}
+    require_perspective_lens(lens, where="camera.params")
+    return fields
 
 
 def _lens_of(model: str, values: Mapping[str, float]) -> tuple[LensKind, tuple[float, ...]]:

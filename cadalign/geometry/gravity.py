@@ -40,7 +40,9 @@ def up_from_gravity(gravity: npt.ArrayLike, *, axes: str = "opencv") -> FloatArr
     >>> up_from_gravity([0.0, 9.81, 0.0]).tolist()
     [0.0, -1.0, 0.0]
     """
-    down = as_floats(gravity, name="gravity", shape=(3,)) * _signs(axes)
+    if axes not in _AXES:
+        raise InputError(f"unknown axes {quote(axes)}", where="axes", fix="give opencv or opengl")
+    down = as_floats(gravity, name="gravity", shape=(3,)) * _AXES[axes]
     length = float(np.linalg.norm(down))
     if not length > 0:
         raise InputError("a direction must not be zero", where="gravity")
@@ -196,9 +198,3 @@ def _plane(
         cross = np.cross(np.eye(3), ray) / length  # lens distortion changes it little
         covariance += cross.T @ of_ray @ cross
     return normal / length, covariance
-
-
-def _signs(axes: str) -> FloatArray:
-    if axes not in _AXES:
-        raise InputError(f"unknown axes {quote(axes)}", where="axes", fix="give opencv or opengl")
-    return _AXES[axes]

@@ -2,30 +2,61 @@
 
 All metrics take ``est`` and ``gt`` by keyword, score a perfect estimate as perfect, and refuse NaN.
 Those of alignments take the model's ``symmetry``, too: the truth is then that of `nearest_truth`.
+Names in the plural are their formulas for stacks, whose arrays have leading dimensions (...) more:
+nothing is checked, and errors of a stack are those of its members, bit for bit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_floats, as_points
+from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.box import Box, oriented_box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.pose_errors import (
-    box_ious,
-    have_volume,
-    rotation_errors,
-    scale_errors,
-    translation_errors,
-    translation_errors_up_to_scale,
-)
+from cadalign.geometry.rotations import angles_between, dots, lengths
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 
 _SAME_STRETCH = 0.01  # relative difference of true scales that annotations do not tell from 0
+_LEAST_SIDE = 1e-9  # of the longest side of a box with a volume
+
+
+class Alignments(NamedTuple):
+    """Alignments of n models: their rotations (n, 3, 3), translations (n, 3) and scales (n, 3)."""
+
+    rotation: FloatArray
+    translation: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def of(cls, alignments: Sequence[Alignment]) -> Alignments:
+        """Stack single alignments, at least one."""
+        return cls(
+            *(np.array([getattr(each, name) for each in alignments]) for name in cls._fields)
+        )
+
+
+class Boxes(NamedTuple):
+    """Boxes of n models: their centres (n, 3), axes (n, 3, 3) and side lengths (n, 3)."""
+
+    center: FloatArray
+    rotation: FloatArray
+    extents: FloatArray
+
+    @classmethod
+    def from_models(cls, bounds: FloatArray, alignments: Alignments) -> Boxes:
+        """The boxes of models with the bounds (n, 2, 3); see `Box.from_model`."""
+        return cls(*oriented_box(bounds, *alignments))
+
+
+_Poses = Alignment | Alignments
+_Boxes = Box | Boxes
 
 
 def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Alignment:
@@ -57,6 +88,10 @@ def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Align
     return group_of(symmetry).nearest(gt, est.rotation, tolerance=_SAME_STRETCH).alignment
 
 
+def _truth(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> Alignment:
+    return gt if symmetry is None else nearest_truth(est=est, gt=gt, symmetry=symmetry)
+
+
 def rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
     """Angle of the rotation between estimate and truth [degrees], 0 to 180.
 
@@ -65,16 +100,12 @@ def rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None =
     >>> rotation_error(est=Alignment.identity(), gt=Alignment.identity())
     0.0
     """
-    if symmetry is not None:
-        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    return float(rotation_errors(est=est, gt=gt))
+    return float(rotation_errors(est=est, gt=_truth(est, gt, symmetry)))
 
 
 def translation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> float:
     """Distance between the two translations [model units]."""
-    if symmetry is not None:
-        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    return float(translation_errors(est=est, gt=gt))
+    return float(translation_errors(est=est, gt=_truth(est, gt, symmetry)))
 
 
 def translation_error_up_to_scale(
@@ -93,9 +124,7 @@ def translation_error_up_to_scale(
     >>> translation_error_up_to_scale(est=est, gt=Alignment(np.eye(3), [0, 3, 4], np.ones(3)))
     3.0
     """
-    if symmetry is not None:
-        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    return float(translation_errors_up_to_scale(est=est, gt=gt))
+    return float(translation_errors_up_to_scale(est=est, gt=_truth(est, gt, symmetry)))
 
 
 def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = None) -> FloatArray:
@@ -107,9 +136,7 @@ def scale_error(*, est: Alignment, gt: Alignment, symmetry: Symmetry | None = No
     >>> scale_error(est=est, gt=Alignment.identity()).tolist()
     [0.0, 0.5, 0.5]
     """
-    if symmetry is not None:
-        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
-    return scale_errors(est=est, gt=gt)
+    return scale_errors(est=est, gt=_truth(est, gt, symmetry))
 
 
 def reprojection_error(
@@ -215,8 +242,7 @@ def alignment_box_iou(
     symmetry: Symmetry | None = None,
 ) -> float:
     """Box IoU of one model, with bounds (2, 3), under two alignments; see `box_iou`."""
-    if symmetry is not None:
-        gt = nearest_truth(est=est, gt=gt, symmetry=symmetry)
+    gt = _truth(est, gt, symmetry)
     bounds = as_floats(bounds, name="bounds", shape=(2, 3))
     return box_iou(est=Box.from_model(bounds, est), gt=Box.from_model(bounds, gt))
 
@@ -261,3 +287,60 @@ def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
             return None
         ends.append(equal * float(found.x[0]))
     return (ends[0], ends[1]) if ends[0] < ends[1] else None
+
+
+# Stacks ------------------------------------------------------------------------------------------
+
+
+def rotation_errors(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Angles (...) [degrees]; see `rotation_error`."""
+    return angles_between(est.rotation, gt.rotation)
+
+
+def translation_errors(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Distances (...) [model units]; see `translation_error`."""
+    return lengths(est.translation - gt.translation)
+
+
+def translation_errors_up_to_scale(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Distances (...); see `translation_error_up_to_scale`."""
+    squares = dots(est.translation, est.translation)
+    products = dots(est.translation, gt.translation)
+    factors = np.divide(products, squares, out=np.zeros_like(squares), where=squares > 0)
+    return lengths(np.maximum(factors, 0.0)[..., None] * est.translation - gt.translation)
+
+
+def scale_errors(*, est: _Poses, gt: _Poses) -> FloatArray:
+    """Relative errors (..., 3) along each axis; see `scale_error`."""
+    return np.asarray(np.abs(est.scale - gt.scale) / gt.scale)
+
+
+def have_volume(boxes: _Boxes) -> BoolArray:
+    """Mask (...) of the boxes that are not flat."""
+    extents = boxes.extents
+    return np.asarray(extents.min(axis=-1) > _LEAST_SIDE * extents.max(axis=-1))
+
+
+def box_ious(*, est: _Boxes, gt: _Boxes) -> FloatArray:
+    """Intersections over unions (...) of boxes that have a volume; see `box_iou`."""
+    from cadalign.geometry.clipping import intersection_volume  # `import cadalign` compiles nothing
+
+    # In a unit of about the boxes' own size no square under- or overflows.
+    unit = np.maximum(est.extents.max(axis=-1), gt.extents.max(axis=-1))
+    to_est = est.rotation.swapaxes(-1, -2)
+    centers = (to_est @ (gt.center - est.center)[..., None])[..., 0] / unit[..., None]
+    parts = (
+        est.extents / unit[..., None],
+        gt.extents / unit[..., None],
+        to_est @ gt.rotation,
+        centers,
+    )
+    shapes = ((-1, 3), (-1, 3), (-1, 3, 3), (-1, 3))
+    pairs = zip(
+        *(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)), strict=True
+    )
+    shared = np.reshape([intersection_volume(*pair) for pair in pairs], unit.shape)
+    # Python's powers: NumPy rounds those of an array otherwise than that of a number.
+    cubes = np.reshape([side**3 for side in unit.ravel().tolist()], unit.shape)
+    total = (est.extents.prod(axis=-1) + gt.extents.prod(axis=-1)) / cubes
+    return np.asarray(np.clip(shared / (total - shared), 0.0, 1.0))

@@ -91,8 +91,6 @@ def perspective(points_cam: FloatArray) -> FloatArray:
 LensKind = Literal["perspective", "fisheye", "fov"]
 """The kind of a lens, by the curve that its radius in the image follows."""
 
-FOCAL_FIX = "calibrate the camera; only a perspective lens's focal length is estimated"
-
 # Numbers of coefficients that a lens of each kind may have, and how to give them.
 _COEFFICIENTS = {
     "perspective": (
@@ -126,6 +124,13 @@ def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple
     if kind == "perspective" and not any(coefficients):
         return ()
     return (0.0,) * 4 if kind == "fisheye" and not coefficients else coefficients
+
+
+def require_perspective_lens(kind: str, *, where: str) -> None:
+    """Refuse a wide lens whose focal length is unknown."""
+    if kind != "perspective":
+        fix = "calibrate the camera; only a perspective lens's focal length is estimated"
+        raise InputError(f"the focal length of a {kind} lens is unknown", where=where, fix=fix)
 
 
 class _Terms(NamedTuple):

@@ -16,13 +16,7 @@ _LAST_ROW = 1e-6
 
 
 def dots(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Dot products (...) of vectors (..., k), those of BLAS bit for bit.
-
-    Examples
-    --------
-    >>> dots(np.array([[1.0, 2.0], [3.0, 4.0]]), np.array([[1.0, 1.0], [0.0, 2.0]])).tolist()
-    [3.0, 8.0]
-    """
+    """Dot products (...) of vectors (..., k), those of BLAS bit for bit."""
     return np.asarray(np.matmul(first[..., None, :], second[..., :, None])[..., 0, 0])
 
 
@@ -50,13 +44,7 @@ def rotation_from_vector(vector: FloatArray) -> FloatArray:
 
 
 def rotations_from_vectors(vectors: FloatArray) -> FloatArray:
-    """The rotation matrices (n, 3, 3) of rotation vectors (n, 3), as `rotation_from_vector`.
-
-    Examples
-    --------
-    >>> rotations_from_vectors(np.array([[0.0, 0.0, np.pi / 2]])).round(12).tolist()
-    [[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]]
-    """
+    """The rotation matrices (n, 3, 3) of rotation vectors (n, 3), as `rotation_from_vector`."""
     angles = np.linalg.norm(vectors, axis=1)
     axes = vectors / np.where(angles > 0, angles, 1.0)[:, None]
     cross = -by_rotation(axes)
@@ -65,13 +53,7 @@ def rotations_from_vectors(vectors: FloatArray) -> FloatArray:
 
 
 def by_rotation(points: FloatArray) -> FloatArray:
-    """Derivatives (..., 3, 3) of points (..., 3) by a rotation vector: columns are axis x point.
-
-    Examples
-    --------
-    >>> by_rotation(np.array([1.0, 2.0, 3.0])).tolist()
-    [[0.0, 3.0, -2.0], [-3.0, 0.0, 1.0], [2.0, -1.0, 0.0]]
-    """
+    """Derivatives (..., 3, 3) of points (..., 3) by a rotation vector: columns are axis x point."""
     x, y, z = np.moveaxis(points, -1, 0)
     found = np.zeros((*points.shape, 3))  # np.cross takes several times as long
     found[..., 0, 1], found[..., 0, 2], found[..., 1, 2] = z, -y, x
@@ -80,13 +62,7 @@ def by_rotation(points: FloatArray) -> FloatArray:
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
-    """The rotation vector (3,), axis times angle [rad], of a rotation matrix (3, 3).
-
-    Examples
-    --------
-    >>> vector_from_rotation(rotation_from_vector(np.array([0.0, 0.5, 0.0]))).round(12).tolist()
-    [0.0, 0.5, 0.0]
-    """
+    """The rotation vector (3,), axis times angle [rad], of a rotation matrix (3, 3)."""
     w, x, y, z = _quaternion(rotation)
     sine = math.sqrt(x * x + y * y + z * z)
     factor = 2.0 * math.atan2(sine, w) / sine if sine > 0 else 2.0
@@ -129,14 +105,7 @@ def angle_between(first: FloatArray, second: FloatArray) -> float:
 
 
 def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Angles (...) between matrices (..., 3, 3) [degrees], as `angle_between`.
-
-    Examples
-    --------
-    >>> turns = rotations_from_vectors(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]))
-    >>> angles_between(np.eye(3), turns).round(9).tolist()
-    [0.0, 180.0]
-    """
+    """Angles (...) between matrices (..., 3, 3) [degrees], as `angle_between`."""
     difference = first - second
     chord = lengths(difference.reshape(*difference.shape[:-2], 9)) / np.sqrt(8.0)
     cosine = np.sqrt(np.maximum(((first * second).sum(axis=(-2, -1)) + 1.0) / 4.0, 0.0))

@@ -25,7 +25,7 @@ from cadalign.errors import DegenerateError
 from cadalign.estimation.fit import fit_batch
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
-from cadalign.geometry.projection import perspective
+from cadalign.geometry.pixels import perspective
 from cadalign.retrieval.candidates import CandidateSet, Observed
 from cadalign.retrieval.kernels import Candidates, Query, search_all
 from cadalign.retrieval.match import Match

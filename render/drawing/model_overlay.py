@@ -18,7 +18,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.projection import projected_covariances
 from cadalign.io.images import read_image
 from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
@@ -187,9 +186,8 @@ def draw_result(
     is_first = number == 0 or result.rig_from_model is not None
     if result.model is not None and covariances is not None and is_first:
         turn = alignment.rotation @ result.alignment.rotation.T
-        projected = projected_covariances(
-            in_camera[ahead], turn @ covariances[ahead] @ turn.T, camera
-        )
+        turned = turn @ covariances[ahead] @ turn.T
+        projected = camera.projected_covariances(in_camera[ahead], turned)
         regions = confidence_regions(camera.project(in_camera[ahead]), projected)
     frame = None
     if mesh is not None:

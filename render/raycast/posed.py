@@ -13,10 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
-from cadalign.geometry.projection import model_rays
 from cadalign.geometry.raycaster import FaceArray, RayCaster
 from cadalign.render.drawing.color import LinearArray
 from cadalign.render.raycast.shading import Studio

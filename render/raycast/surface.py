@@ -6,8 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.geometry.edges import number_rows
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, number_rows
 from cadalign.geometry.raycaster import FaceArray
 from cadalign.render.drawing.color import LinearArray, linear_from_bytes, linear_from_srgb
 

@@ -14,7 +14,7 @@ from cadalign import Alignment, Camera, Mesh
 from cadalign.annotate.model import ClickableModel, Wireframe, box_lines, display_bytes
 from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.simplify import simplify
+from cadalign.geometry.mesh import simplify
 
 SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.geometry.projection import projected_covariances
 from cadalign.render import look_at
 
 DATA = Path(os.environ.get("CADALIGN_DATA", "/nonexistent")) / "keypointnet"
@@ -44,7 +43,7 @@ def test_keypoints_that_are_seen_are_better_known_than_the_rest() -> None:
     model = Model(points_3d=CORNERS, shape_sigma=0.05)
     result = align(model, View(CAMERA, photo_of(CORNERS)[:6]))
     in_camera = result.alignment.apply(result.points_3d)
-    covariances = projected_covariances(in_camera, result.points_cam_covariance, CAMERA)
+    covariances = CAMERA.projected_covariances(in_camera, result.points_cam_covariance)
     deviations = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
     assert (deviations[:6] < 1.5).all()
     assert (deviations[6:] > 3).all()
@@ -79,9 +78,8 @@ def test_regions_hold_unseen_keypoints_of_unseen_chairs() -> None:
         result = align(shape, view)
         rows = shape.rows(ids)
         in_camera = result.alignment.apply(result.points_3d[rows])
-        covariances = projected_covariances(
-            in_camera, result.points_cam_covariance[rows], KEYPOINT_CAMERA
-        )
+        own = result.points_cam_covariance[rows]
+        covariances = KEYPOINT_CAMERA.projected_covariances(in_camera, own)
         error = KEYPOINT_CAMERA.project(in_camera) - pixels
         found = np.einsum("na,nab,nb->n", error, np.linalg.inv(covariances), error)
         shares.extend(np.delete(found, seen) / result.radius(0.95, dimension=2) ** 2)

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from support.refusals import refusal_text
 
 from cadalign import Camera
-from cadalign.geometry.projection import projected_covariances
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.keypoint_layer import REGION_SHARE, UNSEEN_COLOR, confidence_regions
 
@@ -44,7 +43,7 @@ def test_projected_covariances_are_propagated(camera: Camera, seed: int) -> None
     point, covariance = rng.uniform([-1, -1, 4], [1, 1, 8]), random_covariance(rng, 3)
     steps = 1e-6 * np.eye(3)
     slopes = (camera.project(point + steps) - camera.project(point - steps)).T / 2e-6
-    (found,) = projected_covariances(point[None], covariance[None], camera)
+    (found,) = camera.projected_covariances(point[None], covariance[None])
     np.testing.assert_allclose(found, slopes @ covariance @ slopes.T, rtol=1e-4, atol=1e-4)
 
 

@@ -29,9 +29,8 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import model_rays
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import Evidence, Planes, kept_rows, log_focals_of

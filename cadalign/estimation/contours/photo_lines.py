@@ -12,10 +12,9 @@ from cadalign.estimation.contours.contour import Contour, Image, contour_of, int
 from cadalign.estimation.contours.regions import bins_of, crossings_of, edges_of, regions_of
 from cadalign.estimation.contours.rims import across_rims, find_rims
 from cadalign.estimation.contours.surface import PosedSurface
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
-from cadalign.geometry.projection import model_rays
 from cadalign.io.images import ByteImage
 
 STEPS = 10

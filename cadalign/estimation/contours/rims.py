@@ -14,9 +14,8 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import SPACING, Contour, Image, sampled, smoothed
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import model_rays
 from cadalign.geometry.raycaster import RayCaster
 
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed

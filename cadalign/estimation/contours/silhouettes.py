@@ -29,10 +29,9 @@ from cadalign.estimation.contours.atlas import (
     whitened,
 )
 from cadalign.estimation.contours.contour import Image
-from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.projection import model_rays
 
 _CELLS = 80  # of a mask's image
 _LINE_ANGLES = 16  # of what hides a part

@@ -15,7 +15,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import quote
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.projection import perspective
+from cadalign.geometry.pixels import perspective
 from cadalign.shapes.tails import probability_within
 from cadalign.solvers.projection import ray_derivatives
 

@@ -22,7 +22,7 @@ from cadalign.evaluation.instances.hull import HullView, KeypointHull, sample_hu
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.projection import perspective
+from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.seeding import instance_rng
 

@@ -22,9 +22,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
-from cadalign.geometry.edges import mesh_edges
-from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.simplify import cluster, simplify
+from cadalign.geometry.mesh import Mesh, cluster, mesh_edges, simplify
 from cadalign.io.files import dense_json, write_text, write_whole
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay

@@ -11,7 +11,7 @@ from cadalign.estimation.options import Sigma
 from cadalign.estimation.problems import focal_slopes, full_covariance, whitening_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
-from cadalign.geometry.projection import perspective
+from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.solvers.alignment import covariance_of, keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS

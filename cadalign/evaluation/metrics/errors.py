@@ -13,19 +13,17 @@ from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import (
-    box_iou,
-    box_iou_up_to_scale,
-    rotation_error,
-    scale_error,
-    translation_error,
-)
-from cadalign.geometry.pose_errors import (
     Alignments,
     Boxes,
+    box_iou,
+    box_iou_up_to_scale,
     box_ious,
     have_volume,
+    rotation_error,
     rotation_errors,
+    scale_error,
     scale_errors,
+    translation_error,
     translation_errors,
     translation_errors_up_to_scale,
 )

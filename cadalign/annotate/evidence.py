@@ -15,9 +15,8 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
+from cadalign.io.evidence import LENGTHS, ImageEvidence, ObservedImage, Size
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 
 Point2 = tuple[float, float]
 Point3 = tuple[float, float, float]

@@ -41,11 +41,10 @@ from cadalign.io.documents import (
     within,
     written_path,
 )
-from cadalign.io.evidence import ImageEvidence
+from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SeenKeypoint
-from cadalign.io.observed_image import ObservedImage
 
 logger = logging.getLogger("cadalign")
 

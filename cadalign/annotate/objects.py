@@ -24,9 +24,9 @@ from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.geometry.camera import Camera
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 
 
 @dataclass(eq=False)

@@ -26,8 +26,8 @@ from cadalign.annotate.track import FrameTrack
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import photo_size
 from cadalign.io.input_kinds import DetectorOptions
 from cadalign.io.observation import Observation, ObservationChanges
-from cadalign.io.observed_image import ObservedImage
 from cadalign.shapes.model import ShapeModel
 
 

@@ -25,9 +25,9 @@ from cadalign.datasets.detections.coco_masks import decode_segmentation
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import photo_size, write_image
 from cadalign.io.observation import Observation, with_lens
-from cadalign.io.observed_image import ObservedImage
 
 # Arguments of the library's functions, and their names on the command line.
 _FLAGS = {"image": "--image", "number": "--object", "sigma_from_scores": "--sigma"}

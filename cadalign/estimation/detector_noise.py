@@ -15,9 +15,9 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Count, Document, Finite, NotNegative, Positive, read_document
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import write_json
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 
 _LEAST_SIZE = 1.0  # of an object in the image [px]
 

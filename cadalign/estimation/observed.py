@@ -18,9 +18,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import within
-from cadalign.io.evidence import as_arguments
+from cadalign.io.evidence import ObservedImage, as_arguments
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
 

@@ -6,10 +6,9 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.io.camera_file import read_camera
-    from cadalign.io.evidence import EvidenceField, ImageEvidence, Size
+    from cadalign.io.evidence import EvidenceField, ImageEvidence, ObservedImage, Size
     from cadalign.io.meshes.load import load_mesh
     from cadalign.io.observation import Observation
-    from cadalign.io.observed_image import ObservedImage
 
 __all__ = [
     "EvidenceField",

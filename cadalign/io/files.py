@@ -1,14 +1,17 @@
-"""Atomic writes, and reads of regular files of bounded size; errors name the file."""
+"""Atomic writes, reads of regular files of bounded size, and sealed files; errors name the file."""
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import math
 import os
 import stat
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -167,3 +170,80 @@ def refuse_nul(path: Path) -> None:
     """Raise a DataError for a path with a NUL: the file system's ValueError does not name it."""
     if "\0" in str(path):
         raise DataError("the path holds a NUL character", where=printable(path))
+
+
+_HEADER = struct.Struct("<16sIIQ32s")
+
+
+@dataclass(frozen=True)
+class Seal:
+    """One format of sealed files: a header of 64 bytes, then the payload.
+
+    The header holds, in little-endian order, the 16 bytes that name the format, its version (4
+    bytes), 4 bytes of zero, the payload's length (8 bytes) and its BLAKE2b checksum (32 bytes).
+
+    Parameters
+    ----------
+    magic : bytes
+        The 16 bytes that name it.
+    version : int
+        The version that is written and read.
+    noun : str
+        Its name in messages, such as "library file".
+    fix : str
+        How to make such a file.
+    """
+
+    magic: bytes
+    version: int
+    noun: str
+    fix: str
+
+    def write(self, path: Path, payload: Any) -> None:
+        """Write a file atomically; ``payload`` is bytes or a buffer."""
+        size = memoryview(payload).nbytes
+        header = _HEADER.pack(self.magic, self.version, 0, size, checksum(payload))
+
+        def write(unfinished: Path) -> None:
+            with unfinished.open("wb") as file:
+                file.write(header)
+                file.write(payload)
+
+        write_whole(path, write)
+
+    def unwrap(self, content: Any, where: str) -> memoryview:
+        """Check the header and the checksum; returns the payload, which is not copied.
+
+        Raises
+        ------
+        DataError
+            If the content is of another format or version, truncated or damaged.
+        """
+        view = memoryview(content).cast("B")
+        if len(view) < _HEADER.size or bytes(view[:16]) != self.magic:
+            raise DataError(f"not a {self.noun}", where=where, fix=self.fix)
+        _, version, _, size, expected = _HEADER.unpack(view[: _HEADER.size])
+        payload = view[_HEADER.size :]
+        if version != self.version:
+            raise DataError(
+                f"a {self.noun} of version {version}, but this cadalign reads version "
+                f"{self.version}",
+                where=where,
+                fix=self.fix,
+            )
+        if len(payload) != size:
+            what = "truncated" if len(payload) < size else "too long"
+            raise self.error(f"is {what}: {len(payload)} bytes, {size} expected", where, again=True)
+        if checksum(payload) != expected:
+            raise self.error("is damaged: its checksum is wrong", where, again=True)
+        return payload
+
+    def error(self, what: str, where: str, *, again: bool = False) -> DataError:
+        """The error of a file whose content is wrong."""
+        fix = f"copy it again, or {self.fix}" if again else self.fix
+        return DataError(f"the {self.noun} {what}", where=where, fix=fix)
+
+
+def checksum(payload: Any) -> bytes:
+    """BLAKE2b checksum of 32 bytes."""
+    return hashlib.blake2b(payload, digest_size=32).digest()

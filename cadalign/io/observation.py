@@ -90,7 +90,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
-from cadalign.io.evidence import ImageEvidence, Size, as_arguments
+from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
 from cadalign.io.files import write_json
 from cadalign.io.observation_file import (
     fill_xyz,
@@ -100,7 +100,6 @@ from cadalign.io.observation_file import (
     read_start,
     write_image_fields,
 )
-from cadalign.io.observed_image import ObservedImage
 from cadalign.names import renamed
 
 

@@ -34,8 +34,14 @@ from cadalign.io.documents import (
     within,
     written_path,
 )
-from cadalign.io.evidence import EvidenceField, ImageEvidence, Size, as_arguments, evidence_fields
-from cadalign.io.observed_image import ObservedImage
+from cadalign.io.evidence import (
+    EvidenceField,
+    ImageEvidence,
+    ObservedImage,
+    Size,
+    as_arguments,
+    evidence_fields,
+)
 
 Declared = TypeVar("Declared", bound=Document)
 

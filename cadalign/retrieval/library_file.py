@@ -1,6 +1,6 @@
 """File format of libraries: a sealed Arrow table, mapped into memory.
 
-See `cadalign.io.sealed` for the header. The payload is an Arrow IPC file of the columns of
+See `cadalign.io.files` for the header. The payload is an Arrow IPC file of the columns of
 `cadalign.retrieval.models.SCHEMA`. Opening maps it into memory and compares the checksum, which
 reads the file once: 50,000 models of 10 keypoints are 30 MB and take some 0.1 s. Processes that
 open the same file share its memory.
@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cadalign.errors import DataError
-from cadalign.io.sealed import Seal, checksum
+from cadalign.io.files import Seal, checksum
 from cadalign.retrieval.models import SCHEMA, ModelTable
 
 _AGAIN = "build it with: cadalign library build"

@@ -1,6 +1,6 @@
 """File format of shape models: a sealed MessagePack document.
 
-See `cadalign.io.sealed` for the header. The document holds the fields of `cadalign.ShapeModel`;
+See `cadalign.io.files` for the header. The document holds the fields of `cadalign.ShapeModel`;
 arrays are little-endian numbers with their shape.
 """
 
@@ -18,8 +18,7 @@ from msgspec import Meta
 
 from cadalign.errors import InputError
 from cadalign.io.documents import Count, Document, Finite, Index, NotNegative, PathText, Positive
-from cadalign.io.files import read_bytes
-from cadalign.io.sealed import Seal
+from cadalign.io.files import Seal, read_bytes
 from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent, TrainingShapes
 from cadalign.shapes.tails import FewKeypoints

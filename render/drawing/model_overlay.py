@@ -18,10 +18,10 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import read_image
 from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.drawing.keypoint_layer import confidence_regions
 from cadalign.render.drawing.overlay import draw_overlay

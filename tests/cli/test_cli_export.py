@@ -14,10 +14,9 @@ from cadalign import Model, Result, View, align, fit
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
-from cadalign.io.evidence import ImageEvidence
+from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 
 MORE = np.vstack([KEYPOINTS, wedge().vertices[2:5], [[0.1, 0.2, 0.3]]])
 

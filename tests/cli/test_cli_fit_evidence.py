@@ -23,9 +23,8 @@ from cadalign import Alignment, Camera, Model, Result, Size, View, align
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.io.evidence import ImageEvidence
+from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry
 from cadalign.render.drawing.overlay import EST_COLOR

@@ -21,9 +21,8 @@ from cadalign.estimation.evidence_kinds import (
     remove_evidence,
 )
 from cadalign.io.documents import Positive
-from cadalign.io.evidence import EvidenceField, ImageEvidence
+from cadalign.io.evidence import EvidenceField, ImageEvidence, ObservedImage
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 
 POINTS, TRUTH = keypoints(), truth_of()
 DISTANCE = float(-(TRUTH.rotation.T @ TRUTH.translation)[0])  # of the camera along the model's x

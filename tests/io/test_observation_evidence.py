@@ -12,9 +12,8 @@ from support.files import replaced, write_json
 
 from cadalign import Alignment, Camera
 from cadalign.errors import DataError, InputError
-from cadalign.io.evidence import ImageEvidence, Size
+from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 
 CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": [500.0, 500.0, 320.0, 240.0]}
 KEYPOINTS = [

@@ -15,8 +15,8 @@ from cadalign.cli import main
 from cadalign.export.scene_parts import photo_plane
 from cadalign.geometry.box import Box
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.observation import Observation
-from cadalign.io.observed_image import ObservedImage
 from cadalign.render import Scene, cast_geometry, draw_overlay
 from cadalign.render.drawing.model_overlay import draw_result
 from cadalign.render.frame import LIGHT_GREY

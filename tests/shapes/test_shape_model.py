@@ -18,7 +18,7 @@ import cadalign
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
-from cadalign.io.sealed import Seal
+from cadalign.io.files import Seal
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import Reflection, ShapeComponent

@@ -24,8 +24,7 @@ from cadalign.io.meshes.gltf_document import (
     TextureUse,
 )
 from cadalign.io.meshes.join import join
-from cadalign.io.meshes.mtl import WHITE
-from cadalign.io.meshes.textures import Texture, Textures
+from cadalign.io.meshes.materials import WHITE, Texture, Textures
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # A node of some 20 bytes repeats a whole mesh: what all take together is bounded by the file.

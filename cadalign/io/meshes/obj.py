@@ -19,7 +19,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import damaged, read_bytes
-from cadalign.io.meshes.mtl import WHITE, load_materials
+from cadalign.io.meshes.materials import WHITE, load_materials
 
 _DIGITS = b"0123456789+-"
 _MAX_VALUES = 16  # of a vertex; the format has at most 7

@@ -21,9 +21,8 @@ from cadalign.errors import CadalignError, DataError
 from cadalign.geometry.mesh import GREY, Material, Mesh
 from cadalign.io.files import damaged, read_bytes
 from cadalign.io.meshes.join import join
-from cadalign.io.meshes.mtl import WHITE
+from cadalign.io.meshes.materials import WHITE, Texture, Textures
 from cadalign.io.meshes.obj import fan_triangles
-from cadalign.io.meshes.textures import Texture, Textures
 
 _MAX_HEADER_LINES = 1000
 

@@ -3,8 +3,9 @@
 `Library` holds the models, `Library.retrieve` ranks them and returns each as a `Match`.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.retrieval.library import Library
@@ -13,10 +14,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Library", "LibraryModel", "Match"]
 
-_LAZY = {"Library": "library", "LibraryModel": "models", "Match": "match"}
-
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(import_module(f"cadalign.retrieval.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = lazy_names(__name__)

@@ -1,4 +1,4 @@
-"""Probability that the object is none of a library's models, not even stretched.
+"""Probability that the object is none of a library's models; distances between their shapes.
 
 Two hypotheses explain an image's keypoints. By the first, the object is model k of the library,
 stretched, with the covariances C_i of its keypoints in the image that the options give. By the
@@ -25,21 +25,22 @@ any model passes, tell nothing: the probability is then near ``none_prior``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
 from cadalign.estimation.uncertainty.posterior import bent
-from cadalign.retrieval.candidates import CandidateSet, Observed
-from cadalign.retrieval.models import ModelTable
+from cadalign.geometry.rotations import by_rotation
+from cadalign.retrieval.models import LibraryModel, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.ranking import Ranking, shared_keypoints
-from cadalign.retrieval.shape import SAME_SHAPE
+from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, shared_keypoints
 from cadalign.solvers.constants import UNKNOWNS
 
+SAME_SHAPE = 0.01
+"""Distance below which two models count as the same shape."""
 LEAST_SPREAD = 0.7
 """Least standard deviation of log tau: objects of other categories are farther away."""
 _MOST_LIKELY = 40  # models that the sum is over
@@ -61,65 +62,63 @@ def none_probability(
     """Compute the probability that the object is none of the models; see the module."""
     if options.none_prior == 0:
         return 0.0
-    first = slice(_MOST_LIKELY)
-    chosen = ranking.candidates[first].tolist()
+    chosen = ranking.candidates[:_MOST_LIKELY].tolist()
     shared = [shared_keypoints(candidates, observed, candidate) for candidate in chosen]
-    names = [table.keys[row][0] for row in candidates.models[chosen].tolist()]
     alike: dict[tuple[str, int], list[int]] = {}  # places of models that are computed together
-    for place, (name, (_, rows)) in enumerate(zip(names, shared, strict=True)):
-        alike.setdefault((name, len(rows)), []).append(place)
+    for place, row in enumerate(candidates.models[chosen].tolist()):
+        alike.setdefault((table.keys[row][0], len(shared[place][1])), []).append(place)
+    extent = float(np.linalg.norm(np.ptp(observed.points_2d, axis=0)))
+    weights = np.exp(-0.5 * _STEPS**2)
     factors = np.empty(len(chosen))
     for (name, _), places in alike.items():
-        posed = _Posed(
-            ranking.poses[places],
-            np.array([shared[place][0] for place in places]),
-            np.array([shared[place][1] for place in places]),
-        )
-        factors[places] = _log_factors(posed, observed, options, *deviation_of(table, name))
-    relative = ranking.log_likelihoods[first] - ranking.log_likelihoods[0]
+        center, spread = deviation_of(table, name)
+        taus = np.concatenate([[0.0], np.exp(center + spread * _STEPS)])
+        covariances = observed.covariances + (taus * extent)[:, None, None, None] ** 2 * np.eye(2)
+        points, rows = (np.array([shared[place][k] for place in places]) for k in range(2))
+        poses = ranking.poses[places]
+        logs = _log_likelihoods(poses, points, rows, observed, covariances, options)
+        means = np.logaddexp.reduce(logs[1:] + np.log(weights / weights.sum())[:, None], axis=0)
+        factors[places] = means - logs[0]
+    relative = ranking.log_likelihoods[:_MOST_LIKELY] - ranking.log_likelihoods[0]
     odds = np.log(options.none_prior) - np.log1p(-options.none_prior)
     odds += np.logaddexp.reduce(relative + factors) - np.logaddexp.reduce(relative)
     return float(np.exp(-np.logaddexp(0.0, -odds)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Posed:
-    """Models at their optimal poses that share equally many keypoints with the image."""
-
-    poses: FloatArray  # (m, 15)
-    points_3d: FloatArray  # (m, n, 3)
-    rows: IntArray  # (m, n), of the keypoints in the image
-
-
-def _log_factors(
-    posed: _Posed, observed: Observed, options: RetrievalOptions, center: float, spread: float
-) -> FloatArray:
-    """Logarithms of E[B_k(tau)] of models (m,), log tau having this mean and deviation."""
-    extent = float(np.linalg.norm(np.ptp(observed.points_2d, axis=0)))
-    taus = np.concatenate([[0.0], np.exp(center + spread * _STEPS)])
-    covariances = observed.covariances + (taus * extent)[:, None, None, None] ** 2 * np.eye(2)
-    logs = _log_likelihoods(posed, observed, covariances, options)
-    weights = np.exp(-0.5 * _STEPS**2)
-    means = np.logaddexp.reduce(logs[1:] + np.log(weights / weights.sum())[:, None], axis=0)
-    return np.asarray(means - logs[0])
-
-
 def _log_likelihoods(
-    posed: _Posed, observed: Observed, covariances: FloatArray, options: RetrievalOptions
+    poses: FloatArray,
+    points_3d: FloatArray,
+    rows: IntArray,
+    observed: Observed,
+    covariances: FloatArray,
+    options: RetrievalOptions,
 ) -> FloatArray:
-    """Log of l_k (t, m) for covariances (t, all keypoints, 2, 2), the poses optimal for t = 0."""
-    query, fitting, rows = observed.query, options.fitting, posed.rows
+    """Log of l_k (t, m) for covariances (t, all keypoints, 2, 2), the poses optimal for t = 0.
+
+    Poses (m, 15) are of models that share equally many keypoints (m, n, 3) with the image, where
+    they are in the ``rows`` (m, n).
+    """
+    query, fitting = observed.query, options.fitting
     count = len(covariances)
     rays = np.tile(query.rays, (count, 1))
     white = whitening_of(covariances.reshape(-1, 2, 2), rays, observed.camera)
     a, b, c = white.reshape(count, -1, 3)[:, rows].transpose(3, 0, 1, 2)  # (t, m, n) each
-    errors, derivatives = _linearised(posed, query.rays[rows])
+    columns = poses[:, :9].reshape(-1, 3, 3) * poses[:, None, 12:]
+    turned = points_3d @ columns.swapaxes(1, 2)
+    points_cam = turned + poses[:, None, 9:12]
+    by_scale = columns[:, None, :, 1:] * points_3d[:, :, None, 1:]
+    shifts = np.broadcast_to(np.eye(3), (*turned.shape, 3))
+    by_unknown = np.concatenate([by_rotation(turned), shifts, by_scale], axis=3)  # (m, n, 3, 8)
+    projected = points_cam[..., :2] / points_cam[..., 2:]
+    errors = projected - query.rays[rows]
+    derivatives = by_unknown[:, :, :2] - projected[..., None] * by_unknown[:, :, 2:]
+    derivatives /= points_cam[..., 2, None, None]
     free = np.flatnonzero(query.free)
     u, v = derivatives[:, :, 0, free], derivatives[:, :, 1, free]
     jacobian = np.concatenate([a[..., None] * u + b[..., None] * v, c[..., None] * v], axis=2)
     across, down = a * errors[..., 0] + b * errors[..., 1], c * errors[..., 1]
     stretches = np.zeros((len(rows), UNKNOWNS))
-    stretches[:, 6:] = np.log(posed.poses[:, 13:])
+    stretches[:, 6:] = np.log(poses[:, 13:])
     prior = np.zeros(UNKNOWNS)
     prior[6:] = query.prior_weight
     prior, stretches = prior[free], stretches[:, free]
@@ -137,32 +136,12 @@ def _log_likelihoods(
     return np.asarray(-0.5 * (determinants + costs + np.linalg.slogdet(hessian)[1]))
 
 
-def _linearised(posed: _Posed, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Errors of the rays (m, n, 2), and their derivatives by the unknowns (m, n, 2, 8).
-
-    The unknowns are the rotation vector, the translation, log s_y and log s_z.
-    """
-    rotations, scales = posed.poses[:, :9].reshape(-1, 3, 3), posed.poses[:, 12:]
-    columns = rotations * scales[:, None]
-    turned = posed.points_3d @ columns.swapaxes(1, 2)
-    points_cam = turned + posed.poses[:, None, 9:12]
-    x, y, z = np.moveaxis(turned, 2, 0)
-    zero = np.zeros_like(x)
-    by_rotation = np.array([[zero, z, -y], [-z, zero, x], [y, -x, zero]]).transpose(2, 3, 0, 1)
-    by_translation = np.broadcast_to(np.eye(3), by_rotation.shape)
-    by_scale = columns[:, None, :, 1:] * posed.points_3d[:, :, None, 1:]
-    of_points = np.concatenate([by_rotation, by_translation, by_scale], axis=3)
-    projected = points_cam[..., :2] / points_cam[..., 2:]
-    derivatives = of_points[:, :, :2] - projected[..., None] * of_points[:, :, 2:]
-    return projected - rays, derivatives / points_cam[..., 2, None, None]
-
-
 @lru_cache(maxsize=256)
 def deviation_of(table: ModelTable, category: str) -> tuple[float, float]:
     """Mean and standard deviation of log tau: from models of a category to their nearest ones."""
-    points, has = _stacked(table, category)
+    _, points = table.keypoints_of(category)
     asked = np.arange(0, len(points), -(-len(points) // _ASKED))
-    gaps = _distances(points, has, asked)
+    gaps = _distances(points, asked)
     gaps = np.where(gaps > SAME_SHAPE, gaps, np.inf).min(axis=1)
     nearest = np.minimum(gaps[np.isfinite(gaps)] / np.sqrt(3), _FARTHEST)
     if len(nearest) < 2:
@@ -171,26 +150,15 @@ def deviation_of(table: ModelTable, category: str) -> tuple[float, float]:
     return float(np.mean(logs)), max(float(np.std(logs)), LEAST_SPREAD)
 
 
-def _stacked(table: ModelTable, category: str) -> tuple[FloatArray, BoolArray]:
-    """Keypoints (m, k, 3) of a category's models, and which of them each has, (m, k)."""
-    rows = table.rows_of(category)
-    offsets = table.offsets[rows.start : rows.stop + 1]
-    own = slice(int(offsets[0]), int(offsets[-1]))
-    ids, column = np.unique(table.ids[own], return_inverse=True)
-    model = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    points = np.zeros((len(offsets) - 1, len(ids), 3))
-    has = np.zeros(points.shape[:2], dtype=bool)
-    points[model, column] = table.xyz[own]
-    has[model, column] = True
-    return points, has
+def _distances(points: FloatArray, rows: IntArray) -> FloatArray:
+    """Distances (r, m) of all models from some, as `shape_distance`.
 
-
-def _distances(points: FloatArray, has: BoolArray, rows: IntArray) -> FloatArray:
-    """Distances (r, m) of all models from some, as `cadalign.retrieval.shape.shape_distance`.
-
-    Means over the keypoints that two models share are products of matrices.
+    Keypoints (m, k, 3) are NaN where a model lacks one. Means over those that two models share are
+    products of matrices.
     """
-    known, of_rows = has.astype(np.float64), has[rows].astype(np.float64)
+    has = ~np.isnan(points[:, :, 0])
+    points, known = np.nan_to_num(points), has.astype(np.float64)
+    of_rows = known[rows]
     shared = of_rows @ known.T
     counts = np.maximum(shared, 1.0)
     square = np.zeros(shared.shape)
@@ -209,3 +177,40 @@ def _distances(points: FloatArray, has: BoolArray, rows: IntArray) -> FloatArray
     with np.errstate(divide="ignore", invalid="ignore"):
         gaps = np.sqrt(np.maximum(square, 0.0)) / np.array(extents)[:, None]
     return np.asarray(np.where(shared >= _LEAST_SHARED, gaps, np.nan))
+
+
+def shape_distance(est: LibraryModel, gt: LibraryModel) -> float:
+    """Root mean square distance of the shared keypoints, as a share of the true ones' extent.
+
+    The estimated model is moved, and stretched along y and z (x is taken as known), to be closest
+    to the true one; it is not rotated. NaN with fewer than 2 shared keypoints.
+
+    Examples
+    --------
+    >>> xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    >>> bounds = np.array([[0, 0, 0], [1, 1, 1.0]])
+    >>> one = LibraryModel("box", "1", xyz, np.arange(4), bounds)
+    >>> two = LibraryModel("box", "2", xyz * [1, 2, 0.5] + 0.1, np.arange(4), bounds)
+    >>> round(shape_distance(two, one), 12)
+    0.0
+    """
+    if est.category != gt.category:
+        raise InputError(f"the categories {est.category!r} and {gt.category!r} differ", where="est")
+    _, mine, theirs = np.intersect1d(est.ids, gt.ids, return_indices=True)
+    return float(distances(est.xyz[None, mine], gt.xyz[theirs])[0])
+
+
+def distances(est: FloatArray, gt: FloatArray) -> FloatArray:
+    """Compute the shape distance of models' keypoints (m, k, 3) from others (k, 3), (m,) float."""
+    if len(gt) < 2:
+        return np.full(len(est), np.nan)
+    moved = est - est.mean(axis=1, keepdims=True)
+    wanted = gt - gt.mean(axis=0)
+    squares = (moved**2).sum(axis=1)
+    products = (moved * wanted).sum(axis=1)
+    # A mirrored or flat model cannot be stretched to the other.
+    scale = np.maximum(products, 0.0) / np.where(squares > 0, squares, 1.0)
+    scale[:, 0] = 1.0
+    gaps = moved * scale[:, None] - wanted
+    extent = float(np.linalg.norm(np.ptp(gt, axis=0))) or np.nan
+    return np.asarray(np.sqrt((gaps**2).sum(axis=2).mean(axis=1)) / extent)

@@ -1,39 +1,45 @@
-"""Ranking of models by a mask alone, without keypoints.
+"""Rankings by masks: of models by a mask alone, and of the best matches again by silhouettes.
 
-Each model has an outline: its silhouettes along directions all around, free of affine maps and so
-of pose and stretch. The models whose outlines resemble the mask most are aligned with it, and
-ranked by the likelihood of its contour at the estimate, neighbouring samples of which count as one
-as far as they are correlated.
+Without keypoints, each model has an outline: its silhouettes along directions all around, free of
+affine maps and so of pose and stretch. The models whose outlines resemble the mask most are aligned
+with it, and ranked by the likelihood of its contour at the estimate, neighbouring samples of which
+count as one as far as they are correlated.
+
+With keypoints, the silhouette of each match's mesh, posed and stretched, is compared with the
+object's pixels. The intersection over union of the correct model falls short of 1 by 0.05 on
+average, exponentially distributed, so a match gains ``IoU / 0.05`` in log-likelihood over one
+without overlap. A match without a mesh gains the mean of the others' gains, so that it is neither
+preferred nor rejected.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import replace
+from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, worker_count
+from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.align import align
 from cadalign.estimation.contours.atlas import Whitened, outline_of, overlaps
 from cadalign.estimation.contours.noise import cost_of_contour
 from cadalign.estimation.contours.silhouettes import outline_of_mask
 from cadalign.estimation.model import Model
-from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.summary import MaskResiduals
 from cadalign.estimation.view import View
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh
-from cadalign.render import Scene, cast_geometry, silhouette_iou
-from cadalign.retrieval.candidates import chosen_models
+from cadalign.render import Geometry, Scene, cast_geometry, silhouette_iou
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable
+from cadalign.retrieval.models import ModelKey, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.ranking import chosen_models
 
 logger = logging.getLogger("cadalign")
 
@@ -41,6 +47,9 @@ MOST_ALIGNED = 8
 """Models that are aligned with a mask, so that a list of matches is no longer."""
 
 _REACH = 24.0  # [px], farther away is no rim
+_SHORTFALL = 0.05
+_GRAB_ROUNDS = 5
+_MARGIN = 0.15  # around keypoints and boxes, as a share of their extent
 
 
 class OutlineStore:
@@ -68,29 +77,12 @@ class OutlineStore:
             return None
 
 
-@dataclass(frozen=True, eq=False)
-class _AlignedModel:
-    """A model aligned with the mask, and the contour there."""
-
-    model: LibraryModel
-    mesh: Mesh
-    result: Result
-    contour: MaskResiduals = field(repr=False)
-
-    @property
-    def cost(self) -> float:
-        """Mean of a sample's -log density."""
-        residuals = np.abs(np.nan_to_num(self.contour.residuals, nan=_REACH))
-        return cost_of_contour(np.minimum(residuals, _REACH), _REACH)
-
-
 def rank_by_mask(
     table: ModelTable,
     outlines: OutlineStore,
     mask: npt.NDArray[np.generic],
     camera: Camera,
     options: RetrievalOptions,
-    *,
     exclude: Collection[ModelKey],
     workers: int,
 ) -> list[Match]:
@@ -100,32 +92,26 @@ def rank_by_mask(
     DegenerateError if none can be aligned.
     """
     if not camera.focal_known:
-        raise InputError(
-            "a mask alone does not tell the focal length",
-            where="camera",
-            fix="give a calibrated camera, or keypoints",
-        )
+        what, fix = "a mask alone does not tell the focal length", "give a calibrated camera"
+        raise InputError(what, where="camera", fix=f"{fix}, or keypoints")
     inside = np.asarray(View(camera, mask=mask).mask_image) >= 0.5
     aligned = []
     for row in _resembling(table, outlines, inside, camera, options, exclude, workers):
-        found = _aligned(table.model(row), inside, camera, options)
+        found = _aligned(table, row, inside, camera, options)
         if found is not None:
             aligned.append(found)
     if not aligned:
-        raise DegenerateError(
-            "no model can be aligned with the mask",
-            where="mask",
-            fix="check the mask and the camera, or give keypoints",
-        )
-    aligned.sort(key=lambda each: each.cost)
-    first = aligned[0].contour
-    samples = len(first.residuals) / first.correlation
-    logs = np.array([-samples * each.cost for each in aligned])
+        what = "no model can be aligned with the mask"
+        fix = "check the mask and the camera, or give keypoints"
+        raise DegenerateError(what, where="mask", fix=fix)
+    aligned.sort(key=lambda each: each[0])
+    samples = aligned[0][1]
+    logs = np.array([-samples * cost for cost, _, _ in aligned])
     scores = np.exp(logs - logs[0])
     scores /= scores.sum()
     return [
-        _match(each, camera, inside, float(log), float(score))
-        for each, log, score in zip(aligned, logs, scores, strict=True)
+        replace(match, log_likelihood=float(log), score=float(score))
+        for (_, _, match), log, score in zip(aligned, logs, scores, strict=True)
     ][: options.top]
 
 
@@ -142,23 +128,26 @@ def _resembling(
     rows = chosen_models(table, options.category, exclude).tolist()
     query = outline_of_mask(inside, camera)
     found = [
-        (float(overlaps(outline, query).max()), row)
+        (-float(overlaps(outline, query).max()), row)
         for row, outline in zip(rows, outlines.of(rows, workers), strict=True)
         if outline is not None
     ]
     if not found:
-        raise InputError(
-            "no model has a mesh, without which a mask alone ranks nothing",
-            where="library",
-            fix="build the library with meshes, or give keypoints",
-        )
-    found.sort(key=lambda each: (-each[0], each[1]))
-    return [row for _, row in found[:MOST_ALIGNED]]
+        what = "no model has a mesh, without which a mask alone ranks nothing"
+        fix = "build the library with meshes, or give keypoints"
+        raise InputError(what, where="library", fix=fix)
+    return [row for _, row in sorted(found)[:MOST_ALIGNED]]
 
 
 def _aligned(
-    model: LibraryModel, inside: BoolArray, camera: Camera, options: RetrievalOptions
-) -> _AlignedModel | None:
+    table: ModelTable, row: int, inside: BoolArray, camera: Camera, options: RetrievalOptions
+) -> tuple[float, float, Match] | None:
+    """A model aligned with the mask; None if it cannot be.
+
+    Returns the mean of a contour sample's -log density, the number of samples without correlation,
+    and the match, whose likelihood and score are left open.
+    """
+    model = table.model(row)
     mesh = model.load_mesh()
     given = Model(mesh=mesh, stretch=options.stretch, stretch_sigma=options.stretch_sigma)
     try:
@@ -167,22 +156,20 @@ def _aligned(
         logger.debug("%s, model %s: %s", model.category, model.model_id, error)
         return None
     (contour,) = result.mask_residuals
-    return None if contour is None else _AlignedModel(model, mesh, result, contour)
-
-
-def _match(
-    aligned: _AlignedModel, camera: Camera, inside: BoolArray, log: float, score: float
-) -> Match:
-    model, alignment = aligned.model, aligned.result.alignment
-    silhouette = cast_geometry(Scene(aligned.mesh), camera, alignment).mask
+    if contour is None:
+        return None
+    residuals = np.abs(np.nan_to_num(contour.residuals, nan=_REACH))
+    cost = cost_of_contour(np.minimum(residuals, _REACH), _REACH)
+    alignment = result.alignment
+    silhouette = cast_geometry(Scene(mesh), camera, alignment).mask
     none: FloatArray = np.empty((0, 3))
-    return Match(
+    match = Match(
         category=model.category,
         model_id=model.model_id,
         alignment=alignment,
-        rms=aligned.contour.rms,
-        log_likelihood=log,
-        score=score,
+        rms=contour.rms,
+        log_likelihood=np.nan,
+        score=np.nan,
         box=Box.from_model(model.bounds, alignment),
         bounds=model.bounds,
         ids=np.empty(0, dtype=np.int64),
@@ -195,3 +182,90 @@ def _match(
         silhouette_iou=silhouette_iou(est=silhouette, gt=inside),
         camera=camera,
     )
+    return cost, len(contour.residuals) / contour.correlation, match
+
+
+# Reranking ---------------------------------------------------------------------------------------
+
+
+def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> list[Match]:
+    """Rank the best matches by keypoints and silhouettes together.
+
+    They get their ``silhouette_iou``, and ``score`` is redistributed among them. The likelihood
+    remains that of the keypoints.
+    """
+    casts = (cast_match(match, camera) for match in matches)
+    found = [None if cast is None else silhouette_iou(est=cast.mask, gt=mask) for cast in casts]
+    known = [overlap for overlap in found if overlap is not None]
+    if not known:
+        logger.warning("none of the matches has a mesh: the mask is not used")
+        return list(matches)
+    mean = float(np.mean(known))
+    gains = np.array([(mean if overlap is None else overlap) / _SHORTFALL for overlap in found])
+    log_scores = np.array([match.log_likelihood for match in matches]) + gains
+    weights = np.exp(log_scores - log_scores.max())
+    weights *= sum(match.score for match in matches) / weights.sum()
+    order = np.lexsort(([match.model_id for match in matches], -log_scores))
+    return [
+        replace(matches[k], score=float(weights[k]), silhouette_iou=found[k])
+        for k in order.tolist()
+    ]
+
+
+def mask_of(
+    mask: npt.ArrayLike | None,
+    image: npt.ArrayLike | None,
+    matches: Sequence[Match],
+    camera: Camera,
+) -> npt.NDArray[Any]:
+    """Choose the object's pixels: the given mask, the image's opacity, or a segmentation.
+
+    The segmentation (OpenCV's GrabCut) starts from the box around the keypoints and the best match.
+    The parameters are those of `cadalign.Library.retrieve`.
+    """
+    if (mask is None) == (image is None):
+        raise InputError("give a mask or an image, not both", where="mask")
+    where = "image" if mask is None else "mask"
+    found = np.asarray(image if mask is None else mask)
+    if mask is None:
+        if found.dtype != np.uint8 or found.ndim != 3 or found.shape[2] not in (3, 4):
+            what = f"{found.dtype} of shape {found.shape}, expected an RGB or RGBA image of uint8"
+            raise InputError(what, where="image")
+        found = found[:, :, 3] if found.shape[2] == 4 else _segment(found, matches, camera)
+    if found.shape != (camera.height, camera.width):
+        size = f"{camera.height} high and {camera.width} wide"
+        what = f"shape {found.shape}, but the camera's image is {size}"
+        raise InputError(what, where=where)
+    if np.isnan(silhouette_iou(est=found, gt=found)):
+        raise InputError("contains no pixel of the object", where=where)
+    return found
+
+
+def cast_match(match: Match, camera: Camera) -> Geometry | None:
+    """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
+    if match.mesh_path is None:
+        return None
+    try:
+        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
+    except CadalignError as error:
+        logger.warning("no silhouette: %s", error)
+        return None
+
+
+def _segment(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera) -> BoolArray:
+    """Segment the object by its colours, starting from a box."""
+    corners = camera.project(matches[0].box.corners)
+    points = np.concatenate([matches[0].points_2d, corners])
+    margin = _MARGIN * np.ptp(points, axis=0)
+    last = np.array(pixels.shape[1::-1]) - 1
+    left, top = np.clip(points.min(axis=0) - margin, 0, last).astype(int).tolist()
+    right, bottom = np.clip(points.max(axis=0) + margin, 0, last).astype(int).tolist()
+    labels: npt.NDArray[Any] = np.full(pixels.shape[:2], cv2.GC_BGD, dtype=np.uint8)
+    labels[top : bottom + 1, left : right + 1] = cv2.GC_PR_FGD
+    if (labels == cv2.GC_BGD).any() and (labels != cv2.GC_BGD).any():
+        cv2.setRNGSeed(0)
+        bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        colors = np.zeros((2, 1, 65))
+        whole = (0, 0, 1, 1)  # not used with a mask
+        cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _GRAB_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))

@@ -42,10 +42,9 @@ from cadalign.estimation.uncertainty.shape_posterior import (
 )
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
-from cadalign.retrieval.candidates import CandidateSet, Observed
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.ranking import Ranking
+from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking
 from cadalign.shapes.gaussians import Gaussians, Vectors, log_likelihoods
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS
@@ -75,15 +74,6 @@ class _Shapes:
     squares: FloatArray
     has: BoolArray
     deviation: float
-
-
-@dataclass(frozen=True, eq=False)
-class _Ranked:
-    """Candidates of a category, their log probabilities, and their poses (c, 15)."""
-
-    candidates: IntArray
-    logs: FloatArray
-    poses: FloatArray
 
 
 def shapes_by_category(
@@ -154,22 +144,14 @@ def rank_by_shape(
             parts.append(_rank_category(rows, models, known, observed, options, shape))
     if not parts:
         raise _no_shape()
-    logs = np.concatenate([part.logs for part in parts])
+    ranked, logs, poses = map(np.concatenate, zip(*parts, strict=True))
     if not len(logs):
-        raise DegenerateError(
-            "no model has all keypoints in front of the camera",
-            where="points_2d",
-            fix="check the keypoints, their semantic ids and the camera",
-        )
+        fix = "check the keypoints, their semantic ids and the camera"
+        what = "no model has all keypoints in front of the camera"
+        raise DegenerateError(what, where="points_2d", fix=fix)
     order = np.argsort(-logs, kind="stable")
     weights = np.exp(logs[order] - logs.max())
-    return Ranking(
-        np.concatenate([part.candidates for part in parts])[order],
-        np.concatenate([part.poses for part in parts])[order],
-        logs[order],
-        weights / weights.sum(),
-        0,
-    )
+    return Ranking(ranked[order], poses[order], logs[order], weights / weights.sum(), 0)
 
 
 def camera_by_shape(
@@ -188,10 +170,7 @@ def camera_by_shape(
         If the keypoints do not determine the focal length.
     """
     found: list[tuple[float, Camera]] = []
-    size = observed.camera
-    unknown = Camera.without_focal(
-        size.width, size.height, cx=size.cx, cy=size.cy, distortion=size.distortion
-    )
+    unknown = replace(observed.camera, focal_known=False)
     loss: dict[str, Any] = {"loss": options.loss, "loss_scale": options.loss_scale}
     for _, shape in sorted(shapes.items()):
         in_image = np.isin(observed.query.ids, shape.ids)
@@ -223,7 +202,8 @@ def _rank_category(
     observed: Observed,
     options: RetrievalOptions,
     shape: ShapeModel,
-) -> _Ranked:
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Candidates of a category, their log probabilities (c,), and their poses (c, 15)."""
     in_image = np.isin(observed.query.ids, shape.ids)
     view = _view(observed, in_image, options)
     result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
@@ -252,7 +232,7 @@ def _rank_category(
     # Models share the probability of their category.
     logs += evidence - np.logaddexp.reduce(logs)
     kept = _least_depths(poses, centred[:, :-BOX_ROWS], centres) > 0
-    return _Ranked(rows[kept], logs[kept], poses[kept])
+    return rows[kept], logs[kept], poses[kept]
 
 
 def _view(observed: Observed, in_image: BoolArray, options: RetrievalOptions) -> View:
@@ -326,16 +306,11 @@ def _least_depths(poses: FloatArray, centred: FloatArray, centres: FloatArray) -
 @lru_cache(maxsize=32)
 def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
     """All models of a category in the terms of its shape model."""
-    rows = table.rows_of(category)
-    offsets = table.offsets[rows.start : rows.stop + 1]
-    own = slice(int(offsets[0]), int(offsets[-1]))
-    row_of = {label: row for row, label in enumerate(shape.ids)}
-    ids, number = np.unique(table.ids[own], return_inverse=True)
-    row = np.array([row_of.get(label, -1) for label in ids.tolist()], dtype=np.int64)[number]
-    model = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    stacked = np.full((len(offsets) - 1, len(shape.ids) + BOX_ROWS, 3), np.nan)
-    stacked[model[row >= 0], row[row >= 0]] = table.xyz[own][row >= 0]
-    stacked[:, -BOX_ROWS:] = table.bounds[rows]
+    ids, points = table.keypoints_of(category)
+    _, rows, own = np.intersect1d(shape.ids, ids, return_indices=True)
+    stacked = np.full((len(points), len(shape.ids) + BOX_ROWS, 3), np.nan)
+    stacked[:, rows] = points[:, own]
+    stacked[:, -BOX_ROWS:] = table.bounds[table.rows_of(category)]
     has = ~np.isnan(stacked[:, :-BOX_ROWS, 0])
     prior = gaussians_of(shape).widened(_FLOOR * _extent(shape))
     flat = _completed(stacked.reshape(len(stacked), -1), prior)
@@ -348,10 +323,8 @@ def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
 def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:
     """Vectors (n, d) with the expectation of their missing entries under a mixture."""
     vectors = Vectors(values, np.ones(len(values)))
-    parts = [
-        Gaussians(prior.weights[[g]], prior.means[[g]], prior.covariances[[g]])
-        for g in range(len(prior.weights))
-    ]
+    every = zip(prior.weights, prior.means, prior.covariances, strict=True)
+    parts = [Gaussians(*(np.array([value]) for value in each)) for each in every]
     logs = np.array([log_likelihoods(values, part) for part in parts])
     shares = np.exp(logs - np.logaddexp.reduce(logs, axis=0))
     pairs = zip(shares, parts, strict=True)

@@ -17,12 +17,18 @@ from cadalign.geometry.camera import Camera
 from cadalign.names import renamed
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_by_category
-from cadalign.retrieval.candidates import gather_candidates, observe
-from cadalign.retrieval.library_file import fingerprint, read_library, write_library
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable, read_annotated
+from cadalign.retrieval.models import (
+    LibraryModel,
+    ModelKey,
+    ModelTable,
+    fingerprint,
+    read_annotated,
+    read_library,
+    write_library,
+)
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.ranking import make_matches, rank
+from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
@@ -213,7 +219,7 @@ class Library:
         mask : (h, w) bool, optional
             The object's pixels (of numbers, those above half of the largest possible one): reranks
             the best matches that have a mesh by their silhouettes; see
-            `cadalign.retrieval.silhouettes`.
+            `cadalign.retrieval.by_mask`.
         image : (h, w, 3) or (h, w, 4) uint8, optional
             The image instead of a mask: its opacity, or a segmentation around the keypoints, is
             the mask.
@@ -250,19 +256,22 @@ class Library:
         if points_2d is None or ids is None:
             others = (points_2d, ids, shape, image)
             if mask is None or any(each is not None for each in others):
-                raise InputError(
-                    "keypoints are missing",
-                    where="points_2d" if points_2d is None else "ids",
-                    fix="give keypoints with their ids, or mask= and camera= alone",
-                )
-            return self._retrieve_by_mask(mask, camera, chosen, exclude, workers)
+                where = "points_2d" if points_2d is None else "ids"
+                fix = "give keypoints with their ids, or mask= and camera= alone"
+                raise InputError("keypoints are missing", where=where, fix=fix)
+            from cadalign.retrieval.by_mask import OutlineStore, mask_of, rank_by_mask
+
+            if self._outlines is None:
+                self._outlines = OutlineStore(self._table)
+            inside, limits = mask_of(mask, None, (), camera), (exclude, workers)
+            return rank_by_mask(self._table, self._outlines, inside, camera, chosen, *limits)
+        is_calibrated = not isinstance(camera, Camera) or camera.focal_known
+        absent = None
         if shape is None:
-            if isinstance(camera, Camera) and not camera.focal_known:
-                raise InputError(
-                    "the focal length is unknown, without which no model's pose is searched",
-                    where="camera",
-                    fix="rank by shape=, which estimates it, or give it: camera.with_focal(...)",
-                )
+            if not is_calibrated:
+                what = "the focal length is unknown, without which no model's pose is searched"
+                fix = "rank by shape=, which estimates it, or give it: camera.with_focal(...)"
+                raise InputError(what, where="camera", fix=fix)
             observed = observe(points_2d, ids, camera, chosen)
             candidates = gather_candidates(self._table, observed, chosen, exclude, workers)
             ranking = rank(candidates, observed, chosen, workers)
@@ -272,44 +281,16 @@ class Library:
             category = next(iter(shapes)) if len(shapes) == 1 else None
             # The deviation of shapes is no noise of the keypoints here.
             plain = replace(chosen, shape_sigma=0.0, category=category)
-            if isinstance(camera, Camera) and not camera.focal_known:
+            if not is_calibrated:
                 some = camera.with_focal(max(camera.width, camera.height))  # which rays need
                 observed = observe(points_2d, ids, some, plain)
                 camera = camera_by_shape(observed, chosen, shapes, focal_prior)
             observed = observe(points_2d, ids, camera, plain)
             candidates = gather_candidates(self._table, observed, plain, exclude, workers)
             ranking = rank_by_shape(self._table, candidates, observed, chosen, shapes)
-            absent = None
-        matches = [
-            replace(match, none_probability=absent)
-            for match in make_matches(self._table, candidates, observed, ranking, chosen.top)
-        ]
+        matches = make_matches(self._table, candidates, observed, ranking, chosen.top, absent)
         if mask is None and image is None:
             return matches
-        from cadalign.retrieval.silhouettes import mask_of, rerank
+        from cadalign.retrieval.by_mask import mask_of, rerank  # with OpenCV and the renderer
 
         return rerank(matches, mask_of(mask, image, matches, camera), camera)
-
-    def _retrieve_by_mask(
-        self,
-        mask: npt.ArrayLike,
-        camera: Camera,
-        options: RetrievalOptions,
-        exclude: Collection[ModelKey],
-        workers: int,
-    ) -> list[Match]:
-        from cadalign.retrieval.by_mask import OutlineStore, rank_by_mask
-        from cadalign.retrieval.silhouettes import mask_of
-
-        if self._outlines is None:
-            self._outlines = OutlineStore(self._table)
-        inside = mask_of(mask, None, (), camera)
-        return rank_by_mask(
-            self._table,
-            self._outlines,
-            inside,
-            camera,
-            options,
-            exclude=exclude,
-            workers=workers,
-        )

@@ -107,9 +107,7 @@ class Match:
         )
 
     def _repr_html_(self) -> str:
-        scale = ", ".join(
-            f"{axis} {value:.3g}" for axis, value in zip("xyz", self.alignment.scale, strict=True)
-        )
+        scales = zip("xyz", self.alignment.scale, strict=True)
         absent = self.none_probability
         none = [] if absent is None else [("none of these", f"{100 * absent:.3g} %")]
         rows = [
@@ -119,7 +117,7 @@ class Match:
             *none,
             ("keypoints", f"{self.shared} of {self.shared + len(self.missing_ids)}"),
             ("residuals (rms)", f"{self.rms:.3g} px"),
-            ("stretch", scale),
+            ("stretch", ", ".join(f"{axis} {value:.3g}" for axis, value in scales)),
         ]
         camera = self.camera
         if camera is None:
@@ -156,11 +154,8 @@ class Match:
         assert seen.ids is not None
         kept = np.flatnonzero(np.isin(seen.ids, self.ids))
         ids = seen.ids[kept]
-        own: dict[str, Any] = {
-            name: None if values is None else values[kept]
-            for name in ("sigma", "scores", "depths")
-            for values in (getattr(seen, name),)
-        }
+        own: dict[str, Any] = {name: getattr(seen, name) for name in ("sigma", "scores", "depths")}
+        own = {name: None if each is None else each[kept] for name, each in own.items()}
         return replace(
             seen,
             points_3d=self.points_3d[np.searchsorted(self.ids, ids)],
@@ -199,19 +194,12 @@ class Match:
 
     def to_dict(self) -> dict[str, Any]:
         """Write the match as plain lists and numbers, for JSON."""
+        names = ("category", "model_id", "score", "log_likelihood", "rms", "shared")
+        box = {name: getattr(self.box, name).tolist() for name in ("center", "rotation", "extents")}
         return {
-            "category": self.category,
-            "model_id": self.model_id,
-            "score": self.score,
-            "log_likelihood": self.log_likelihood,
-            "rms": self.rms,
-            "shared": self.shared,
+            **{name: getattr(self, name) for name in names},
             "alignment": self.alignment.to_dict(),
-            "box": {
-                "center": self.box.center.tolist(),
-                "rotation": self.box.rotation.tolist(),
-                "extents": self.box.extents.tolist(),
-            },
+            "box": box,
             "semantic_ids": self.ids.tolist(),
             "residuals": self.residuals.tolist(),
             "missing_ids": list(self.missing_ids),

@@ -69,26 +69,17 @@ class RetrievalOptions(AlignmentOptions):
 
     def __post_init__(self) -> None:
         if self.method not in METHODS:
-            raise InputError(
-                f"unknown method {self.method!r}",
-                where="method",
-                fix=f"known are {', '.join(METHODS)}",
-            )
+            fix = f"known are {', '.join(METHODS)}"
+            raise InputError(f"unknown method {self.method!r}", where="method", fix=fix)
         if not isinstance(self.top, int) or self.top < 1:
             raise InputError(f"must be a whole number >= 1, not {self.top!r}", where="top")
         if self.sigma is None:
-            raise InputError(
-                "the noise must be known to compare models",
-                where="sigma",
-                fix="give pixels, and shape_sigma where shapes differ",
-            )
+            fix = "give pixels, and shape_sigma where shapes differ"
+            raise InputError("the noise must be known to compare models", where="sigma", fix=fix)
+        is_share = 1e-9 <= self.missing_prob <= 1 - 1e-9
         for name, is_valid, rule in (
             ("shape_sigma", 0 <= self.shape_sigma < math.inf, ">= 0"),
-            (
-                "missing_prob",
-                1e-9 <= self.missing_prob <= 1 - 1e-9,
-                "between 0 and 1, both excluded",
-            ),
+            ("missing_prob", is_share, "between 0 and 1, both excluded"),
             ("spurious", 1e-9 <= self.spurious < math.inf, "> 0"),
             ("none_prior", 0 <= self.none_prior < 1, "between 0 and 1, the latter excluded"),
             ("max_stretch", 1 <= self.max_stretch <= 1000, "between 1 and 1000"),
@@ -96,11 +87,9 @@ class RetrievalOptions(AlignmentOptions):
             if not is_valid:
                 raise InputError(f"must be {rule}, not {getattr(self, name)}", where=name)
         if self.method == "epnp" and (self.loss != "linear" or self.stretch not in (None, "none")):
-            raise InputError(
-                "the method 'epnp' supports neither loss nor stretch",
-                where="method",
-                fix="use the method 'optimal', or leave these options at their defaults",
-            )
+            what = "the method 'epnp' supports neither loss nor stretch"
+            fix = "use the method 'optimal', or leave these options at their defaults"
+            raise InputError(what, where="method", fix=fix)
         _ = self.fitting  # checks the options that it shares with a fit
 
     @property

@@ -15,8 +15,8 @@ from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.color import ByteImage
 from cadalign.render.frame import LIGHT_GREY
+from cadalign.retrieval.by_mask import cast_match
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.silhouettes import cast_match
 from cadalign.web import asset, fill
 
 
@@ -38,7 +38,11 @@ def write_retrieval(
     """
     if image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
-    _remove_overlays(folder)
+    with writing(folder):  # overlays of an earlier retrieval, but no files with similar names
+        for path in folder.glob("overlay_*.png"):
+            number = path.stem.removeprefix("overlay_")
+            if number.isdecimal() and path.name == overlay_name(int(number)):
+                path.unlink()
     for rank, match in enumerate(matches, start=1):
         write_image(folder / overlay_name(rank), draw_match(image, camera, match))
         if query is not None:
@@ -48,13 +52,14 @@ def write_retrieval(
                 fit.mkdir(exist_ok=True)
             match.result.save(fit / "fit.json")
     write_json(folder / "matches.json", [match.to_dict() for match in matches])
+    none = none_text(matches)
     html = fill(
         "retrieval.html",
         title=escape(title),
         style=asset("retrieval.css"),
         count=len(matches),
         library=escape(library),
-        none=_none_line(matches),
+        none="" if none is None else f'<p class="lead"><strong>{escape(none)}</strong></p>',
         matches="".join(_card(rank, match) for rank, match in enumerate(matches, start=1)),
     )
     page = folder / "index.html"
@@ -65,15 +70,6 @@ def write_retrieval(
 def overlay_name(rank: int) -> str:
     """File name of a match's overlay; ranks count from 1."""
     return f"overlay_{rank:02d}.png"
-
-
-def _remove_overlays(folder: Path) -> None:
-    """Remove the overlays of an earlier retrieval, but no files with similar names."""
-    with writing(folder):
-        for path in folder.glob("overlay_*.png"):
-            rank = path.stem.removeprefix("overlay_")
-            if rank.isdecimal() and path.name == overlay_name(int(rank)):
-                path.unlink()
 
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
@@ -92,11 +88,6 @@ def none_text(matches: Sequence[Match]) -> str | None:
     """Sentence of a table or page on the probability that the object is none of the models."""
     probability = matches[0].none_probability if matches else None
     return None if probability is None else f"None of these: {score_text(probability)}"
-
-
-def _none_line(matches: Sequence[Match]) -> str:
-    text = none_text(matches)
-    return "" if text is None else f'<p class="lead"><strong>{escape(text)}</strong></p>'
 
 
 def _card(rank: int, match: Match) -> str:

@@ -77,11 +77,9 @@ class ObservationRetrieval:
                 mask = read_mask(seen.evidence.mask, camera)
             return library.retrieve(mask=mask, camera=camera, workers=workers, **vars(self.ranking))
         if shape is None and not camera.focal_known:
-            raise InputError(
-                "the focal length is unknown, without which no model's pose is searched",
-                where=f"{where}: camera",
-                fix="rank by --shape, which estimates it, or give a calibrated camera",
-            )
+            what = "the focal length is unknown, without which no model's pose is searched"
+            fix = "rank by --shape, which estimates it, or give a calibrated camera"
+            raise InputError(what, where=f"{where}: camera", fix=fix)
         prior = None
         if not camera.focal_known and seen.image is not None:
             prior = FocalPrior.from_exif(seen.image)
@@ -160,11 +158,8 @@ def read_mask(path: Path, camera: Camera) -> BoolArray:
 def read_opacity(path: Path | None, camera: Camera) -> ByteImage:
     """Read a photo with its opacity if it has one, (h, w, 3 or 4) uint8, upright by EXIF."""
     if path is None:
-        raise InputError(
-            "the observation names no image",
-            where="--silhouette",
-            fix="add the image to the observation, or give the object's pixels with --mask",
-        )
+        fix = "add the image to the observation, or give the object's pixels with --mask"
+        raise InputError("the observation names no image", where="--silhouette", fix=fix)
     colors = read_image(path, camera)
     from PIL import ImageOps
 

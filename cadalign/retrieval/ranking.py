@@ -1,11 +1,12 @@
-"""Ranking of candidates by a best-first search with bounds.
+"""Candidates of a query, and their ranking by a best-first search with bounds.
 
-The lower bound of a candidate's errors (`kernels.bound_all`) gives an upper bound of its
-log-likelihood. Candidates are searched in growing batches, in the order of their bounds, until the
-bounds of all others lie 20 below the best log-likelihood found. So every match with a score above
-1e-8 has the rank of an exhaustive search. If these do not fill the top list, up to 768 more
-candidates are searched, so that in a library of that size the whole list is exact. A candidate's
-search ends early once its pose is out of reach of a log-likelihood that would count.
+A candidate is a model with its own or mirrored keypoint labels. The lower bound of its errors
+(`kernels.bound_all`) gives an upper bound of its log-likelihood. Candidates are searched in growing
+batches, in the order of their bounds, until the bounds of all others lie 20 below the best
+log-likelihood found. So every match with a score above 1e-8 has the rank of an exhaustive search.
+If these do not fill the top list, up to 768 more candidates are searched, so that in a library of
+that size the whole list is exact. A candidate's search ends early once its pose is out of reach of
+a log-likelihood that would count.
 
 Candidates are searched independently: the result does not depend on the order of the library or on
 the number of threads.
@@ -13,29 +14,37 @@ the number of threads.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import numpy as np
+import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, worker_count
-from cadalign.errors import DegenerateError
+from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
+from cadalign.datasets.models.categories import require_category
+from cadalign.errors import DegenerateError, InputError
+from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.fit import fit_batch
+from cadalign.estimation.options import LOSSES, Sigma
+from cadalign.estimation.problems import rays_of, whitening_of
+from cadalign.estimation.uncertainty.posterior import bent
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
-from cadalign.retrieval.candidates import CandidateSet, Observed
-from cadalign.retrieval.kernels import Candidates, Query, search_all
+from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import ModelTable
+from cadalign.retrieval.models import ModelKey, ModelTable, check_semantic_ids
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.solvers.constants import POSE_SIZE
 
+_BOUNDED_AT_ONCE = 1024  # candidates that a thread bounds at a time
+_SEARCHED_AT_ONCE = 32  # and searches
 _FIRST_BATCH = 64
 _LARGEST_BATCH = 4096
-_PIECE = 32  # candidates that a thread gets at a time
 # Candidates this far below the best in log-likelihood are negligible: 50,000 of them together have
 # 1e-4 of its probability.
 _NEGLIGIBLE = 20.0
@@ -57,6 +66,29 @@ packed poses (m, 15) and costs (m,)."""
 
 
 @dataclass(frozen=True, eq=False)
+class Observed:
+    """An image's keypoints, in the order of their semantic ids."""
+
+    order: IntArray  # (n,), their rows as they were given
+    points_2d: FloatArray  # (n, 2) [px]
+    covariances: FloatArray  # (n, 2, 2) [px^2]
+    camera: Camera
+    query: Query  # semantic ids and rays of the keypoints, for the kernels
+    spurious: float  # log-likelihood of the keypoints if all of them are spurious
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateSet:
+    """The c candidates of a query that share enough keypoints with it."""
+
+    keypoints: Candidates  # for the kernels
+    models: IntArray  # (c,), rows of the models in the table
+    mirrored: BoolArray  # (c,)
+    base: FloatArray  # (c,), log-likelihood of a candidate that fits without error
+    bounds: FloatArray  # (c,), lower bounds of the costs, twice the loss of log-likelihood
+
+
+@dataclass(frozen=True, eq=False)
 class Ranking:
     """Searched candidates, one for each of m models, the best first."""
 
@@ -67,41 +99,166 @@ class Ranking:
     searched: int  # number of candidates that were searched for a pose
 
 
+def observe(
+    points_2d: npt.ArrayLike, ids: npt.ArrayLike, camera: Camera, options: RetrievalOptions
+) -> Observed:
+    """Check an image's keypoints and prepare them for the kernels."""
+    if not isinstance(camera, Camera):
+        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
+    require_perspective(camera, "retrieval")
+    pixels = as_points(points_2d, name="points_2d", dimension=2)
+    ids = check_semantic_ids(ids, len(pixels), where="ids")
+    order = np.argsort(ids)
+    pixels, ids = pixels[order], ids[order]
+    covariances = _covariances(options, pixels, order)
+    rays = np.require(rays_of(pixels, camera), np.float64, ["C", "W"])
+    fitting = options.fitting
+    density = np.log1p(-options.missing_prob) - np.log(2 * np.pi)
+    off = np.log(options.spurious / (camera.width * camera.height))
+    query = Query(
+        ids=ids,
+        rays=rays,
+        whitening=whitening_of(covariances, rays, camera),
+        loss=LOSSES[fitting.loss],
+        loss_scale=float(fitting.loss_scale),
+        prior_weight=fitting.prior_weight,
+        free=fitting.free,
+        max_stretch=float(options.max_stretch),
+        gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
+    )
+    return Observed(order, pixels, covariances, camera, query, float(off) * len(ids))
+
+
+def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
+    """Sum of the covariances of noise and shape, (n, 2, 2) float [px^2], in the given order."""
+    count = len(pixels)
+    sigma = cast("Sigma", options.sigma)  # the options refuse None
+    if np.ndim(sigma) == 3:
+        covariances = as_floats(sigma, name="sigma", shape=(count, 2, 2))[order]
+    else:
+        shape: tuple[int | None, ...] = () if np.ndim(sigma) == 0 else (count,)
+        deviations = np.broadcast_to(as_floats(sigma, name="sigma", shape=shape), count)
+        if not (deviations > 0).all():
+            raise InputError("all values must be > 0", where="sigma")
+        covariances = deviations[order][:, None, None] ** 2 * np.eye(2)
+    extent = float(np.linalg.norm(np.ptp(pixels, axis=0))) if count else 0.0
+    return np.asarray(covariances + (options.shape_sigma * extent) ** 2 * np.eye(2))
+
+
+def chosen_models(
+    table: ModelTable, category: str | None, exclude: Collection[ModelKey]
+) -> IntArray:
+    """Select the rows of the models to compare, in the table's order.
+
+    Raises InputError if there are none, or the category is unknown.
+    """
+    if not len(table):
+        raise InputError("the library is empty", where="library")
+    rows = np.arange(len(table))
+    if category is not None:
+        rows = rows[table.rows_of(require_category(category, table.categories, where="category"))]
+    if exclude:
+        unwanted = set(exclude)
+        rows = rows[[table.keys[row] not in unwanted for row in rows.tolist()]]
+        if not len(rows):
+            raise InputError("all models are excluded", where="exclude")
+    return rows
+
+
+def gather_candidates(
+    table: ModelTable,
+    observed: Observed,
+    options: RetrievalOptions,
+    exclude: Collection[ModelKey],
+    workers: int = -1,
+) -> CandidateSet:
+    """Gather the candidates of a query, without the models to ``exclude``."""
+    threads, query = worker_count(workers), observed.query
+    chosen = chosen_models(table, options.category, exclude)
+    known = table.known_ids(None if options.category is None else table.keys[int(chosen[0])][0])
+    unknown = np.setdiff1d(query.ids, known)
+    if len(unknown):
+        where = "the library" if options.category is None else f"the category {options.category!r}"
+        what = f"no model of {where} has a keypoint with the semantic id {unknown[0]}"
+        raise InputError(what, where="ids", fix=f"known are {_ranges(known)}")
+    models, candidates, labelings = _candidates(table, chosen, options.symmetries)
+
+    def bound(start: int) -> tuple[FloatArray, FloatArray, IntArray]:
+        spans = candidates.spans[start : start + _BOUNDED_AT_ONCE]
+        return bound_all(query, candidates._replace(spans=spans))
+
+    with ThreadPoolExecutor(threads) as pool:
+        parts = list(pool.map(bound, range(0, len(candidates.spans), _BOUNDED_AT_ONCE)))
+    bounds, gains, shared = map(np.concatenate, zip(*parts, strict=True))
+    kept = shared >= LEAST_SHARED
+    if not kept.any():
+        what = f"no model shares more than {shared.max()} keypoints with the image"
+        fix = f"at least {LEAST_SHARED} are needed to align a model"
+        raise DegenerateError(what, where="ids", fix=fix)
+    # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
+    bounds = bent(bounds, options.loss, options.loss_scale)
+    counts = candidates.spans[:, 1] - candidates.spans[:, 0]
+    base = gains + observed.spurious + (counts - shared) * np.log(options.missing_prob)
+    base = base + options.log_scale_constant - np.log(labelings)
+    spans = np.ascontiguousarray(candidates.spans[kept])
+    mirrored = spans[:, 0] != spans[:, 2]
+    kept_keypoints = candidates._replace(spans=spans)
+    return CandidateSet(kept_keypoints, models[kept], mirrored, base[kept], bounds[kept])
+
+
+def _candidates(
+    table: ModelTable, chosen: IntArray, symmetries: bool
+) -> tuple[IntArray, Candidates, IntArray]:
+    """List the candidates: models (c,), keypoints, and numbers of labelings of each model (c,)."""
+    first, last = table.offsets[chosen], table.offsets[chosen + 1]
+    labelings = np.ones_like(chosen)
+    if symmetries:
+        starts, ends = table.labeling_offsets[chosen], table.labeling_offsets[chosen + 1]
+        labelings += (ends - starts) // (last - first)
+    models = np.repeat(chosen, labelings)
+    number = np.arange(len(models)) - np.repeat(np.cumsum(labelings) - labelings, labelings)
+    spans = np.repeat(np.stack([first, last, first], axis=1), labelings, axis=0)
+    mirrored = table.labeling_offsets[models] + (number - 1) * (spans[:, 1] - spans[:, 0])
+    spans[:, 2] = np.where(number > 0, len(table.xyz) + mirrored, spans[:, 0])
+    candidates = Candidates(table.xyz, table.ids, table.places, spans)
+    return models, candidates, np.repeat(labelings, labelings)
+
+
+def _ranges(ids: IntArray) -> str:
+    """Format ascending numbers as ranges: 0-2, 5."""
+    runs = np.split(ids, np.flatnonzero(np.diff(ids) > 1) + 1)
+    return ", ".join(
+        str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs if len(run)
+    )
+
+
 def rank(
     candidates: CandidateSet, observed: Observed, options: RetrievalOptions, workers: int
 ) -> Ranking:
     """Rank the models of a candidate set."""
-    threads = worker_count(workers)
     found = _SearchState(candidates)
     if options.method == "epnp":
         _search_in_order(found, options, partial(_search_unstretched, candidates, observed))
         return found.ranking()
-    with ThreadPoolExecutor(threads) as pool:
-        search = partial(_search_in_pieces, pool, observed.query, candidates.keypoints)
+    with ThreadPoolExecutor(worker_count(workers)) as pool:
+
+        def search(
+            effort: tuple[int, int, int], chosen: IntArray, ceilings: FloatArray
+        ) -> tuple[FloatArray, FloatArray]:
+            def piece(start: int) -> tuple[FloatArray, FloatArray]:
+                own = slice(start, start + _SEARCHED_AT_ONCE)
+                known = observed.query, candidates.keypoints
+                return search_all(*known, chosen[own], ceilings[own], *effort)
+
+            parts = list(pool.map(piece, range(0, len(chosen), _SEARCHED_AT_ONCE)))
+            poses, costs = map(np.concatenate, zip(*parts, strict=True))
+            return poses, costs
+
         effort = _EFFORT if options.loss == "linear" else _ROBUST_EFFORT
         _search_in_order(found, options, partial(search, effort))
         last = found.ranking().candidates[: 2 * options.top]
         found.search(last, partial(search, _FINAL_EFFORT), floor=-np.inf)
     return found.ranking()
-
-
-def _search_in_pieces(
-    pool: ThreadPoolExecutor,
-    query: Query,
-    keypoints: Candidates,
-    effort: tuple[int, int, int],
-    chosen: IntArray,
-    ceilings: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Search the chosen candidates in the threads of a pool; see `Search`."""
-
-    def search(start: int) -> tuple[FloatArray, FloatArray]:
-        piece = slice(start, start + _PIECE)
-        return search_all(query, keypoints, chosen[piece], ceilings[piece], *effort)
-
-    parts = list(pool.map(search, range(0, len(chosen), _PIECE)))
-    poses, costs = zip(*parts, strict=True)
-    return np.concatenate(poses), np.concatenate(costs)
 
 
 class _SearchState:
@@ -141,11 +298,9 @@ class _SearchState:
         order = np.argsort(-self._reached, kind="stable")
         order = order[np.isfinite(self._reached[order])]
         if not len(order):
-            raise DegenerateError(
-                "no model can be aligned with the keypoints",
-                where="points_2d",
-                fix="check the keypoints, their semantic ids and the camera",
-            )
+            fix = "check the keypoints, their semantic ids and the camera"
+            what = "no model can be aligned with the keypoints"
+            raise DegenerateError(what, where="points_2d", fix=fix)
         _, first = np.unique(self._candidates.models[order], return_index=True)
         order = order[np.sort(first)]
         reached = self._reached[order]
@@ -157,8 +312,7 @@ class _SearchState:
 def _search_in_order(found: _SearchState, options: RetrievalOptions, search: Search) -> None:
     """Search the candidates in the order of their bounds; see the module."""
     order = np.argsort(-found.limits, kind="stable")
-    done = 0
-    size = _FIRST_BATCH
+    done, size = 0, _FIRST_BATCH
     while done < len(order):
         batch = order[done : done + size]
         if not options.exhaustive:
@@ -181,23 +335,17 @@ def _search_unstretched(
     candidates: CandidateSet, observed: Observed, chosen: IntArray, _ceilings: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Compute poses and costs by OpenCV's EPnP."""
-    points, seen = [], []
-    for candidate in chosen.tolist():
-        on_model, in_image = shared_keypoints(candidates, observed, candidate)
-        points.append(on_model)
-        seen.append(in_image)
-    batch = fit_batch(
-        points, [observed.points_2d[rows] for rows in seen], observed.camera, method="epnp"
-    )
-    poses = np.zeros((len(chosen), POSE_SIZE))
-    costs = np.full(len(chosen), np.inf)
+    shared = [shared_keypoints(candidates, observed, each) for each in chosen.tolist()]
+    seen = [observed.points_2d[rows] for _, rows in shared]
+    batch = fit_batch([points for points, _ in shared], seen, observed.camera, method="epnp")
+    poses, costs = np.zeros((len(chosen), POSE_SIZE)), np.full(len(chosen), np.inf)
     each = len(observed.query.whitening) > 1
     for m in np.flatnonzero(batch.solved).tolist():
+        points, rows = shared[m]
         poses[m] = np.concatenate([batch.rotation[m].ravel(), batch.translation[m], batch.scale[m]])
-        inside = points[m] @ batch.rotation[m].T + batch.translation[m]
-        errors = perspective(inside) - observed.query.rays[seen[m]]
-        a, b, c = observed.query.whitening[seen[m] if each else [0]].T
-        across, down = errors.T
+        inside = points @ batch.rotation[m].T + batch.translation[m]
+        across, down = (perspective(inside) - observed.query.rays[rows]).T
+        a, b, c = observed.query.whitening[rows if each else [0]].T
         costs[m] = ((a * across + b * down) ** 2 + (c * down) ** 2).sum()
     return poses, costs
 
@@ -215,34 +363,38 @@ def shared_keypoints(
 
 
 def make_matches(
-    table: ModelTable, candidates: CandidateSet, observed: Observed, ranking: Ranking, top: int
+    table: ModelTable,
+    candidates: CandidateSet,
+    observed: Observed,
+    ranking: Ranking,
+    top: int,
+    none_probability: float | None,
 ) -> list[Match]:
     """Make matches of the first models of a ranking."""
     matches = []
-    for place in range(min(top, len(ranking.candidates))):
-        candidate = int(ranking.candidates[place])
+    for place, candidate in enumerate(ranking.candidates[:top].tolist()):
         points_3d, rows = shared_keypoints(candidates, observed, candidate)
         model = table.model(int(candidates.models[candidate]))
         alignment = Alignment.from_packed(ranking.poses[place])
         residuals = observed.camera.project(alignment.apply(points_3d)) - observed.points_2d[rows]
-        matches.append(
-            Match(
-                category=model.category,
-                model_id=model.model_id,
-                alignment=alignment,
-                rms=float(np.sqrt((residuals**2).sum(axis=1).mean())),
-                log_likelihood=float(ranking.log_likelihoods[place]),
-                score=float(ranking.scores[place]),
-                box=Box.from_model(model.bounds, alignment),
-                bounds=model.bounds,
-                ids=observed.query.ids[rows],
-                points_3d=points_3d,
-                points_2d=observed.points_2d[rows],
-                residuals=residuals,
-                missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
-                mirrored=bool(candidates.mirrored[candidate]),
-                mesh_path=model.mesh_path,
-                camera=observed.camera,
-            )
+        match = Match(
+            category=model.category,
+            model_id=model.model_id,
+            alignment=alignment,
+            rms=float(np.sqrt((residuals**2).sum(axis=1).mean())),
+            log_likelihood=float(ranking.log_likelihoods[place]),
+            score=float(ranking.scores[place]),
+            box=Box.from_model(model.bounds, alignment),
+            bounds=model.bounds,
+            ids=observed.query.ids[rows],
+            points_3d=points_3d,
+            points_2d=observed.points_2d[rows],
+            residuals=residuals,
+            missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
+            mirrored=bool(candidates.mirrored[candidate]),
+            mesh_path=model.mesh_path,
+            none_probability=none_probability,
+            camera=observed.camera,
         )
+        matches.append(match)
     return matches

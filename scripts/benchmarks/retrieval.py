@@ -32,8 +32,8 @@ from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
 from cadalign.evaluation.methods.unseen import UnseenObject
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel, Match
+from cadalign.retrieval.absence import SAME_SHAPE, shape_distance
 from cadalign.retrieval.models import ModelKey
-from cadalign.retrieval.shape import SAME_SHAPE, shape_distance
 
 _KEYPOINTS = 8
 _CALLS = 3

@@ -26,8 +26,8 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.uncertainty.advice import rank_evidence
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
-from cadalign.retrieval.candidates import observe
 from cadalign.retrieval.options import RetrievalOptions
+from cadalign.retrieval.ranking import observe
 
 FISHEYE = Camera(
     1000, 1000, 280.0, 285.0, 499.5, 498.0, (0.01, -0.003, 0.0005, 0.0), lens="fisheye"

@@ -32,7 +32,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.geometry.metrics import box_iou, box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.shape import distances
+from cadalign.retrieval.absence import distances
 
 pytestmark = pytest.mark.slow
 

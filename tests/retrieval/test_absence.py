@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from cadalign import Alignment, Camera, Library, Match
 from cadalign.errors import InputError
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.absence import _distances, _stacked
-from cadalign.retrieval.shape import shape_distance
+from cadalign.retrieval.absence import _distances, shape_distance
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 BOUNDS = np.array([[-0.3] * 3, [0.3] * 3])
@@ -86,9 +85,9 @@ def test_distances_of_a_category_are_those_of_its_pairs_of_models() -> None:
         for keep in [np.random.default_rng(seed).permutation(10)[: 3 + seed % 8]]
     ]
     library = Library.from_models(models)
-    points, has = _stacked(library._table, "box")
+    _, points = library._table.keypoints_of("box")
     rows = np.array([0, 4, 17])
-    found = _distances(points, has, rows)
+    found = _distances(points, rows)
     every = list(library)
     for row, distances in zip(rows, found, strict=True):
         for model, distance in zip(every, distances, strict=True):

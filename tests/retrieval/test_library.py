@@ -17,9 +17,7 @@ from cadalign import Library
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.labelings import mirrored_labelings
-from cadalign.retrieval.library_file import SEAL, write_library
-from cadalign.retrieval.models import SCHEMA, ModelTable
+from cadalign.retrieval.models import SCHEMA, SEAL, ModelTable, mirrored_labelings, write_library
 
 HEADER = 64
 

@@ -21,12 +21,10 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.bounds import error_bound
-from cadalign.retrieval.candidates import gather_candidates, observe
-from cadalign.retrieval.kernels import search_all
+from cadalign.retrieval.absence import SAME_SHAPE, shape_distance
+from cadalign.retrieval.kernels import error_bound, search_all
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.ranking import rank
-from cadalign.retrieval.shape import SAME_SHAPE, shape_distance
+from cadalign.retrieval.ranking import gather_candidates, observe, rank
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 LENS = replace(CAMERA, distortion=(-0.1, 0.03, 0.001, -0.002))

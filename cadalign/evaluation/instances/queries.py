@@ -36,10 +36,10 @@ from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import rotation_error
+from cadalign.retrieval.absence import SAME_SHAPE, distances, shape_distance
 from cadalign.retrieval.library import Library
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import LibraryModel, ModelKey
-from cadalign.retrieval.shape import SAME_SHAPE, distances, shape_distance
 from cadalign.seeding import instance_rng
 
 TOP = 50

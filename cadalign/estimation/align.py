@@ -17,6 +17,16 @@ from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.prepared_views import (
+    check_first,
+    check_sides,
+    facing_inits,
+    facing_view,
+    numbered_without,
+    turned_back,
+    views_without_pose,
+    with_views_left_out,
+)
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
@@ -30,13 +40,6 @@ from cadalign.estimation.single import (
     is_single,
 )
 from cadalign.estimation.view import View
-from cadalign.estimation.weak_views import (
-    check_first,
-    numbered_without,
-    views_without_pose,
-    with_views_left_out,
-)
-from cadalign.estimation.wide_views import check_sides, facing_inits, facing_view, turned_back
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import needs_facing
 from cadalign.io.evidence import Size

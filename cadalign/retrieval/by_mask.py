@@ -28,9 +28,8 @@ from cadalign.arrays import BoolArray, FloatArray, worker_count
 from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.align import align
-from cadalign.estimation.contours.atlas import Whitened, outline_of, overlaps
-from cadalign.estimation.contours.noise import cost_of_contour
-from cadalign.estimation.contours.silhouettes import outline_of_mask
+from cadalign.estimation.contours.silhouettes import Whitened, outline_of, outline_of_mask, overlaps
+from cadalign.estimation.contours.view_contour import cost_of_contour
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
 from cadalign.geometry.box import Box

@@ -7,7 +7,7 @@ import pytest
 
 from cadalign import ShapeModel, Tracker, align
 from cadalign.estimation.result import Result
-from cadalign.estimation.tracks.correlation import SuccessiveErrors
+from cadalign.estimation.tracks.frames import SuccessiveErrors
 from cadalign.evaluation.simulation.tracks import (
     SimulatedTrack,
     simulate_track,

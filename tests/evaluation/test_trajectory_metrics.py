@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cadalign.errors import InputError
-from cadalign.estimation.tracks.between import moved_by
+from cadalign.estimation.tracks.motion import moved_by
 from cadalign.evaluation.metrics.trajectories import (
     absolute_pose_error,
     count_flips,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.estimation.tracks.between import moved_by
+from cadalign.estimation.tracks.motion import moved_by
 from cadalign.solvers.tracks.chain import (
     STATE,
     Chain,

@@ -15,14 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.contours.noise import (
-    OWN_MODES,
-    Noise,
-    first_noise,
-    noise_of,
-    noise_of_similar,
-    with_learned_offsets,
-)
 from cadalign.estimation.contours.rims import Rims, extraction_bias, find_rims
 from cadalign.estimation.contours.surface import (
     PosedSurface,
@@ -32,7 +24,15 @@ from cadalign.estimation.contours.surface import (
     state_without_points,
     with_measured,
 )
-from cadalign.estimation.contours.view_contour import ViewContour
+from cadalign.estimation.contours.view_contour import (
+    OWN_MODES,
+    Noise,
+    ViewContour,
+    first_noise,
+    noise_of,
+    noise_of_similar,
+    with_learned_offsets,
+)
 from cadalign.estimation.estimates import poses_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

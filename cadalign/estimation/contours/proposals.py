@@ -12,10 +12,9 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.descent import Masked, approached
-from cadalign.estimation.contours.noise import cost_of_contour
 from cadalign.estimation.contours.silhouettes import Resembling, differ, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
-from cadalign.estimation.contours.view_contour import ViewContour, contour_view
+from cadalign.estimation.contours.view_contour import ViewContour, contour_view, cost_of_contour
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.search import JointProblem, Minimum, find_minima

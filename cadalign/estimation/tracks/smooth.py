@@ -24,9 +24,15 @@ from cadalign.estimation.prior import Lenses, prior_of, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.search import Inits, JointProblem, Minimum, Track, find_minima, thresholds
-from cadalign.estimation.tracks.candidates import best_path, candidates_of, filled, velocities_of
-from cadalign.estimation.tracks.correlation import SuccessiveErrors, weakened
-from cadalign.estimation.tracks.frames import Frames
+from cadalign.estimation.tracks.frames import (
+    Frames,
+    SuccessiveErrors,
+    best_path,
+    candidates_of,
+    filled,
+    velocities_of,
+    weakened,
+)
 from cadalign.estimation.tracks.motion import Motion, Trajectory
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.estimation.uncertainty.posterior import widening_of

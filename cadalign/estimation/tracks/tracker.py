@@ -13,18 +13,15 @@ from cadalign.estimation.align import align
 from cadalign.estimation.joint_robust import whitened_lengths, with_loss
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.prepared_views import lie_on_a_line
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.search import JointProblem, thresholds
-from cadalign.estimation.tracks.between import moved_by
-from cadalign.estimation.tracks.candidates import candidates_of
-from cadalign.estimation.tracks.correlation import SuccessiveErrors, weakened
-from cadalign.estimation.tracks.frames import Frames
-from cadalign.estimation.tracks.motion import Motion, PoseAt
+from cadalign.estimation.tracks.frames import Frames, SuccessiveErrors, candidates_of, weakened
+from cadalign.estimation.tracks.motion import Motion, PoseAt, moved_by
 from cadalign.estimation.tracks.smooth import Smoothed, estimate_track
 from cadalign.estimation.tracks.window import Window, without_pose
 from cadalign.estimation.view import View
-from cadalign.estimation.weak_views import lie_on_a_line
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY

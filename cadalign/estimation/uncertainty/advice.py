@@ -23,10 +23,10 @@ from cadalign.estimation.estimates import (
 from cadalign.estimation.facing import turned_alignment, turned_covariance
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prepared_views import facing_view
 from cadalign.estimation.prior import ShapePrior, is_exact, prior_of, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.estimation.wide_views import facing_view
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import needs_facing
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.tracks.between import moved_by
-from cadalign.estimation.tracks.motion import Motion
+from cadalign.estimation.tracks.motion import Motion, moved_by
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.alignment import Alignment

@@ -13,7 +13,7 @@ import pytest
 
 from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.contours.regions import bins_of, crossings_of, edges_of, regions_of
+from cadalign.estimation.contours.photo_lines import bins_of, crossings_of, edges_of, regions_of
 from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.images import write_image

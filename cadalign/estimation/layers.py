@@ -20,13 +20,7 @@ from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.problems import Problems, rays_of
 from cadalign.estimation.solve import solve
-from cadalign.estimation.uncertainty.derivatives import (
-    UNKNOWNS,
-    Optima,
-    PriorTerms,
-    SeenKeypoints,
-)
-from cadalign.estimation.uncertainty.sensitivity import lens_slopes
+from cadalign.estimation.uncertainty.derivatives import UNKNOWNS, Optima, lens_slopes
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
 from cadalign.solvers.constants import OK
@@ -186,7 +180,7 @@ class _Part:
     def values(self) -> FitValues:
         free = self.optima.free
         covariance = np.zeros((len(self.valid), UNKNOWNS, UNKNOWNS))
-        covariance[:, free[:, None], free] = self.optima.inverse  # of the Hessian
+        covariance[:, free[:, None], free] = self.optima.solved[0]
         covariance[~self.valid] = 0.0
         pose = self.rotation, self.translation, self.scale
         return FitValues(*pose, self.focals, covariance, self.valid)
@@ -204,9 +198,9 @@ class _Part:
         slopes[:, 6:9] = by_scale * self.scale
         slopes[:, 9] = by_focal * self.focals
         slopes[~self.valid] = 0.0
-        pulled = self.optima.pull_back(slopes)
-        by_pixels = (pulled.by_rays[..., None, :] @ self.by_pixels)[..., 0, :]
-        return pulled.by_points, by_pixels, pulled.by_log_sigma / self.sigmas
+        by_rays, by_log_sigma, by_points = self.optima.pull_back(slopes)
+        by_pixels = (by_rays[..., None, :] @ self.by_pixels)[..., 0, :]
+        return by_points, by_pixels, by_log_sigma / self.sigmas
 
 
 def fits_of(
@@ -264,19 +258,29 @@ def _polished(
     pose = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:12], poses[:, 12:]
     given = np.array([camera.fx for camera in batch.cameras])
     ratio = (focals / given)[:, None, None]
-    prior = PriorTerms(options.scale_prior)
+    offset = weight = np.zeros(len(focals))
     rays, information, by_pixels = batch.rays, batch.information, batch.by_pixels
     if options.focal == "estimate":
         rays, by_pixels = rays / ratio, by_pixels / ratio[..., None]
         information = information * ratio[..., None] ** 2
-        low, high, mean, weight = log_focal_range(batch.cameras[0], options.focal_prior)
+        low, high, mean, of_prior = log_focal_range(batch.cameras[0], options.focal_prior)
         logs = np.log(focals)
         is_held = (logs < low + _AT_BOUND) | (logs > high - _AT_BOUND)
-        weights = np.where(is_held, _HELD, weight)
-        prior = PriorTerms(options.scale_prior, np.where(is_held, 0.0, logs - mean), weights)
-    loss, bend = LOSSES[options.loss], options.loss_scale
-    keypoints = SeenKeypoints(points, rays, information, loss, bend)
-    optima = Optima(keypoints, *pose, prior, options.estimated_unknowns, exact)
+        weight = np.where(is_held, _HELD, of_prior)
+        offset = np.where(is_held, 0.0, logs - mean)
+    optima = Optima(
+        points,
+        rays,
+        information,
+        *pose,
+        scale_prior=options.scale_prior,
+        free=options.estimated_unknowns,
+        loss=LOSSES[options.loss],
+        loss_scale=options.loss_scale,
+        exact=exact,
+        focal_offset=offset,
+        focal_weight=weight,
+    )
     step = optima.newton_step
     size = np.abs(step[:, [0, 1, 2, 6, 7, 8, 9]]).max(axis=1)
     step[~(valid & (size < _LARGEST_POLISH))] = 0.0
@@ -289,7 +293,7 @@ def _polished(
         pose[1] + step[:, 3:6],
         pose[2] * np.exp(step[:, 6:9]),
         focals * np.exp(step[:, 9]),
-        valid & optima.determined,
+        valid & optima.solved[1],
     )
 
 

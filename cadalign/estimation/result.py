@@ -103,7 +103,7 @@ class Result(ResultData):
         >>> result.sensitivity().strongest
         0
         """
-        from cadalign.estimation.uncertainty.joint_sensitivity import sensitivity_of  # rarely asked
+        from cadalign.estimation.uncertainty.sensitivity import sensitivity_of  # rarely asked
 
         return sensitivity_of(self, exact=exact, view=view)
 

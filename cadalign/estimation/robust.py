@@ -34,7 +34,7 @@ from cadalign.estimation.support import (
     disagreeing,
     log_expected_by_chance,
 )
-from cadalign.estimation.uncertainty.distributions import f_quantile
+from cadalign.estimation.uncertainty.residuals import f_quantile
 
 _INLIER_ROUNDS = 5
 _REACH = 3.0  # estimated sigmas within which keypoints agree

@@ -35,7 +35,7 @@ from cadalign.estimation.scene_messages import (
     SharedUnknowns,
     as_prior,
 )
-from cadalign.estimation.uncertainty.distributions import chi_square_tail
+from cadalign.estimation.uncertainty.residuals import chi_square_tail
 from cadalign.estimation.uncertainty.summary import Uncertainty
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment

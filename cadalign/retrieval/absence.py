@@ -32,7 +32,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
-from cadalign.estimation.uncertainty.posterior import bent
+from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.geometry.rotations import by_rotation
 from cadalign.retrieval.models import LibraryModel, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
@@ -76,7 +76,7 @@ def none_probability(
         covariances = observed.covariances + (taus * extent)[:, None, None, None] ** 2 * np.eye(2)
         points, rows = (np.array([shared[place][k] for place in places]) for k in range(2))
         poses = ranking.poses[places]
-        logs = _log_likelihoods(poses, points, rows, observed, covariances, options)
+        logs = _log_likelihoods(poses, points, rows, observed, covariances)
         means = np.logaddexp.reduce(logs[1:] + np.log(weights / weights.sum())[:, None], axis=0)
         factors[places] = means - logs[0]
     relative = ranking.log_likelihoods[:_MOST_LIKELY] - ranking.log_likelihoods[0]
@@ -91,14 +91,13 @@ def _log_likelihoods(
     rows: IntArray,
     observed: Observed,
     covariances: FloatArray,
-    options: RetrievalOptions,
 ) -> FloatArray:
     """Log of l_k (t, m) for covariances (t, all keypoints, 2, 2), the poses optimal for t = 0.
 
     Poses (m, 15) are of models that share equally many keypoints (m, n, 3) with the image, where
     they are in the ``rows`` (m, n).
     """
-    query, fitting = observed.query, options.fitting
+    query = observed.query
     count = len(covariances)
     rays = np.tile(query.rays, (count, 1))
     white = whitening_of(covariances.reshape(-1, 2, 2), rays, observed.camera)
@@ -130,7 +129,7 @@ def _log_likelihoods(
     # The optimum of a larger deviation is a step from that of the noise alone.
     gain = (slope * np.linalg.solve(hessian, slope)).sum(axis=(2, 3))
     gain[0] = 0.0
-    costs = bent(across**2 + down**2, fitting.loss, fitting.loss_scale).sum(axis=2)
+    costs = bent(across**2 + down**2, query.loss, query.loss_scale).sum(axis=2)
     costs += (prior * stretches**2).sum(axis=1) - gain
     determinants = np.log(np.linalg.det(covariances))[:, rows].sum(axis=2)
     return np.asarray(-0.5 * (determinants + costs + np.linalg.slogdet(hessian)[1]))

@@ -30,7 +30,7 @@ from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.fit import fit_batch
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
-from cadalign.estimation.uncertainty.posterior import bent
+from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -196,7 +196,7 @@ def gather_candidates(
         fix = f"at least {LEAST_SHARED} are needed to align a model"
         raise DegenerateError(what, where="ids", fix=fix)
     # The losses are concave in the squares and 0 at 0, so that of their sum is at most their sum.
-    bounds = bent(bounds, options.loss, options.loss_scale)
+    bounds = bent(bounds, query.loss, query.loss_scale)
     counts = candidates.spans[:, 1] - candidates.spans[:, 0]
     base = gains + observed.spurious + (counts - shared) * np.log(options.missing_prob)
     base = base + options.log_scale_constant - np.log(labelings)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import chdtri, fdtri
 
-from cadalign.estimation.uncertainty.distributions import chi_square_quantile, f_quantile
+from cadalign.estimation.uncertainty.residuals import chi_square_quantile, f_quantile
 
 probabilities = st.sampled_from([0.5, 0.32, 0.05, 0.01])
 

@@ -16,7 +16,8 @@ from scipy.linalg import eigh
 from cadalign import Alignment, Box, Camera, Library, Match, fit
 from cadalign.datasets import KeypointNet, Symmetries
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.uncertainty.posterior import bent
+from cadalign.estimation.options import LOSSES
+from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import RetrievalTask, observe_model
 from cadalign.evaluation.simulation.problems import random_rotation
@@ -394,7 +395,7 @@ def test_no_pose_has_errors_below_the_bound(
     )
     errors = pixels - seen
     squares = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(covariances), errors)
-    cost = bent(squares, loss, 1.5).sum()
+    cost = bent(squares, LOSSES[loss], 1.5).sum()
     assert field.bounds[0] <= cost * (1 + 1e-9) + 1e-9
 
 

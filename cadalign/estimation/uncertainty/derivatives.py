@@ -23,7 +23,10 @@ from functools import cached_property
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.solvers.constants import CAUCHY, HUBER, LINEAR, ScalePrior
+from cadalign.estimation.uncertainty.residuals import loss_slopes
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import by_rotation
+from cadalign.solvers.constants import LINEAR, ScalePrior
 
 UNKNOWNS = 10
 _FOCAL = 9
@@ -32,55 +35,27 @@ _LEAST_SHARE = 1e-10  # of an unknown's information that the others must leave
 
 
 @dataclass(frozen=True, eq=False)
-class SeenKeypoints:
-    """Keypoints of B problems of at most n; those that are absent have the information 0.
-
-    ``points`` (B, n, 3) are the model's, ``rays`` (B, n, 2) the observed ones, ``information``
-    (B, n, 2, 2) theirs, and ``slopes`` (B, n, 2) derivatives of undistorted rays by the log focal
-    length, or None where they are 0. The loss is one of `cadalign.solvers.constants`.
-    """
-
-    points: FloatArray
-    rays: FloatArray
-    information: FloatArray
-    loss: int = LINEAR
-    loss_scale: float = 1.0
-    slopes: FloatArray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class PriorTerms:
-    """Priors of B problems: on the log scales, and log focal lengths with mean and weight (B,)."""
-
-    scale: ScalePrior
-    focal_offset: FloatArray | float = 0.0  # of the log focal length from the prior's mean
-    focal_weight: FloatArray | float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
-class PulledBack:
-    """Derivatives of B numbers by the data: rays (B, n, 2), log sigmas (B, n), points (B, n, 3)."""
-
-    by_rays: FloatArray
-    by_log_sigma: FloatArray
-    by_points: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Optima:
-    """Optima of B problems: rotations (B, 3, 3), translations and scales (B, 3).
+    """Optima of B problems of at most n keypoints; those that are absent have the information 0.
 
-    ``free`` are the rows of the unknowns that were estimated. With ``exact``, H is the Hessian,
-    otherwise the Gauss-Newton matrix, which leaves out what vanishes with the residuals.
+    With ``exact``, H is the Hessian, otherwise the Gauss-Newton matrix, which leaves out what
+    vanishes with the residuals.
     """
 
-    keypoints: SeenKeypoints
-    rotation: FloatArray
-    translation: FloatArray
-    scale: FloatArray
-    prior: PriorTerms
-    free: IntArray
+    points: FloatArray  # (B, n, 3) of the model
+    rays: FloatArray  # (B, n, 2) observed
+    information: FloatArray  # (B, n, 2, 2) of the rays
+    rotation: FloatArray  # (B, 3, 3)
+    translation: FloatArray  # (B, 3)
+    scale: FloatArray  # (B, 3)
+    scale_prior: ScalePrior
+    free: IntArray  # (u,) rows of the unknowns that were estimated
+    loss: int = LINEAR  # one of `cadalign.solvers.constants`
+    loss_scale: float = 1.0
     exact: bool = True
+    slopes: FloatArray | None = None  # (B, n, 2) of undistorted rays by the log focal; None for 0
+    focal_offset: FloatArray | float = 0.0  # (B,) of the log focal length from its prior's mean
+    focal_weight: FloatArray | float = 0.0  # (B,) of that prior
 
     @cached_property
     def _axes(self) -> FloatArray:
@@ -90,7 +65,7 @@ class Optima:
     @cached_property
     def _along(self) -> FloatArray:
         """Parts of the turned points (B, n, 3, 3) that are due to x, y, z, one a column."""
-        return np.asarray(self._axes * self.keypoints.points[:, :, None, :])
+        return np.asarray(self._axes * self.points[:, :, None, :])
 
     @cached_property
     def _turned(self) -> FloatArray:
@@ -105,34 +80,29 @@ class Optima:
         slope = np.zeros((*inverse.shape, 2, 4))
         slope[..., 0, 0] = slope[..., 1, 1] = inverse
         slope[..., 2] = -projected * inverse[..., None]
-        slope[..., 3] = (
-            projected if self.keypoints.slopes is None else (projected - self.keypoints.slopes)
-        )
+        slope[..., 3] = projected if self.slopes is None else projected - self.slopes
         return projected, inverse, slope
 
     @cached_property
     def _weighted(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Forces a = M r (B, n, 2), squares r'M r, and the loss's first and second derivative."""
-        residuals = self._projection[0] - self.keypoints.rays
-        force = (self.keypoints.information @ residuals[..., None])[..., 0]
+        residuals = self._projection[0] - self.rays
+        force = (self.information @ residuals[..., None])[..., 0]
         squares = (force * residuals).sum(axis=-1)
-        first, second = loss_slopes(squares, self.keypoints.loss, self.keypoints.loss_scale)
+        first, second = loss_slopes(squares, self.loss, self.loss_scale)
         return force, squares, first, second if self.exact else np.zeros_like(second)
 
     @cached_property
     def _by_unknowns(self) -> FloatArray:
         """K = dp/dt (B, n, 4, 10)."""
-        x, y, z = np.moveaxis(self._turned, 2, 0)
-        rows = np.zeros((*x.shape, 4, UNKNOWNS))
-        rows[..., 0, 1], rows[..., 0, 2] = z, -y
-        rows[..., 1, 0], rows[..., 1, 2] = -z, x
-        rows[..., 2, 0], rows[..., 2, 1] = y, -x
+        rows = np.zeros((*self._turned.shape[:2], 4, UNKNOWNS))
+        rows[..., :3, :3] = by_rotation(self._turned)
         rows[..., 0, 3] = rows[..., 1, 4] = rows[..., 2, 5] = rows[..., 3, _FOCAL] = 1.0
         rows[..., :3, 6:9] = self._along
         return rows
 
     @cached_property
-    def _slopes(self) -> FloatArray:
+    def _forces(self) -> FloatArray:
         """Half the derivatives q (B, n, 4) of the cost by the points p."""
         force, _, first, _ = self._weighted
         by_point = self._projection[2]
@@ -143,21 +113,18 @@ class Optima:
         """G (B, n, 4, 4)."""
         force, _, first, second = self._weighted
         projected, inverse, by_point = self._projection
-        whitened = first[..., None, None] * self.keypoints.information
-        if self.exact and self.keypoints.loss != LINEAR:
-            whitened = whitened + 2.0 * second[..., None, None] * (
-                force[..., :, None] * force[..., None, :]
-            )
+        whitened = first[..., None, None] * self.information
+        if self.exact and self.loss != LINEAR:
+            bending = force[..., :, None] * force[..., None, :]
+            whitened = whitened + 2.0 * second[..., None, None] * bending
         curvature = by_point.swapaxes(-1, -2) @ (whitened @ by_point)
         if not self.exact:
             return np.asarray(curvature)
         weighted = first[..., None] * force
         across = weighted * (inverse**2)[..., None]
         along = (weighted * projected).sum(axis=-1)
-        curvature[..., 0, 2] -= across[..., 0]
-        curvature[..., 2, 0] -= across[..., 0]
-        curvature[..., 1, 2] -= across[..., 1]
-        curvature[..., 2, 1] -= across[..., 1]
+        curvature[..., :2, 2] -= across
+        curvature[..., 2, :2] -= across
         curvature[..., 2, 2] += 2.0 * along * inverse**2
         by_focal = (weighted[..., None, :] @ by_point[..., :3])[..., 0, :]
         curvature[..., 3, :3] += by_focal
@@ -170,17 +137,11 @@ class Optima:
         """Half the gradient of the cost (B, u), of the free unknowns; 0 at an optimum."""
         count, n = self._turned.shape[:2]
         rows = self._by_unknowns.reshape(count, 4 * n, UNKNOWNS)
-        whole = (self._slopes.reshape(count, 1, 4 * n) @ rows)[:, 0]
-        excess, _ = self._scale_excess
-        whole[:, 6:9] += self.prior.scale.weight * excess
-        whole[:, _FOCAL] += self.prior.focal_weight * self.prior.focal_offset
+        whole = (self._forces.reshape(count, 1, 4 * n) @ rows)[:, 0]
+        logs, width = np.log(self.scale), self.scale_prior.width
+        whole[:, 6:9] += self.scale_prior.weight * (logs - np.clip(logs, -width, width))
+        whole[:, _FOCAL] += self.focal_weight * self.focal_offset
         return np.asarray(whole[:, self.free])
-
-    @property
-    def _scale_excess(self) -> tuple[FloatArray, BoolArray]:
-        """Parts (B, 3) of the log scales beyond the prior's flat part, and where there are any."""
-        logs, width = np.log(self.scale), self.prior.scale.width
-        return logs - np.clip(logs, -width, width), np.abs(logs) >= width
 
     @cached_property
     def hessian(self) -> FloatArray:
@@ -191,9 +152,9 @@ class Optima:
         whole = rows.reshape(count, 4 * n, UNKNOWNS).swapaxes(1, 2) @ curved
         if self.exact:
             self._add_motion(whole)
-        axes = np.arange(6, 9)
-        whole[:, axes, axes] += self.prior.scale.weight * self._scale_excess[1]
-        whole[:, _FOCAL, _FOCAL] += self.prior.focal_weight
+        axes, is_bound = np.arange(6, 9), np.abs(np.log(self.scale)) >= self.scale_prior.width
+        whole[:, axes, axes] += self.scale_prior.weight * is_bound
+        whole[:, _FOCAL, _FOCAL] += self.focal_weight
         return np.asarray(whole[:, self.free[:, None], self.free])
 
     def _add_motion(self, whole: FloatArray) -> None:
@@ -201,13 +162,13 @@ class Optima:
 
         A turn about axis a and a longer axis k give ``(Y_k x q)_a``, Y_k the part of X due to k.
         """
-        slopes = self._slopes[..., :3]
-        moments = slopes.swapaxes(1, 2) @ self._turned
+        forces = self._forces[..., :3]
+        moments = forces.swapaxes(1, 2) @ self._turned
         turns = (moments + moments.swapaxes(1, 2)) / 2
         diagonal = np.arange(3)
         turns[:, diagonal, diagonal] -= np.trace(moments, axis1=1, axis2=2)[:, None]
         whole[:, :3, :3] += turns
-        by_axis = (slopes[..., None] * self.keypoints.points[:, :, None, :]).sum(axis=1)
+        by_axis = (forces[..., None] * self.points[:, :, None, :]).sum(axis=1)
         axes = self._axes[:, 0]
         mixed = np.cross(axes, by_axis, axis=1)
         whole[:, :3, 6:9] += mixed
@@ -215,75 +176,62 @@ class Optima:
         whole[:, diagonal + 6, diagonal + 6] += (axes * by_axis).sum(axis=1)
 
     @cached_property
-    def _inverse(self) -> tuple[FloatArray, BoolArray]:
-        """Inverse of H (B, u, u), 0 where it is not positive or nearly singular, and where not."""
-        size = len(self.free)
+    def solved(self) -> tuple[FloatArray, BoolArray]:
+        """Inverse of H (B, u, u), and whether the data determine all unknowns (B,).
+
+        The inverse is 0 where they do not, H being nearly singular or not positive.
+        """
         diagonal = np.diagonal(self.hessian, axis1=1, axis2=2)
         is_finite = np.isfinite(self.hessian).all(axis=(1, 2))
         usable = np.asarray((diagonal > 0).all(axis=1) & is_finite)
         root = np.sqrt(np.where(usable[:, None], diagonal, 1.0))
         scaled = self.hessian / (root[:, :, None] * root[:, None, :])
-        scaled = np.where(usable[:, None, None], scaled, np.eye(size))
+        scaled = np.where(usable[:, None, None], scaled, np.eye(len(self.free)))
         try:
             inverse = np.asarray(np.linalg.inv(scaled), dtype=np.float64)
         except np.linalg.LinAlgError:  # one of them is singular to the last digit
-            scaled = scaled + 1e-13 * np.eye(size)
+            scaled = scaled + 1e-13 * np.eye(len(self.free))
             inverse = np.asarray(np.linalg.inv(scaled), dtype=np.float64)
         shares = np.diagonal(inverse, axis1=1, axis2=2)
-        determined = np.asarray(usable & (shares > 0).all(axis=1))
-        determined &= (shares < 1 / _LEAST_SHARE).all(axis=1)
+        determined = usable & ((shares > 0) & (shares < 1 / _LEAST_SHARE)).all(axis=1)
         inverse /= root[:, :, None] * root[:, None, :]
         inverse[~determined] = 0.0
         return inverse, determined
-
-    @property
-    def inverse(self) -> FloatArray:
-        """Inverse of H (B, u, u); 0 for problems that are not determined."""
-        return self._inverse[0]
-
-    @property
-    def determined(self) -> BoolArray:
-        """Marks the problems (B,) whose data determine all unknowns: the others have no slopes."""
-        return self._inverse[1]
 
     @cached_property
     def newton_step(self) -> FloatArray:
         """Step (B, 10) of all unknowns to the optimum; 0 where it is not determined."""
         step = np.zeros((len(self.scale), UNKNOWNS))
-        step[:, self.free] = -(self._inverse[0] @ self.gradient[..., None])[..., 0]
+        step[:, self.free] = -(self.solved[0] @ self.gradient[..., None])[..., 0]
         return step
 
-    def pull_back(self, slopes: FloatArray) -> PulledBack:
+    def pull_back(self, slopes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Derivatives by the data of numbers whose derivatives by the unknowns are (B, 10).
 
-        Of one problem, the numbers may be many.
+        By rays (B, n, 2), log sigmas (B, n) and points (B, n, 3). Of one problem, the numbers may
+        be many.
         """
         adjoint = np.zeros((len(slopes), UNKNOWNS))
-        adjoint[:, self.free] = -(self._inverse[0] @ slopes[:, self.free, None])[..., 0]
+        adjoint[:, self.free] = -(self.solved[0] @ slopes[:, self.free, None])[..., 0]
         force, squares, first, second = self._weighted
-        _, _, by_point = self._projection
         moved = (self._by_unknowns @ adjoint[:, None, :, None])[..., 0]  # (B, n, 4)
-        seen = (by_point @ moved[..., None])[..., 0]
+        seen = (self._projection[2] @ moved[..., None])[..., 0]
         agreement = (force * seen).sum(axis=-1)
-        by_rays = -first[..., None] * (self.keypoints.information @ seen[..., None])[..., 0]
+        by_rays = -first[..., None] * (self.information @ seen[..., None])[..., 0]
         by_rays -= 2.0 * (second * agreement)[..., None] * force
         by_log_sigma = -2.0 * (first + second * squares) * agreement
         by_place = (self._curvature @ moved[..., None])[..., :3, 0]
         by_points = (by_place[..., None, :] @ self._axes)[..., 0, :]
         if self.exact:
-            turned = np.cross(adjoint[:, None, :3], self._axes[:, 0].swapaxes(1, 2))
-            turned = turned + adjoint[:, 6:9, None] * self._axes[:, 0].swapaxes(1, 2)
-            by_points = by_points + self._slopes[..., :3] @ turned.swapaxes(1, 2)
-        return PulledBack(by_rays, by_log_sigma, by_points)
+            axes = self._axes[:, 0].swapaxes(1, 2)
+            turned = np.cross(adjoint[:, None, :3], axes) + adjoint[:, 6:9, None] * axes
+            by_points = by_points + self._forces[..., :3] @ turned.swapaxes(1, 2)
+        return by_rays, by_log_sigma, by_points
 
 
-def loss_slopes(squares: FloatArray, loss: int, bend: float) -> tuple[FloatArray, FloatArray]:
-    """First and second derivatives of a loss by the squared residual."""
-    if loss == HUBER:
-        length = np.sqrt(np.maximum(squares, bend**2))
-        is_bent = squares > bend**2
-        return bend / length, np.where(is_bent, -bend / (2.0 * length**3), 0.0)
-    if loss == CAUCHY:
-        first = 1.0 / (1.0 + squares / bend**2)
-        return first, -(first**2) / bend**2
-    return np.ones_like(squares), np.zeros_like(squares)
+def lens_slopes(rays: FloatArray, camera: Camera) -> FloatArray:
+    """Derivatives (n, 2, 2) of undistorted rays (n, 2) by the pixels."""
+    inverse = np.diag([1.0 / camera.fx, 1.0 / camera.fy])
+    if not camera.distortion:
+        return np.broadcast_to(inverse, (len(rays), 2, 2))
+    return np.asarray(np.linalg.inv(camera.distortion_jacobian(rays)) @ inverse)

@@ -12,9 +12,9 @@ prior's are zero.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
-from cadalign.estimation.uncertainty.derivatives import loss_slopes
+from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.evidence import Evidence, State, log_focals_of, points_of, unpacked
 from cadalign.solvers.joint.reduction import reduced_row, sighted_points
@@ -34,18 +34,18 @@ from cadalign.solvers.unknowns import move_rigid
 _DIFFERENCE = 1e-5  # in standard deviations, radians, and shares of lengths
 
 
+def _at_focal(camera: Camera, log_ratio: float) -> Camera:
+    return camera.with_focal(camera.fx * float(np.exp(log_ratio))) if log_ratio else camera
+
+
 @dataclass(frozen=True, eq=False)
 class SightedKeypoints:
-    """Keypoints that an estimate rests on, which are the first k of its sightings.
+    """Keypoints that an estimate rests on, which are the first k of its sightings."""
 
-    ``cameras`` (V,) are those of the views at the estimate, ``pixels`` (k, 2), ``covariances``
-    (k, 2, 2) the keypoints' [px^2], and ``image`` (k,) their views.
-    """
-
-    cameras: Sequence[Camera]
-    image: IntArray
-    pixels: FloatArray
-    covariances: FloatArray
+    cameras: Sequence[Camera]  # (V,) of the views, at the focal lengths that rays are relative to
+    image: IntArray  # (k,), views
+    pixels: FloatArray  # (k, 2)
+    covariances: FloatArray  # (k, 2, 2) [px^2]
 
     @classmethod
     def of(
@@ -57,9 +57,7 @@ class SightedKeypoints:
         for v, camera in enumerate(cameras):
             own = image == v
             rays = rays_of(np.require(pixels[own], requirements="W"), camera, clips=True)
-            a, b, c = evidence.sightings.whitening[: len(pixels)][own].T
-            zero = np.zeros_like(a)
-            rows = np.stack([np.stack([a, b], axis=-1), np.stack([zero, c], axis=-1)], axis=-2)
+            rows = whitening_matrices(evidence.sightings.whitening[: len(pixels)][own])
             to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
             from_pixels = rows @ np.linalg.inv(to_pixels)
             covariances[own] = np.linalg.inv(from_pixels.swapaxes(1, 2) @ from_pixels)
@@ -75,8 +73,7 @@ class SightedKeypoints:
         whitening = given.whitening.copy()
         for v, (camera, log_ratio) in enumerate(zip(self.cameras, log_ratios, strict=True)):
             own = np.flatnonzero(self.image == v)
-            ratio = float(np.exp(log_ratio))
-            lens = camera.with_focal(camera.fx * ratio) if log_ratio else camera
+            ratio, lens = float(np.exp(log_ratio)), _at_focal(camera, log_ratio)
             pixels = np.ascontiguousarray(self.pixels[own])
             there = rays_of(pixels, lens, clips=True)
             whitening[own] = whitening_of(self.covariances[own], there, lens) / ratio
@@ -88,16 +85,13 @@ class SightedKeypoints:
 
     def forces(self, evidence: Evidence, state: State) -> FloatArray:
         """Derivatives (k, 2) of half the cost by the keypoints' projections [1/px]."""
-        points, count = points_of(evidence.shape, state), len(self.pixels)
-        of_point, found = evidence.sightings.point[:count], np.zeros((count, 2))
-        loss, bend = (int(evidence.sightings.loss[0]), float(evidence.sightings.loss_scale[0]))
-        logs = log_focals_of(evidence, state)
-        for v, (camera, pose) in enumerate(
-            zip(self.cameras, poses_of(evidence, state), strict=True)
-        ):
-            own = self.image == v
-            lens = camera.with_focal(camera.fx * float(np.exp(logs[v]))) if logs[v] else camera
-            in_camera = points[of_point[own]] @ pose.rotation.T + pose.translation
+        sightings, found = evidence.sightings, np.zeros(self.pixels.shape)
+        points = points_of(evidence.shape, state)[sightings.point[: len(found)]]
+        loss, bend = int(sightings.loss[0]), float(sightings.loss_scale[0])
+        given = zip(self.cameras, poses_of(evidence, state), strict=True)
+        for v, (camera, pose) in enumerate(given):
+            own, lens = self.image == v, _at_focal(camera, log_focals_of(evidence, state)[v])
+            in_camera = points[own] @ pose.rotation.T + pose.translation
             residuals = lens.project(in_camera) - self.pixels[own]
             forces = np.linalg.solve(self.covariances[own], residuals[..., None])[..., 0]
             first, _ = loss_slopes((forces * residuals).sum(axis=1), loss, bend)
@@ -108,22 +102,12 @@ class SightedKeypoints:
 class DataSlopes(NamedTuple):
     """Derivatives of u unknowns by the data of k keypoints.
 
-    By pixels (u, k, 2), logarithms of the standard deviations (u, k), and the model's points
-    (u, k, 3): of one that several views see, by all at once.
+    Of a point of the model that several views see, by all at once.
     """
 
-    by_pixels: FloatArray
-    by_log_sigma: FloatArray
-    by_points: FloatArray
-
-
-class _Parts(NamedTuple):
-    """First rows of the parts of the unknowns; poses come first."""
-
-    focals: int
-    scales: int
-    coefficients: int
-    displacements: int
+    by_pixels: FloatArray  # (u, k, 2)
+    by_log_sigma: FloatArray  # (u, k), by logarithms of the standard deviations
+    by_points: FloatArray  # (u, k, 3), by the model's
 
 
 class _Place(NamedTuple):
@@ -137,16 +121,12 @@ class _Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointOptimum:
-    """The optimum of all evidence, in modes that the evidence tells apart.
-
-    ``row`` is the state in a row. Where the principal point was estimated, ``principal_weight`` is
-    the inverse variance of its prior [px^-2], otherwise None.
-    """
+    """The optimum of all evidence, in modes that the evidence tells apart."""
 
     evidence: Evidence
-    row: FloatArray
+    row: FloatArray  # the state
     keypoints: SightedKeypoints
-    principal_weight: float | None
+    principal_weight: float | None  # of the principal point's prior [px^-2]; None where it is known
 
     @classmethod
     def of(
@@ -161,27 +141,24 @@ class JointOptimum:
 
         ``cameras`` are those of the views at the estimate.
         """
-        references = [
-            camera.with_focal(camera.fx * float(np.exp(-log))) if log else camera
-            for camera, log in zip(cameras, log_focals_of(evidence, state), strict=True)
-        ]
+        logs = log_focals_of(evidence, state)
+        references = [_at_focal(*each) for each in zip(cameras, -logs, strict=True)]
         reduction, row = reduced_row(evidence, state)
         keypoints = SightedKeypoints.of(evidence, references, pixels)
         weight = None if principal_sigma is None else principal_sigma**-2
         return cls(reduction.evidence, row, keypoints, weight)
 
-    @property
+    @cached_property
     def state(self) -> State:
         """The state."""
         return unpacked(self.evidence, self.row)
 
-    @property
-    def parts(self) -> _Parts:
-        """First rows of log focals, log scales, coefficients and displacements."""
-        state = self.state
-        focals = 6 * len(state.poses)
-        scales = focals + len(state.log_focals)
-        return _Parts(focals, scales, scales + 3, scales + 3 + len(state.coefficients))
+    @cached_property
+    def parts(self) -> tuple[int, int, int, int]:
+        """First rows of log focals, log scales, coefficients and displacements; poses are first."""
+        focals = 6 * len(self.state.poses)
+        scales = focals + len(self.state.log_focals)
+        return focals, scales, scales + 3, scales + 3 + len(self.state.coefficients)
 
     @cached_property
     def _free(self) -> IntArray:
@@ -204,8 +181,7 @@ class JointOptimum:
 
         Raises DegenerateError if the evidence does not determine them.
         """
-        by_unknowns = np.stack([self._difference(*each) for each in self._moved()], axis=1)
-        by_data = np.stack([self._difference(*each) for each in self._changed()], axis=1)
+        by_unknowns, by_data = self._by_unknowns(), self._by_data()
         try:
             solved = -np.linalg.solve(by_unknowns, by_data)
         except np.linalg.LinAlgError:
@@ -213,7 +189,7 @@ class JointOptimum:
         if not np.isfinite(solved).all():
             what = "the evidence does not determine all unknowns, which have no derivatives"
             raise DegenerateError(what, where="sensitivity", fix="give more evidence")
-        size, count = self.parts.displacements + 3 * len(self.evidence.shape.mean), len(self._point)
+        size, count = self.parts[3] + 3 * len(self.evidence.shape.mean), len(self._point)
         whole = np.zeros((size, solved.shape[1]))
         whole[self._free] = solved[: len(self._free)]
         by_points = whole[:, 3 * count :].reshape(size, -1, 3)
@@ -228,9 +204,10 @@ class JointOptimum:
         """Points (k,) of the shape that the keypoints are."""
         return self.evidence.sightings.point[: len(self.keypoints.pixels)]
 
-    def _difference(self, unit: float, plus: _Place, minus: _Place) -> FloatArray:
+    def _slope(self, changed: Callable[[float], _Place], unit: float) -> FloatArray:
         """Central difference of the equations that the optimum solves."""
-        return (self._equations(plus) - self._equations(minus)) / (2 * unit)
+        plus, minus = self._equations(changed(unit)), self._equations(changed(-unit))
+        return (plus - minus) / (2 * unit)
 
     def _equations(self, place: _Place) -> FloatArray:
         evidence, row, keypoints, shift = place
@@ -240,10 +217,74 @@ class JointOptimum:
         forces = keypoints.forces(evidence, unpacked(evidence, row)).sum(axis=0)
         return np.concatenate([step, forces + self.principal_weight * shift])
 
+    def _by_unknowns(self) -> FloatArray:
+        distance = float(np.linalg.norm(self.state.poses[:, 9:], axis=1).mean())
+        focals, _, _, displaced = self.parts
+        spread = np.repeat(self.evidence.shape.spread, 3)
+        columns = []
+        for k in self._free.tolist():
+            unit = _DIFFERENCE
+            if k < focals and k % 6 >= 3:
+                unit *= distance
+            elif k >= displaced:
+                unit *= float(spread[k - displaced])
+            columns.append(self._slope(partial(self._with_unknown, k), unit))
+        if self.principal_weight is not None:
+            for axis in np.eye(2):
+                columns.append(self._slope(partial(self._with_principal, axis), _DIFFERENCE))
+        return np.stack(columns, axis=1)
+
+    def _by_data(self) -> FloatArray:
+        """Columns of pixels, logarithms of standard deviations, and points of the model."""
+        covariances, mean = self.keypoints.covariances, self.evidence.shape.mean
+        sigmas = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2)
+        length = float(np.ptp(mean, axis=0).max())
+        columns = []
+        for k, axis in np.ndindex(self.keypoints.pixels.shape):
+            unit = _DIFFERENCE * float(sigmas[k])
+            columns.append(self._slope(partial(self._with_pixel, k, axis), unit))
+        for k in range(len(covariances)):
+            columns.append(self._slope(partial(self._with_log_sigma, k), _DIFFERENCE))
+        for point, axis in np.ndindex(len(np.unique(self._point)), 3):
+            changed = partial(self._with_point, int(np.unique(self._point)[point]), axis)
+            columns.append(self._slope(changed, _DIFFERENCE * length))
+        return np.stack(columns, axis=1)
+
+    def _with_unknown(self, unknown: int, change: float) -> _Place:
+        row, poses = self.row.copy(), 6 * len(self.state.poses)
+        if unknown >= poses:
+            row[unknown + poses] += change  # a pose has 12 numbers
+        else:
+            step = np.zeros(6)
+            step[unknown % 6] = change
+            pose = 12 * (unknown // 6)
+            move_rigid(self.row[pose : pose + 12], step, row[pose : pose + 12])
+        return self._at(row)
+
+    def _with_principal(self, axis: FloatArray, change: float) -> _Place:
+        return self._seen(self.keypoints, change * axis)
+
+    def _with_pixel(self, keypoint: int, axis: int, change: float) -> _Place:
+        pixels = self.keypoints.pixels.copy()
+        pixels[keypoint, axis] += change
+        return self._seen(replace(self.keypoints, pixels=pixels), np.zeros(2))
+
+    def _with_log_sigma(self, keypoint: int, change: float) -> _Place:
+        covariances = self.keypoints.covariances.copy()
+        covariances[keypoint] *= np.exp(2 * change)
+        return self._seen(replace(self.keypoints, covariances=covariances), np.zeros(2))
+
+    def _with_point(self, point: int, axis: int, change: float) -> _Place:
+        shape = self.evidence.shape
+        mean = shape.mean.copy()
+        mean[point, axis] += change
+        evidence = self.evidence._replace(shape=shape._replace(mean=mean))
+        return _Place(evidence, self.row, self.keypoints, np.zeros(2))
+
     def _at(self, row: FloatArray) -> _Place:
-        logs = log_focals_of(self.evidence, unpacked(self.evidence, row))
         evidence = self.evidence
         if any(camera.distortion for camera in self.keypoints.cameras):
+            logs = log_focals_of(evidence, unpacked(evidence, row))
             evidence = self.keypoints.seen_in(evidence, logs)
         return _Place(evidence, row, self.keypoints, np.zeros(2))
 
@@ -252,64 +293,3 @@ class JointOptimum:
         logs = log_focals_of(self.evidence, self.state)
         keypoints = replace(keypoints, pixels=keypoints.pixels - shift)
         return _Place(keypoints.seen_in(self.evidence, logs), self.row, keypoints, shift)
-
-    def _moved(self) -> Iterator[tuple[float, _Place, _Place]]:
-        """Other states, one for each unknown."""
-        distance = float(np.linalg.norm(self.state.poses[:, 9:], axis=1).mean())
-        focals, displaced = self.parts.focals, self.parts.displacements
-        spread = np.repeat(self.evidence.shape.spread, 3)
-        for k in self._free.tolist():
-            unit = _DIFFERENCE
-            if k < focals and k % 6 >= 3:
-                unit *= distance
-            elif k >= displaced:
-                unit *= float(spread[k - displaced])
-            yield unit, self._at(self._row_at(k, unit)), self._at(self._row_at(k, -unit))
-        if self.principal_weight is not None:
-            for shift in _DIFFERENCE * np.eye(2):
-                plus, minus = (self._seen(self.keypoints, each) for each in (shift, -shift))
-                yield _DIFFERENCE, plus, minus
-
-    def _row_at(self, unknown: int, change: float) -> FloatArray:
-        """The state with one unknown changed."""
-        row, poses = self.row.copy(), 6 * len(self.state.poses)
-        if unknown >= poses:
-            row[unknown + poses] += change  # a pose has 12 numbers
-            return row
-        step = np.zeros(6)
-        step[unknown % 6] = change
-        pose = 12 * (unknown // 6)
-        move_rigid(self.row[pose : pose + 12], step, row[pose : pose + 12])
-        return row
-
-    def _changed(self) -> Iterator[tuple[float, _Place, _Place]]:
-        """Other data: pixels, logarithms of standard deviations, points of the model."""
-        keypoints, still = self.keypoints, np.zeros(2)
-        deviations = np.sqrt(np.trace(keypoints.covariances, axis1=1, axis2=2) / 2)
-        for k, axis in np.ndindex(keypoints.pixels.shape):
-            change = np.zeros_like(keypoints.pixels)
-            change[k, axis] = unit = _DIFFERENCE * float(deviations[k])
-            plus, minus = (
-                replace(keypoints, pixels=keypoints.pixels + each) for each in (change, -change)
-            )
-            yield unit, self._seen(plus, still), self._seen(minus, still)
-        for k in range(len(keypoints.pixels)):
-            factor = np.ones((len(keypoints.pixels), 1, 1))
-            factor[k] = np.exp(2 * _DIFFERENCE)
-            plus, minus = (
-                replace(keypoints, covariances=keypoints.covariances * each)
-                for each in (factor, 1 / factor)
-            )
-            yield _DIFFERENCE, self._seen(plus, still), self._seen(minus, still)
-        shape = self.evidence.shape
-        unit = _DIFFERENCE * float(np.ptp(shape.mean, axis=0).max())
-        for point, axis in np.ndindex(len(np.unique(self._point)), 3):
-            change = np.zeros_like(shape.mean)
-            change[np.unique(self._point)[point], axis] = unit
-            ahead, behind = (
-                self._at(self.row)._replace(
-                    evidence=self.evidence._replace(shape=shape._replace(mean=shape.mean + each))
-                )
-                for each in (change, -change)
-            )
-            yield unit, ahead, behind

@@ -15,8 +15,8 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
-from cadalign.estimation.uncertainty.distributions import chi_square_tail
 from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood
+from cadalign.estimation.uncertainty.residuals import chi_square_tail
 from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

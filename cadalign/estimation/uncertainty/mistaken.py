@@ -11,9 +11,9 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, other_sizes
-from cadalign.estimation.uncertainty.distributions import chi_square_tail, f_quantile
 from cadalign.estimation.uncertainty.misfit import Tested
 from cadalign.estimation.uncertainty.posterior import FittedKeypoints
+from cadalign.estimation.uncertainty.residuals import chi_square_tail, f_quantile
 from cadalign.estimation.uncertainty.summary import Misfit
 
 _CHANCE = 1e-4  # that noise alone leaves residuals in which mistakes are looked for

@@ -19,9 +19,14 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.options import FitOptions, pixel_information
+from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.problems import distinct_rows
-from cadalign.estimation.uncertainty.distributions import chi_square_quantile, f_quantile
+from cadalign.estimation.uncertainty.residuals import (
+    bent,
+    chi_square_quantile,
+    f_quantile,
+    loss_slopes,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.geometry.rotations import by_rotation, rotations_from_vectors
@@ -36,9 +41,8 @@ _FREEDOM = 5.0  # degrees of freedom of the Student proposals
 _FIRST_INFLATION = 1.5  # of the inverse Fisher information, for the first proposal
 _INFLATION = 1.3
 _FEW_EFFECTIVE = 60.0  # effective draws below which the weights are tempered
-_MOST_LOG_RATIO = (
-    3.0  # of distance, scales and focal length to the estimates: flat priors end there
-)
+# Of distance, scales and focal length to the estimates: flat priors end there.
+_MOST_LOG_RATIO = 3.0
 _COVERAGE = 0.95
 _NOISE_OF_DRAWS = 1.25  # ratio of variances that the draws cannot tell from 1
 _SEED = 0
@@ -96,16 +100,13 @@ class Likelihood:
 
     def losses(self, residuals: FloatArray) -> FloatArray:
         """The loss (n,) on each of the residuals (n, 2) [px], at most its whitened square."""
-        return bent(self.squares(residuals), self.options.loss, self.options.loss_scale)
+        loss, bend = LOSSES[self.options.loss], self.options.loss_scale
+        return bent(self.squares(residuals), loss, bend)
 
     def weights(self, residuals: FloatArray) -> FloatArray:
         """Weights (n,) of the squares that stand for the loss near residuals (n, 2) [px]."""
-        squares, bend = self.squares(residuals), self.options.loss_scale
-        if self.options.loss == "huber":
-            return np.asarray(bend / np.maximum(np.sqrt(squares), bend))
-        if self.options.loss == "cauchy":
-            return np.asarray(1 / (1 + squares / bend**2))
-        return np.ones(len(squares))
+        loss, bend = LOSSES[self.options.loss], self.options.loss_scale
+        return loss_slopes(self.squares(residuals), loss, bend)[0]
 
     def penalties(self, log_scales: FloatArray, log_focals: FloatArray) -> FloatArray:
         """Squared deviations (k,) from the priors, of the log scales (k, 3) and focals (k,)."""
@@ -118,25 +119,12 @@ class Likelihood:
         return np.asarray(total)
 
 
-def bent(squares: FloatArray, loss: str, bend: float) -> FloatArray:
-    """The loss, linear, huber or cauchy, on squared whitened lengths of any shape."""
-    if loss == "huber":
-        linear = 2 * bend * np.sqrt(squares) - bend**2
-        return np.asarray(np.where(squares <= bend**2, squares, linear))
-    if loss == "cauchy":
-        return np.asarray(bend**2 * np.log1p(squares / bend**2))
-    return squares
-
-
 def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
     assert result.fisher_covariance is not None
     if needs_facing([result.camera]):
-        from cadalign.estimation.facing import (  # wide lenses are rare
-            faced,
-            turned_alignment,
-            turned_covariance,
-        )
+        # Wide lenses are rare.
+        from cadalign.estimation.facing import faced, turned_alignment, turned_covariance
 
         kept = result.points_3d[result.inliers]
         camera = faced(result.camera, result.camera.project(result.alignment.apply(kept)))
@@ -308,10 +296,9 @@ def _sample(
     at_estimate += likelihood.penalties(*chart.evaluate(np.zeros((1, 10)))[2:])[0]
     limit = chi_square_quantile(len(free), 1 - _COVERAGE)
     likely = costs - at_estimate <= limit
-    moved = deviations[:, free]
-    covariance = np.zeros_like(first)
-    among = np.ix_(free, free)
+    covariance, among = np.zeros_like(first), np.ix_(free, free)
     prior = _prior_information(likelihood.options, size)[free]
+    moved = deviations[:, free]
     covariance[among] = _widened(first[among], prior, moved, weights, likely, limit)
     return covariance if np.isfinite(covariance).all() else None
 

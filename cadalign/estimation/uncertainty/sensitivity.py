@@ -1,4 +1,7 @@
-"""Sensitivity of a result: its derivatives by keypoints, their sigmas and the model's points."""
+"""Sensitivity of results: of fits in closed form, of all other evidence by differences.
+
+That is the derivatives of a result by its keypoints, their sigmas, and the model's points.
+"""
 
 from __future__ import annotations
 
@@ -9,21 +12,31 @@ from typing import cast
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.errors import InputError
+from cadalign.estimation.estimates import placed_box, poses_of
+from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.focal import log_focal_range
-from cadalign.estimation.options import LOSSES, pixel_information
+from cadalign.estimation.joint_robust import with_sightings
+from cadalign.estimation.model import Model
+from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
+from cadalign.estimation.pack import evidence_of
+from cadalign.estimation.prior import Lenses, prior_of, rows_among, widened
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
 from cadalign.estimation.result_data import ResultData
-from cadalign.estimation.uncertainty.derivatives import (
-    UNKNOWNS,
-    Optima,
-    PriorTerms,
-    SeenKeypoints,
-)
+from cadalign.estimation.symmetry import equal_slopes
+from cadalign.estimation.uncertainty.derivatives import UNKNOWNS, Optima, lens_slopes
+from cadalign.estimation.uncertainty.differences import JointOptimum
+from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis
+from cadalign.estimation.uncertainty.residuals import whitening_matrices
 from cadalign.estimation.uncertainty.stated import KeypointStatistics
-from cadalign.geometry.camera import Camera
+from cadalign.estimation.view import View
+from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.joint.evidence import State, points_of
+from cadalign.solvers.joint.search import has_latent
 from cadalign.solvers.unknowns import leaves_bounds
 
 _SINGULAR = 1e-12
+_NEAR = 1e-9  # of coordinates that are the same but for rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,21 +119,106 @@ class Sensitivity:
         return "\n".join(lines)
 
 
-def sensitivity_of_keypoints(
-    result: ResultData, fitted: KeypointStatistics, *, exact: bool
-) -> Sensitivity:
+def sensitivity_of(result: ResultData, *, exact: bool, view: int) -> Sensitivity:
+    """The sensitivity of a result; see `cadalign.Result.sensitivity`."""
+    if not 0 <= view < len(result.views):
+        what = f"{view} is none of the result's {len(result.views)} views"
+        raise InputError(what, where="view", fix=f"give 0 to {len(result.views) - 1}")
+    statistics = result.statistics
+    if isinstance(statistics, KeypointStatistics) and not result.camera.is_wide:
+        if statistics.fisher_covariance is None:
+            what = f"the method {result.method} minimises no cost, and has no derivatives"
+            raise InputError(what, where="sensitivity", fix='fit with method="optimal"')
+        return _of_keypoints(result, statistics, exact)
+    if not exact:
+        what = "only keypoints of one view of an exact model have a Gauss-Newton sensitivity"
+        raise InputError(what, where="exact", fix="leave it at True")
+    if result.trajectory is not None:
+        what = "an estimate with a motion has no sensitivity"
+        raise InputError(what, where="sensitivity", fix="align its frames without `motion`")
+    basis = statistics.basis
+    if basis is None and result.options is not None and result.covariance is not None:
+        basis = _basis_of_fit(result, result.options)
+    if basis is None:
+        what = "the result holds no evidence: it was read from a file"
+        raise InputError(what, where="sensitivity", fix="align again")
+    return _of_evidence(result, basis, view)
+
+
+def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
+    """The evidence of a fit, and its state."""
+    own = result.views[0]
+    model = Model(
+        points_3d=result.points_3d,
+        ids=result.ids,
+        stretch=options.stretch,
+        stretch_sigma=options.stretch_sigma,
+        known_axis=options.known_axis,
+    )
+    sigma = result.sigma if options.sigma is None else options.sigma
+    camera = faced(own.camera, own.points_2d)
+    view = View(camera, own.points_2d, ids=own.ids, sigma=sigma)
+    focals = int(options.focal == "estimate")
+    evidence = evidence_of(
+        prior_of(model),
+        [view],
+        None,
+        loss=LOSSES[options.loss],
+        loss_scale=options.loss_scale,
+        lenses=Lenses((camera,), (focals - 1,), options.focal_prior),
+    )
+    rows = rows_among(result.ids, own.ids, "ids")
+    evidence = with_sightings(evidence, own.inliers[np.argsort(rows, kind="stable")])
+    pose = turned_alignment(own.alignment, camera.lens_from_camera.T)
+    state = State(
+        np.concatenate([pose.rotation.ravel(), pose.translation])[None],
+        np.zeros(focals),
+        np.log(pose.scale),
+        np.zeros(0),
+        np.zeros_like(evidence.shape.mean),
+    )
+    return Basis(evidence, state, principal_sigma=options.principal_sigma)
+
+
+def _of_keypoints(result: ResultData, fitted: KeypointStatistics, exact: bool) -> Sensitivity:
     """The sensitivity of a fit, in closed form."""
-    kept, view, options = result.inliers, result.views[0], fitted.options
+    kept, view, options = fitted.inliers, result.views[0], fitted.options
+    camera, alignment, n = view.camera, fitted.alignment, len(kept)
     pixels = np.require(view.points_2d[kept], requirements=["C", "W"])
-    optima = _optimum(fitted, pixels, exact)
-    size = 10 if options.focal == "estimate" else 9
-    pulled = optima.pull_back(np.eye(UNKNOWNS)[:size])
-    n = len(kept)
+    rays, sigma = rays_of(pixels, camera), fitted.chosen_sigma
+    own = np.asarray(sigma, dtype=np.float64)[kept] if np.ndim(sigma) > 0 else sigma
+    whitening = np.broadcast_to(whitening_of(own, rays, camera), (len(rays), 3))
+    matrices = whitening_matrices(whitening)
+    free, size, slopes, mean, weight = options.estimated_unknowns, UNKNOWNS - 1, None, 0.0, 0.0
+    if options.focal == "estimate":
+        size = UNKNOWNS
+        low, high, mean, weight = log_focal_range(camera, options.focal_prior, camera.fx)
+        if leaves_bounds(0.0, low, high, 0.0) or not low < 0.0 < high:
+            free = free[free < UNKNOWNS - 1]
+        if camera.distortion:
+            slopes = focal_slopes(pixels, camera, rays)[None]
+    optima = Optima(
+        fitted.points_3d[kept][None],
+        rays[None],
+        (matrices.swapaxes(1, 2) @ matrices)[None],
+        alignment.rotation[None],
+        alignment.translation[None],
+        alignment.scale[None],
+        scale_prior=options.scale_prior,
+        free=free,
+        loss=LOSSES[options.loss],
+        loss_scale=options.loss_scale,
+        exact=exact,
+        slopes=slopes,
+        focal_offset=-mean,
+        focal_weight=weight,
+    )
+    by_rays, by_log_sigma, by_place = optima.pull_back(np.eye(UNKNOWNS)[:size])
     by_pixels, by_sigma = np.zeros((size, n, 2)), np.zeros((size, n))
     by_points = np.zeros((size, n, 3))
-    lens = lens_slopes(optima.keypoints.rays[0], view.camera)
-    by_pixels[:, kept] = (pulled.by_rays[:, :, None] @ lens)[:, :, 0]
-    by_sigma[:, kept], by_points[:, kept] = pulled.by_log_sigma, pulled.by_points
+    by_pixels[:, kept] = (by_rays[:, :, None] @ lens_slopes(rays, camera))[:, :, 0]
+    by_sigma[:, kept], by_points[:, kept] = by_log_sigma, by_place
+    variances = np.linalg.inv(pixel_information(sigma, n))
     return Sensitivity(
         tuple(view.ids),
         np.zeros(n, dtype=np.int64),
@@ -129,65 +227,117 @@ def sensitivity_of_keypoints(
         by_points,
         None,
         None,
-        _sigmas(fitted.chosen_sigma, n),
+        np.asarray(np.sqrt(np.trace(variances, axis1=1, axis2=2) / 2)),
         cast(FloatArray, result.covariance),
     )
 
 
-def _optimum(fitted: KeypointStatistics, pixels: FloatArray, exact: bool) -> Optima:
-    """The optimum of one fit to its inliers' ``pixels`` (k, 2)."""
-    options, camera = fitted.options, fitted.camera
-    rays = rays_of(pixels, camera)
-    sigma = fitted.chosen_sigma
-    if np.ndim(sigma) > 0:
-        sigma = np.asarray(sigma, dtype=np.float64)[fitted.inliers]
-    whitening = np.broadcast_to(whitening_of(sigma, rays, camera), (len(rays), 3))
-    estimates_focal = options.focal == "estimate"
-    prior, free = PriorTerms(options.scale_prior), options.estimated_unknowns
-    slopes = None
-    if estimates_focal:
-        low, high, mean, weight = log_focal_range(camera, options.focal_prior, camera.fx)
-        if leaves_bounds(0.0, low, high, 0.0) or not low < 0.0 < high:
-            free = free[free < UNKNOWNS - 1]
-        prior = PriorTerms(options.scale_prior, -mean, weight)
-        if camera.distortion:
-            slopes = focal_slopes(pixels, camera, rays)[None]
-    keypoints = SeenKeypoints(
-        fitted.points_3d[fitted.inliers][None],
-        rays[None],
-        information_of(whitening)[None],
-        LOSSES[options.loss],
-        options.loss_scale,
-        slopes,
+def _of_evidence(result: ResultData, basis: AnyBasis, view: int) -> Sensitivity:
+    """The sensitivity of one view's pose, and of all that the views share."""
+    numbers = basis.numbers or tuple(range(len(result.views)))
+    if view not in numbers:
+        what = f"views[{view}] is left out of the estimate"
+        raise InputError(what, where="view", fix="give the number of another one")
+    evidence, state = basis.evidence, basis.state
+    if isinstance(basis, Basis) and isinstance(result.model, ShapeModel):  # as it was estimated
+        evidence, state = widened(evidence, state, 1 / result.model.inflation)
+    of_view = np.repeat(np.arange(len(result.views)), [len(each.ids) for each in result.views])
+    ids = [name for each in result.views for name in each.ids]
+    rows, kept = np.array(rows_among(result.ids, ids, "ids")), np.flatnonzero(result.inliers)
+    kept = kept[np.argsort(rows[kept], kind="stable")]  # the order of the sightings
+    pixels = np.concatenate(result.observed)[kept]
+    cameras = [faced(each.camera, each.points_2d) for each in (result.views[k] for k in numbers)]
+    optimum = JointOptimum.of(evidence, state, cameras, pixels, basis.principal_sigma)
+    image, slopes = numbers.index(view), optimum.slopes
+    points = _points_by_unknowns(result, optimum)
+    turn = cameras[image].lens_from_camera
+    shown, by_mean = _shown_by_unknowns(result, optimum, points, image, turn)
+
+    def spread(values: FloatArray, axis: int) -> FloatArray:
+        """Columns of all keypoints from those of the inliers, 0 for the others."""
+        shape = list(values.shape)
+        shape[axis] = len(ids)
+        whole = np.zeros(shape)
+        whole[(slice(None),) * axis + (kept,)] = values
+        return whole
+
+    def of_points(values: FloatArray) -> FloatArray | None:
+        if not has_latent(evidence):
+            return None
+        return spread(np.tensordot(points[: len(result.points_3d)], values, 1), 2)
+
+    by_points = np.tensordot(shown, slopes.by_points, 1)
+    by_points[6:9] += by_mean[:, rows[kept]]
+    sigma = np.sqrt(np.trace(optimum.keypoints.covariances, axis1=1, axis2=2) / 2)
+    return Sensitivity(
+        tuple(ids),
+        of_view,
+        spread(np.tensordot(shown, slopes.by_pixels, 1), 1),
+        spread(np.tensordot(shown, slopes.by_log_sigma, 1), 1),
+        spread(by_points, 1),
+        of_points(slopes.by_pixels),
+        of_points(slopes.by_log_sigma),
+        spread(sigma, 0),
+        cast(FloatArray, result.views[view].covariance),
     )
-    alignment = fitted.alignment
-    return Optima(
-        keypoints,
-        alignment.rotation[None],
-        alignment.translation[None],
-        alignment.scale[None],
-        prior,
-        free,
-        exact,
-    )
 
 
-def information_of(whitening: FloatArray) -> FloatArray:
-    """Information (..., 2, 2) of rays from rows (..., 3) of weights; see `whitening_of`."""
-    a, b, c = np.moveaxis(whitening, -1, 0)
-    rows = np.stack([a * a, a * b, a * b, b * b + c * c], axis=-1)
-    return np.asarray(rows.reshape(*rows.shape[:-1], 2, 2))
+def _points_by_unknowns(result: ResultData, optimum: JointOptimum) -> FloatArray:
+    """Derivatives (m + 2, 3, U) of points before the stretch, the box's corners last."""
+    shape, (_, _, coefficients, displaced) = optimum.evidence.shape, optimum.parts
+    count = len(shape.mean)
+    found = np.zeros((count, 3, displaced + 3 * count))
+    found[:, :, coefficients:displaced] = np.moveaxis(shape.modes, 0, 2)
+    found[:, :, displaced:] = np.eye(3 * count).reshape(count, 3, -1)
+    return found[np.r_[: len(result.ids), -2:0]]
 
 
-def lens_slopes(rays: FloatArray, camera: Camera) -> FloatArray:
-    """Derivatives (n, 2, 2) of undistorted rays (n, 2) by the pixels."""
-    inverse = np.diag([1.0 / camera.fx, 1.0 / camera.fy])
-    if not camera.distortion:
-        return np.broadcast_to(inverse, (len(rays), 2, 2))
-    return np.asarray(np.linalg.inv(camera.distortion_jacobian(rays)) @ inverse)
+def _shown_by_unknowns(
+    result: ResultData, optimum: JointOptimum, points: FloatArray, image: int, turn: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (9 or 10, U) of rotation vector, translation, log lengths and log focal.
+
+    ``turn`` (3, 3) leads from the frame of the view's camera, the one that was estimated in, to
+    that of the result. Also returns the derivatives (3, m, 3) of the log lengths by the mean's
+    keypoints that are corners.
+    """
+    evidence, (focals, scales, coefficients, _) = optimum.evidence, optimum.parts
+    group, pose = int(evidence.focals.group[image]), 6 * int(evidence.rig.pose[image])
+    found = np.zeros((9 + (group >= 0), points.shape[2]))
+    whole = turn @ evidence.rig.cam_from_rig[image, :9].reshape(3, 3)
+    found[:3, pose : pose + 3] = found[3:6, pose + 3 : pose + 6] = whole
+    found[6:9, scales:coefficients] = np.eye(3)
+    if group >= 0:
+        found[9, focals + group] = 1.0
+    if result.symmetry is not None:
+        given = turned_alignment(poses_of(evidence, optimum.state)[image], turn)
+        free = (evidence.scales.free == 0).tolist()
+        found[:9] = equal_slopes(given, result.symmetry, held=tuple(free)) @ found[:9]
+    by_mean = np.zeros((3, len(points), 3))
+    if isinstance(result.model, ShapeModel):
+        low, high = _corners(result, optimum)
+        axes, extent = np.arange(3), result.bounds[1] - result.bounds[0]
+        found[6:9] += (points[high, axes] - points[low, axes]) / extent[:, None]
+        by_mean[axes, high, axes] += 1 / extent
+        by_mean[axes, low, axes] -= 1 / extent
+    return found, by_mean
 
 
-def _sigmas(sigma: object, count: int) -> FloatArray:
-    """Standard deviations (n,) [px] of keypoints, root mean square over x and y."""
-    variances = np.linalg.inv(pixel_information(sigma, count))
-    return np.asarray(np.sqrt(np.trace(variances, axis1=1, axis2=2) / 2))
+def _corners(result: ResultData, optimum: JointOptimum) -> tuple[IntArray, IntArray]:
+    """Rows (3,) of the shape's points that the least and the greatest corner move with.
+
+    Without margins these are the corners of the linear box, or keypoints beyond them.
+    """
+    evidence, state, count = optimum.evidence, optimum.state, len(result.points_3d)
+    seen = np.unique(evidence.sightings.point)
+    seen = seen[seen < count]
+    own = count + np.array([[0, 0, 0], [1, 1, 1]])
+    margins = cast(ShapeModel, result.model).box_margins
+    if margins is not None and not len(evidence.offsets.value):
+        linear = points_of(evidence.shape, state)[-2:] / np.exp(state.log_scales)
+        _, own = placed_box(np.concatenate([result.points_3d, linear]), seen, margins)
+    given = result.points_3d[seen]
+    for side, outermost in enumerate((given.argmin(axis=0), given.argmax(axis=0))):
+        at_corner = np.abs(result.bounds[side] - given[outermost, np.arange(3)]) < _NEAR
+        own[side, at_corner] = seen[outermost[at_corner]]
+    return own[0], own[1]

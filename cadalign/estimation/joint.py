@@ -40,7 +40,7 @@ from cadalign.estimation.symmetry import (
 )
 from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
-from cadalign.estimation.uncertainty.held_out import ShapeTails, misfits
+from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,

@@ -27,7 +27,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.uncertainty.evidence import summary_of_keypoints
-from cadalign.estimation.uncertainty.held_out import SeenShape, ShapeTails, keypoint_misfits
+from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTails, keypoint_misfits
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel

@@ -26,7 +26,7 @@ from cadalign.estimation.uncertainty.evidence import (
     redundancy_of,
     without,
 )
-from cadalign.estimation.uncertainty.held_out import ShapeTails, misfits
+from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, packed

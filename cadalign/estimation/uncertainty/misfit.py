@@ -1,29 +1,33 @@
-"""Tests of residuals, and of given scales and camera, against stated noise; outliers among them."""
+"""Tests of residuals, and of given scales and camera, against stated noise: outliers, mistakes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood
-from cadalign.estimation.uncertainty.residuals import chi_square_tail
+from cadalign.estimation.uncertainty.residuals import chi_square_tail, f_quantile
 from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
-_FALSE_OUTLIERS = 0.01
+if TYPE_CHECKING:
+    from cadalign.estimation.mistakes import Explained, Mistake
+    from cadalign.estimation.result_data import ResultData
+
 Rows = npt.NDArray[np.intp]
+_FALSE_OUTLIERS = 0.01
 _FALSE_ALARMS = 0.004
 _FALSE_STRETCH_ALARMS = 0.002
 _FALSE_CAMERA_ALARMS = 1e-5
@@ -31,40 +35,16 @@ _SCALES = 2  # unknown ones, of an alignment without constraints
 _WORTH_A_SEARCH = 4.0  # linearised decrease of the sum
 _TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
+# Hands click to about 2 px, and shapes differ by as much: weight of that, as of so many equations.
+_CLICK, _CLICK_EQUATIONS = 2.0, 4
+_MISTAKE_CHANCE = 1e-4  # that noise alone leaves residuals in which mistakes are looked for
+_CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
+_LARGE = 0.02  # estimated sigma, over the keypoints' extent, that asks for a mistake
+_LEAST_SQUARES = 1e-9  # of exact keypoints
 
-
-class PoseFit(Protocol):
-    """A fit of keypoints, such as `cadalign.Result`."""
-
-    @property
-    def alignment(self) -> Alignment: ...
-    @property
-    def camera(self) -> Camera: ...
-    @property
-    def fisher_covariance(self) -> FloatArray | None: ...
-
-
-FitRows = Callable[[Rows, bool], PoseFit]
+FitRows = Callable[[Rows, bool], "FittedKeypoints | ResultData"]
 """Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
 True."""
-
-
-@dataclass(frozen=True)
-class NoiseLevel:
-    """Prior on the keypoints' noise, relative to that of the fits."""
-
-    sigma: float = 1.0  # expected standard deviation
-    equations: float = math.inf  # weight, as of so many equations; infinite for a known noise
-
-    def variance(self, squares: float, redundancy: float) -> float:
-        """The variance, by the prior and a sum of squares with that redundancy."""
-        if math.isinf(self.equations):
-            return self.sigma**2
-        return (squares + self.equations * self.sigma**2) / (redundancy + self.equations)
-
-
-CLICKS = NoiseLevel(2.0, 4)
-"""Hands click to about 2 px, and shapes differ by as much."""
 
 
 def find_outliers(
@@ -74,161 +54,89 @@ def find_outliers(
     *,
     unknowns: int,
     noise: FloatArray | None = None,
-    level: NoiseLevel = CLICKS,
 ) -> dict[int, float]:
     """Find the keypoints that lie farther from the others' prediction than noise explains.
 
     A forward search (Hadi, "Identifying multiple outliers in multivariate data", 1992): it begins
     with the better half of the keypoints in a robust fit and adds all that agree, until nothing
     changes, so that several outliers do not mask each other. ``noise`` (n, 2, 2) are the
-    covariances [px^2] of the fits, by default those of 1 px; unless ``level`` says that it is
-    known, their common factor is estimated from the inliers, since all keypoints of a model that is
-    only similar to the object are some pixels off.
+    covariances [px^2] of the fits, which are known. Without these the fits take 1 px, and the
+    common factor is estimated from the inliers, about that of clicks, since all keypoints of a
+    model that is only similar to the object are some pixels off.
 
     Returns, by row, the outlier's distance [px] from the prediction of the fit to the inliers; none
     with too few keypoints: without one, at least two more equations than unknowns must be left.
     """
-    count = len(points_3d)
-    least = unknowns // 2 + 1
+    count, least = len(points_3d), unknowns // 2 + 1
     if count <= least:
         return {}
-    if noise is None:
-        noise = np.tile(np.eye(2), (count, 1, 1))
-    search = _Search(points_3d, points_2d, noise, fit_rows, level, unknowns)
-    try:
-        inliers = search.run(least)
-        if inliers.all():
-            return {}
-        result = fit_rows(np.flatnonzero(inliers), False)
-    except CadalignError:  # a subset of the keypoints is degenerate, so that none can be judged
-        return {}
-    lengths = np.linalg.norm(search.residuals(result), axis=1)
-    return {int(row): float(lengths[row]) for row in np.flatnonzero(~inliers)}
+    covariances = np.tile(np.eye(2), (count, 1, 1)) if noise is None else noise
+    start = max(least, count // 2 + 1)
 
+    def residuals_of(result: FittedKeypoints | ResultData) -> FloatArray:
+        """Projected minus observed (n, 2) [px]; infinite behind the camera."""
+        in_camera = result.alignment.apply(points_3d)
+        return result.camera.project_where_ahead(in_camera) - points_2d
 
-@dataclass(frozen=True, eq=False)
-class _Search:
-    """The forward search of `find_outliers`."""
-
-    points_3d: FloatArray
-    points_2d: FloatArray
-    noise: FloatArray
-    fit_rows: FitRows
-    level: NoiseLevel
-    unknowns: int
-
-    def run(self, least: int) -> BoolArray:
-        """Find the inliers, (n,) bool, at least so many."""
-        count = len(self.points_3d)
-        start = max(least, count // 2 + 1)
-        robust = self.residuals(self.fit_rows(np.arange(count), True))
-        lengths = _squares(robust, self.noise)
-        rows = np.sort(np.argsort(lengths, kind="stable")[:start])
-        for _ in range(2 * count):
-            statistic, redundancy = self._statistic(rows)
-            quantile = _f_quantile(_FALSE_OUTLIERS / count, redundancy + self.level.equations)
-            agreed = np.flatnonzero(statistic <= quantile)
-            if len(agreed) < start:
-                agreed = np.sort(np.argsort(statistic, kind="stable")[:start])
-            if np.array_equal(agreed, rows):
-                break
-            rows = agreed
-        inliers = np.zeros(count, dtype=bool)
-        inliers[rows] = True
-        return inliers
-
-    def _statistic(self, rows: Rows) -> tuple[FloatArray, int]:
-        """Squared residuals (n,) per equation over their expectation, and the fit's redundancy.
+    def statistic(rows: Rows) -> tuple[FloatArray, float]:
+        """Squared residuals (n,) per equation over their expectation, and their quantile.
 
         For keypoints outside the fit, the covariance of the prediction adds to the noise.
         """
-        result = self.fit_rows(rows, False)
-        residuals = self.residuals(result)
-        redundancy = 2 * len(rows) - self.unknowns
-        total = float(_squares(residuals[rows], self.noise[rows]).sum())
-        expected = self.noise.copy()
-        others = np.setdiff1d(np.arange(len(self.points_3d)), rows)
-        others = others[result.camera.sees(result.alignment.apply(self.points_3d[others]))]
+        result = fit_rows(rows, False)
+        residuals = residuals_of(result)
+        variance, equations = 1.0, math.inf
+        if noise is None:
+            equations = 2 * len(rows) - unknowns + _CLICK_EQUATIONS
+            total = float(_squares(residuals[rows], covariances[rows]).sum())
+            variance = (total + _CLICK_EQUATIONS * _CLICK**2) / equations
+        expected = covariances.copy()
+        others = np.setdiff1d(np.arange(count), rows)
+        others = others[result.camera.sees(result.alignment.apply(points_3d[others]))]
         covariance = result.fisher_covariance
         if len(others) and covariance is not None:
-            jacobian = projection_jacobian(self.points_3d[others], result.camera, result.alignment)
+            jacobian = projection_jacobian(points_3d[others], result.camera, result.alignment)
             expected[others] += predicted_covariances(jacobian, covariance)
-        squares = _squares(residuals, expected) / 2
-        return squares / self.level.variance(total, redundancy), redundancy
+        quantile = _f_quantile_of_two(_FALSE_OUTLIERS / count, equations)
+        return _squares(residuals, expected) / 2 / variance, quantile
 
-    def residuals(self, result: PoseFit) -> FloatArray:
-        """Projected minus observed (n, 2) [px]; infinite behind the camera."""
-        in_camera = result.alignment.apply(self.points_3d)
-        return result.camera.project_where_ahead(in_camera) - self.points_2d
+    def nearest(squares: FloatArray) -> Rows:
+        return np.sort(np.argsort(squares, kind="stable")[:start])
+
+    try:
+        robust = residuals_of(fit_rows(np.arange(count), True))
+        rows = nearest(_squares(robust, covariances))
+        for _ in range(2 * count):
+            values, quantile = statistic(rows)
+            agreed = np.flatnonzero(values <= quantile)
+            agreed = agreed if len(agreed) >= start else nearest(values)
+            if np.array_equal(agreed, rows):
+                break
+            rows = agreed
+        outliers = np.setdiff1d(np.arange(count), rows)
+        if not len(outliers):
+            return {}
+        lengths = np.linalg.norm(residuals_of(fit_rows(rows, False)), axis=1)
+    except CadalignError:  # a subset of the keypoints is degenerate, so that none can be judged
+        return {}
+    return {int(row): float(lengths[row]) for row in outliers}
 
 
 def _squares(residuals: FloatArray, covariances: FloatArray) -> FloatArray:
     """Squared lengths (n,) of residuals (n, 2) whitened by their covariances (n, 2, 2)."""
     finite = np.nan_to_num(residuals, posinf=1e9)
-    squares = np.einsum("na,nab,nb->n", finite, np.linalg.inv(covariances), finite)
-    return np.asarray(squares)
+    return np.asarray(np.einsum("na,nab,nb->n", finite, np.linalg.inv(covariances), finite))
 
 
-def _f_quantile(chance: float, equations: float) -> float:
+def _f_quantile_of_two(chance: float, equations: float) -> float:
     """Value that an F variable with (2, equations) degrees of freedom exceeds by this chance."""
     if math.isinf(equations):
         return -math.log(chance)
     return equations / 2 * (math.pow(chance, -2 / equations) - 1)
 
 
-def find_misfit(result: FittedKeypoints) -> Misfit | None:
-    """Test the residuals of the inliers by chi-square; None if they pass, or sigma is estimated.
-
-    The sum of squares at the optimum has the redundancy as its expectation; a robust loss, which is
-    at most the square, only makes the test more cautious, and so does the cut of RANSAC. Priors
-    count as equations that are always met. A constraint on the scales is tested by the decrease of
-    the sum without it, which has one degree of freedom for each scale, and so is the camera's focal
-    length.
-    """
-    if result.options.sigma is None:
-        return None
-    try:
-        tested = Tested.of(result)
-    except (InputError, np.linalg.LinAlgError):  # a depth, or a weight, that rounds to zero
-        return None
-    free_scale = contradicting_scale(tested)
-    if free_scale is not None:
-        return Misfit(tested.chi_square, tested.redundancy, free_scale)
-    passes = tested.passes
-    outliers = {} if passes else _outliers(tested)
-    camera = contradicting_camera(tested) if len(outliers) != 1 else None
-    if camera is not None:
-        return Misfit(tested.chi_square, tested.redundancy, camera=camera)
-    return None if passes else Misfit(tested.chi_square, tested.redundancy, outliers=outliers)
-
-
-def unverified_stretch(result: FittedKeypoints) -> str | None:
-    """Warn about scales held at 1 where the keypoints would not contradict another value.
-
-    None where nothing is held, sigma is estimated, or the free scales are not determined at all,
-    which is what holding them is for.
-    """
-    options = result.options
-    held = set("xyz") - {options.known_axis} - set(options.stretched_axes)
-    if not held or options.sigma is None:
-        return None
-    try:
-        free = Tested.of(result).fit(stretch=None)
-    except CadalignError:
-        return None
-    assert free.fisher_covariance is not None
-    scale = uncertainty_of(free.fisher_covariance).scale
-    doubtful = [axis for axis in sorted(held) if scale["xyz".index(axis)] > _TESTED_TO]
-    if not doubtful:
-        return None
-    known = " and ".join(f"s_{axis} to +-{percent(scale['xyz'.index(axis)])}" for axis in doubtful)
-    return (
-        f"the scale is held at 1, which is not tested: free, the keypoints determine {known} only"
-    )
-
-
 @dataclass(frozen=True, eq=False)
-class Tested:
+class _Tested:
     """A result's inliers, with their noise and the sum of their losses."""
 
     points_3d: FloatArray
@@ -241,7 +149,7 @@ class Tested:
     chi_square: float
 
     @classmethod
-    def of(cls, result: FittedKeypoints) -> Tested:
+    def of(cls, result: FittedKeypoints) -> _Tested:
         rows = np.flatnonzero(result.inliers)
         points_3d, residuals = result.points_3d[rows], result.residuals[rows]
         projected = result.camera.project(result.alignment.apply(points_3d))
@@ -292,11 +200,7 @@ class Tested:
         return along * (along / length) if length > 0 else 0.0  # a power raises where it overflows
 
     def fit(
-        self,
-        rows: Rows | slice = slice(None),
-        *,
-        camera: Camera | None = None,
-        **changes: Any,
+        self, rows: Rows | slice = slice(None), *, camera: Camera | None = None, **changes: Any
     ) -> FittedKeypoints:
         """Fit some of the keypoints anew, with changed options or camera."""
         options = replace(self.options, sigma=self.covariances[rows], **changes)
@@ -306,24 +210,81 @@ class Tested:
             solutions = solve_one(problems, options)
         return FittedKeypoints(**fitted_fields(problems, solutions, options))
 
+    def again(self, **changes: Any) -> _Tested | None:
+        """The keypoints in a fit with changed options or camera; None if there is none."""
+        try:
+            return _Tested.of(self.fit(**changes))
+        except CadalignError:
+            return None
 
-def contradicting_scale(tested: Tested) -> tuple[float, float, float] | None:
+
+def find_misfit(result: FittedKeypoints) -> Misfit | None:
+    """Test the residuals of the inliers by chi-square; None if they pass, or sigma is estimated.
+
+    The sum of squares at the optimum has the redundancy as its expectation; a robust loss, which is
+    at most the square, only makes the test more cautious, and so does the cut of RANSAC. Priors
+    count as equations that are always met. A constraint on the scales is tested by the decrease of
+    the sum without it, which has one degree of freedom for each scale, and so is the camera's focal
+    length.
+    """
+    if result.options.sigma is None:
+        return None
+    try:
+        tested = _Tested.of(result)
+    except (InputError, np.linalg.LinAlgError):  # a depth, or a weight, that rounds to zero
+        return None
+    sums = tested.chi_square, tested.redundancy
+    free_scale = _contradicting_scale(tested)
+    if free_scale is not None:
+        return Misfit(*sums, free_scale)
+    passes = tested.passes
+    outliers = {} if passes else _outliers(tested)
+    camera = _contradicting_camera(tested) if len(outliers) != 1 else None
+    if camera is not None:
+        return Misfit(*sums, camera=camera)
+    return None if passes else Misfit(*sums, outliers=outliers)
+
+
+def unverified_stretch(result: FittedKeypoints) -> str | None:
+    """Warn about scales held at 1 where the keypoints would not contradict another value.
+
+    None where nothing is held, sigma is estimated, or the free scales are not determined at all,
+    which is what holding them is for.
+    """
+    options = result.options
+    held = set("xyz") - {options.known_axis} - set(options.stretched_axes)
+    if not held or options.sigma is None:
+        return None
+    try:
+        free = _Tested.of(result).fit(stretch=None)
+    except CadalignError:
+        return None
+    assert free.fisher_covariance is not None
+    scale = dict(zip("xyz", uncertainty_of(free.fisher_covariance).scale, strict=True))
+    doubtful = [axis for axis in sorted(held) if scale[axis] > _TESTED_TO]
+    if not doubtful:
+        return None
+    known = " and ".join(f"s_{axis} to +-{percent(scale[axis])}" for axis in doubtful)
+    return (
+        f"the scale is held at 1, which is not tested: free, the keypoints determine {known} only"
+    )
+
+
+def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
     """The scales without the constraints on them, if these contradict the keypoints."""
     options = tested.options
     if len(options.stretched_axes) == _SCALES and options.stretch_sigma is None:
         return None
-    try:
-        free = tested.fit(stretch=None, stretch_sigma=None)
-        decrease = tested.chi_square - Tested.of(free).chi_square
-    except CadalignError:  # the keypoints do not determine the scales, so nothing contradicts
+    free = tested.again(stretch=None, stretch_sigma=None)
+    if free is None:  # the keypoints do not determine the scales, so nothing contradicts
         return None
-    if chi_square_tail(decrease, _SCALES) >= _FALSE_STRETCH_ALARMS:
+    if chi_square_tail(tested.chi_square - free.chi_square, _SCALES) >= _FALSE_STRETCH_ALARMS:
         return None
     x, y, z = free.alignment.scale.tolist()
     return x, y, z
 
 
-def contradicting_camera(tested: Tested) -> Camera | None:
+def _contradicting_camera(tested: _Tested) -> Camera | None:
     """The camera that the keypoints fit instead of the given one, if they contradict it.
 
     Tried are a focal length of their own and images of another size than the camera's, unless the
@@ -333,13 +294,13 @@ def contradicting_camera(tested: Tested) -> Camera | None:
         return None
     if tested.passes and tested.decrease_by_focal() < _WORTH_A_SEARCH:
         return None
-    width, height = tested.camera.width, tested.camera.height
-    found = [_tried(tested, focal="estimate")]
     from cadalign.estimation.mistakes import OTHER_SIZES  # rarely asked
 
+    found = [tested.again(focal="estimate")]
     for factor in OTHER_SIZES:
-        sizes = max(1, round(width * factor)), max(1, round(height * factor))
-        found.append(_tried(tested, camera=tested.camera.resized(*sizes)))
+        given = tested.camera.width, tested.camera.height
+        sizes = (max(1, round(size * factor)) for size in given)
+        found.append(tested.again(camera=tested.camera.resized(*sizes)))
     fits = [each for each in found if each is not None and each.passes]
     if not fits:
         return None
@@ -348,31 +309,77 @@ def contradicting_camera(tested: Tested) -> Camera | None:
     return best.camera if chi_square_tail(decrease, 1) < _FALSE_CAMERA_ALARMS else None
 
 
-def _tried(tested: Tested, **changes: Any) -> Tested | None:
-    try:
-        return Tested.of(tested.fit(**changes))
-    except CadalignError:
-        return None
-
-
-def _outliers(tested: Tested) -> dict[int, float]:
+def _outliers(tested: _Tested) -> dict[int, float]:
     """The few keypoints without which the others pass the test, with their distances [px]."""
 
     def fit_rows(rows: Rows, robust: bool) -> FittedKeypoints:
         loss = "cauchy" if robust else "linear"
         return tested.fit(rows, loss=loss, loss_scale=FitOptions.loss_scale)
 
-    found = find_outliers(
-        tested.points_3d,
-        tested.points_2d,
-        fit_rows,
-        unknowns=tested.options.unknowns,
-        noise=tested.covariances,
-        level=NoiseLevel(),
-    )
+    points, unknowns = (tested.points_3d, tested.points_2d), tested.options.unknowns
+    found = find_outliers(*points, fit_rows, unknowns=unknowns, noise=tested.covariances)
     if not 0 < len(found) <= _MOST_OUTLIERS * len(tested.rows):
         return {}
     rest = fit_rows(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
-    if not Tested.of(rest).passes:
+    if not _Tested.of(rest).passes:
         return {}
     return {int(tested.rows[row]): length for row, length in found.items()}
+
+
+def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> str | None:
+    """Name the mistake in the keypoints of a fit without which they would fit.
+
+    ``misfit`` may tell a camera that they fit as they are. Returns a warning; None where keypoints
+    fit, and where no mistake explains the misfit better than that camera. Another image size, which
+    leaves nearly as much open as a stretch, counts only where neither a stretch nor a few wrong
+    keypoints explain it.
+    """
+    from cadalign.estimation.mistakes import Explained, find_in_all, other_sizes
+
+    camera = None if misfit is None else misfit.camera
+    has_reason = misfit is not None and bool(misfit.outliers or misfit.free_scale)
+    try:
+        tested = _Tested.of(result)
+    except InputError:  # a depth that rounds to zero has no projection
+        return None
+    redundancy, keypoints = tested.redundancy, len(tested.rows)
+    if redundancy < 1:
+        return None
+    sigma, most = result.sigma if result.options.sigma is None else None, math.inf
+    if sigma is None:
+        if chi_square_tail(tested.chi_square, redundancy) >= _MISTAKE_CHANCE:
+            return None
+    else:
+        if sigma < _LARGE * np.ptp(tested.points_2d, axis=0).max():
+            return None
+        most = tested.chi_square / f_quantile(redundancy, redundancy, _CHANCE_OF_RATIO)
+
+    def score(fitted: _Tested) -> float:
+        """Twice the negative log likelihood, at the likeliest sigma where it is not known."""
+        if sigma is None:
+            return fitted.chi_square
+        return 2 * keypoints * math.log(max(fitted.chi_square, _LEAST_SQUARES))
+
+    def explain(mistake: Mistake) -> Explained | None:
+        points_3d: FloatArray = mistake.undo_3d(tested.points_3d)
+        points_2d = mistake.undo_2d(tested.points_2d, tested.camera)
+        found = replace(tested, points_3d=points_3d, points_2d=points_2d).again()
+        if found is None or not found.passes or found.chi_square * mistake.factor**2 > most:
+            return None
+        corrected[mistake] = math.sqrt(found.chi_square / redundancy)
+        return Explained(score(found), keypoints, -float(found.alignment.rotation[1, 1]))
+
+    corrected: dict[Mistake, float] = {}
+    sizes: Sequence[Mistake] = () if has_reason else other_sizes(tested.points_2d, tested.camera)
+    named = find_in_all(score(tested), keypoints, explain, sizes)
+    if named is None:
+        return None
+    clauses, mistake, best = named
+    if camera is not None and score(_Tested.of(tested.fit(camera=camera))) < best:
+        return None
+    given = math.sqrt(tested.chi_square / redundancy)
+    what, unit = ("the residuals are", " times what sigma explains")
+    if sigma is not None:
+        what, unit, given = "sigma is", " px", given * sigma
+    after = corrected[mistake] * (sigma or 1.0)
+    return f"{clauses}: corrected, {what} {after:.2g}{unit}; as given, {given:.2g}{unit}"

@@ -1,36 +1,47 @@
-"""Posterior of an object's whole shape: all keypoints and the box, jointly, given one image.
+"""Learned shapes in one view: the posterior of the whole shape, and the test of each keypoint.
 
 The reprojection errors are linear in shape and pose about the estimate of `align`. Whitened and
 projected to what no change of the pose explains, they read ``A x = b + noise`` of unit covariance,
 with the stacked rows x of the shape: each Gaussian of the category is conditioned on that in closed
 form, and its weight grows with the probability that it gave to b.
+
+Each keypoint is tested against what the others predict. The errors of held-out objects are
+distributed as a multivariate t: one unknown scale widens all of an object's shape. The other
+keypoints tell the scale, so that a keypoint is tested by an F distribution (Kotz and Nadarajah,
+"Multivariate t distributions and their applications", 2004).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import cast
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
-from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.held_out import whitened_errors
-from cadalign.estimation.view import View
+from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.pixels import perspective
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.evidence import loss_and_root
+from cadalign.shapes.tails import probability_within
+from cadalign.solvers.projection import ray_derivatives
+
+if TYPE_CHECKING:
+    from cadalign.estimation.result import Result
+    from cadalign.estimation.view import View
 
 _POSE = 6
+_FALSE_ALARMS = 0.005  # of all tests of a view together
+_WORTH_TESTING = 1.0  # reduced chi-square
 
 
-@dataclass(frozen=True, eq=False)
-class ShapePosterior:
+class ShapePosterior(NamedTuple):
     """Knowledge of an object's shape from one image and a shape model.
 
     ``shapes`` is a mixture over the stacked rows: x, y, z of each keypoint of the shape model, then
@@ -41,6 +52,24 @@ class ShapePosterior:
 
     shapes: Gaussians
     log_evidence: float
+
+
+class ShapeTails(NamedTuple):
+    """Distribution of held-out objects' errors about a learned shape."""
+
+    inflation: float = 1.0  # factor on the standard deviations of the shape
+    degrees_of_freedom: float | None = None  # tails; None for Gaussian ones
+
+
+class SeenShape(NamedTuple):
+    """Keypoints of one view, and the learned shape's Gaussian about them."""
+
+    points: FloatArray  # (n, 3) of the estimate [model units]
+    mean: FloatArray  # (n, 3)
+    covariance: FloatArray  # (3 n, 3 n) about the mean
+    pose: Alignment  # the estimate, without a stretch
+    rays: FloatArray  # (n, 2) observed, normalised
+    whitening: FloatArray  # (n, 3), as of `cadalign.solvers.marginal.problem.Seen`
 
 
 def shape_posterior(
@@ -66,7 +95,7 @@ def shape_posterior(
     --------
     The front side of a box that is as deep as it is wide determines the depth:
 
-    >>> from cadalign import Alignment, Camera, align
+    >>> from cadalign import Alignment, Camera, View, align
     >>> corners = np.array([[x, y, z] for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], float)
     >>> model = ShapeModel.from_basis(corners, [corners * [1, 0, 1]], [0.2], residual_sigma=1e-3)
     >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
@@ -86,16 +115,16 @@ def shape_posterior(
     rows = rest @ by_shape
     right = rows @ estimate - rest @ residuals
     pose_volume = float(np.log(np.abs(triangle.diagonal())).sum())
-    posterior = _conditioned(gaussians_of(result.model), rows, right)
+    shapes, log_evidence = _conditioned(gaussians_of(result.model), rows, right)
     # The estimate's objective has the log determinant of the shape, linear here: a slope by the
     # keypoints, which moves the means. The box of an estimate is widened to hold what is seen.
-    shapes, keypoints = posterior.shapes, result.points_3d.size
+    keypoints = result.points_3d.size
     gap = (estimate - shapes.means[result.component])[:keypoints]
     own = shapes.covariances[result.component][:keypoints, :keypoints]
     slope = np.linalg.pinv(own, hermitian=True) @ gap
     shifts = shapes.covariances[:, :, :keypoints] @ slope
     moved = Gaussians(shapes.weights, shapes.means + shifts, shapes.covariances)
-    return ShapePosterior(moved, posterior.log_evidence - pose_volume)
+    return ShapePosterior(moved, log_evidence - pose_volume)
 
 
 def gaussians_of(model: ShapeModel) -> Gaussians:
@@ -121,9 +150,8 @@ def _linearised(
     weights = np.broadcast_to(whitening_of(view.sigma, rays, camera), (len(rays), 3))[kept]
     pose = turned_alignment(result.alignment, camera.lens_from_camera.T)
     points = result.points_3d[names]
-    residuals, derivatives = whitened_errors(points, pose, rays[kept], weights)
-    squares = (residuals**2).sum(axis=1).tolist()
-    roots = np.array([loss_and_root(loss, loss_scale, square)[1] for square in squares])
+    residuals, derivatives = _whitened_errors(points, pose, rays[kept], weights)
+    roots = np.sqrt(loss_slopes((residuals**2).sum(axis=1), loss, loss_scale)[0])
     by_pose = roots[:, None, None] * derivatives
     by_point = by_pose[:, :, 3:]  # a translation moves every point alike
     by_shape = np.zeros((len(names), 2, len(result.points_3d) + len(result.bounds), 3))
@@ -148,3 +176,86 @@ def _conditioned(prior: Gaussians, rows: FloatArray, right: FloatArray) -> Shape
     total = float(np.logaddexp.reduce(logs))
     weights = np.exp(np.array(logs) - total)
     return ShapePosterior(Gaussians(weights, np.array(means), np.array(covariances)), total)
+
+
+def _whitened_errors(
+    points: FloatArray, pose: Alignment, rays: FloatArray, whitening: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Whitened errors (n, 2) of points in a view, and their derivatives (n, 2, 6) by the pose."""
+    matrices = whitening_matrices(whitening)
+    errors = matrices @ (perspective(pose.apply(points)) - rays)[:, :, None]
+    by_pose = matrices @ ray_derivatives(points, pose.packed)[:, :, :_POSE]
+    return errors[:, :, 0], by_pose
+
+
+def keypoint_misfits(
+    seen: SeenShape, cost: float, names: Sequence[object], *, tails: ShapeTails, focal: float
+) -> tuple[str, ...]:
+    """Warn about a keypoint that contradicts the others, or about all that do not fit together.
+
+    ``cost`` is that of the estimate; ``focal`` [px] turns distances into pixels.
+    """
+    count, freedom = len(seen.rays), tails.degrees_of_freedom
+    redundancy = 2 * count - _POSE
+    if redundancy <= 0 or cost < _WORTH_TESTING * redundancy:
+        return ()
+    errors, weight = _predicted(seen, tails.inflation)
+    forces = (weight @ errors).reshape(count, 2)
+    blocks = weight.reshape(count, 2, count, 2)[np.arange(count), :, np.arange(count)]
+    if np.linalg.eigvalsh(blocks).min() <= 0:  # nothing predicts the keypoint
+        return ()
+    misses = np.linalg.solve(blocks, forces[:, :, None])[:, :, 0]
+    squares = (misses * forces).sum(axis=1)
+    total, worst = float(errors @ weight @ errors), int(np.argmax(squares))
+    alone, others = float(squares[worst]), None
+    inflated = ShapeTails(degrees_of_freedom=freedom)  # as the errors are
+    fits_without = not misfits(total - alone, redundancy - 2, inflated)
+    if freedom is not None:
+        others = freedom + redundancy - 2
+        # The scale of this object's shape, by the prior and by the other keypoints.
+        alone *= others / (freedom - 2 + total - alone) * (others - 2) / others
+    is_wrong = count * (1 - probability_within(alone, 2, others)) < _FALSE_ALARMS
+    if is_wrong and fits_without:
+        away = np.linalg.solve(whitening_matrices(seen.whitening)[worst], misses[worst])
+        pixels = focal * float(np.linalg.norm(away))
+        return (
+            f"keypoint {quote(names[worst])} is {pixels:.2g} px from where the others and the "
+            "learned shapes predict it: a wrong keypoint, or a part that the shapes do not have",
+        )
+    return misfits(total, redundancy, inflated)
+
+
+def misfits(cost: float, redundancy: int, tails: ShapeTails) -> tuple[str, ...]:
+    """Report residuals that are too large for their standard deviations.
+
+    At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
+    prior adds one equation, every other takes one away. Of a learned shape it is distributed as
+    errors of held-out objects are, see `ShapeTails`.
+    """
+    if redundancy <= 0 or cost < redundancy:
+        return ()
+    squares = cost / tails.inflation**2
+    if 1 - probability_within(squares, redundancy, tails.degrees_of_freedom) >= _FALSE_ALARMS:
+        return ()
+    ratio = np.sqrt(squares / redundancy)
+    return (
+        f"the residuals are {ratio:.2g} times as large as sigma and the spread of shapes allow: "
+        "a keypoint, a sigma or the model is wrong",
+    )
+
+
+def _predicted(seen: SeenShape, inflation: float) -> tuple[FloatArray, FloatArray]:
+    """Whitened errors (2 n,) of the mean shape, and their inverse covariance beside any pose."""
+    count = len(seen.rays)
+    errors, by_pose = _whitened_errors(seen.points, seen.pose, seen.rays, seen.whitening)
+    by_point = by_pose[:, :, 3:] @ seen.pose.rotation
+    errors = errors - (by_point @ (seen.points - seen.mean)[:, :, None])[:, :, 0]
+    by_shape = np.zeros((count, 2, count, 3))
+    by_shape[np.arange(count), :, np.arange(count)] = by_point
+    rows = by_shape.reshape(2 * count, 3 * count)
+    spread = inflation**2 * (rows @ seen.covariance @ rows.T) + np.eye(2 * count)
+    inverse = np.linalg.inv(spread)
+    pose = by_pose.reshape(2 * count, _POSE)
+    weighted = inverse @ pose
+    weight = inverse - weighted @ np.linalg.solve(pose.T @ weighted, weighted.T)
+    return errors.ravel(), np.asarray(weight)

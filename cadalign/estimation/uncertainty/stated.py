@@ -130,7 +130,7 @@ class KeypointStatistics(FittedKeypoints):
                 return None
             if self.misfit is None and self.options.sigma is not None:
                 return None
-            from cadalign.estimation.uncertainty.mistaken import mistake_in_fit
+            from cadalign.estimation.uncertainty.misfit import mistake_in_fit
 
             return mistake_in_fit(self, self.misfit)
         from cadalign.estimation.consensus import mistake_in  # with the kernels of the search

@@ -14,18 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.evidence import (
     Piece,
     count_equations,
-    keypoints_in,
     measured_factor,
     pieces_of,
     plane_distances,
     redundancy_of,
+    told_by,
     without,
 )
+from cadalign.estimation.uncertainty.residuals import chi_square_quantile, chi_square_tail
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of
@@ -55,17 +55,27 @@ class _Trial(NamedTuple):
     misfit: float  # reduced chi-square of the rest, at least 1
     state: State
 
+    def is_unlikely(self, level: float) -> bool:
+        """True if a piece that agrees with the rest saves as much with less than this chance."""
+        return chi_square_tail(self.saved / self.misfit, self.equations) < level
 
-class _Determined(NamedTuple):
-    redundancy: int
-    rank: int
 
+def warnings_of(
+    evidence: Evidence, state: State, cost: float, tails: ShapeTails
+) -> tuple[str, ...]:
+    """Warnings about evidence that contradicts the rest, and residuals beyond their sigma.
 
-def contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str, ...]:
-    """Warnings that name the pieces which contradict the rest.
-
-    ``state`` is the estimate, ``cost`` its cost.
+    ``state`` is the estimate, ``cost`` its cost; ``tails`` are those of the shape's prior.
     """
+    contradicting = _contradictions(evidence, state, cost)
+    warnings = [*_wrong_units(evidence, state, contradicting), *contradicting]
+    if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
+        warnings += misfits(cost, redundancy_of(evidence), tails)
+    return tuple(warnings)
+
+
+def _contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str, ...]:
+    """A warning that names the pieces which contradict the rest."""
     every = pieces_of(evidence)
     pieces = [each for each in every if not _determines_its_pose(evidence, each)]
     if len(every) < 2 or not pieces:
@@ -74,75 +84,63 @@ def contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str, 
     if len(evidence.planes.point):
         evidence = _without_hidden(evidence, state)
         cost, state, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
-    pieces = _worst(evidence, state, pieces)
+    if len(pieces) > _MOST_TESTED:  # those of the largest own cost
+        trials = [without(evidence, state, piece) for piece in pieces]
+        rests = [joint_cost(Joint(rest, False), packed(start)) for rest, start in trials]
+        pieces = [
+            pieces[k] for k in sorted(np.argsort(rests, kind="stable")[:_MOST_TESTED].tolist())
+        ]
     level = _FALSE_ALARMS / len(every)
-    if not _is_suspicious(evidence, state, cost, pieces, level):
+    if not any(_is_suspicious(evidence, state, cost, piece, level) for piece in pieces):
         return ()
     whole = _determined(evidence, state)
     found = [_searched(evidence, state, cost, whole, piece) for piece in pieces]
-    suspects = [trial for trial in found if trial is not None and _is_unlikely(trial, level)]
+    suspects = [trial for trial in found if trial is not None and trial.is_unlikely(level)]
     if not suspects:
         return ()
     noise = min(trial.misfit for trial in suspects)
     suspects.sort(key=lambda trial: _PER_EQUATION * trial.equations - trial.saved / noise)
     best = suspects[0]
     alike = _as_likely(best, suspects, noise)
-    names = [name_of(*trial.piece) for trial in alike]
+    *names, last = [name_of(*trial.piece) for trial in alike]
     sigmas = np.sqrt(best.saved / best.misfit / best.equations)
     hints = (_wrong_unit(evidence, trial) or _wrong_axis(evidence, trial) for trial in alike)
-    unit = next(filter(None, hints), "")
-    if len(names) == 1:
-        return (f"{names[0]} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
-    listed = f"{', '.join(names[:-1])} or {names[-1]}"
-    return (f"{listed} contradicts the other evidence, by {sigmas:.2g} sigma{unit}",)
+    hint = next(filter(None, hints), "")
+    named = f"{', '.join(names)} or {last}" if names else last
+    return (f"{named} contradicts the other evidence, by {sigmas:.2g} sigma{hint}",)
 
 
 def _determines_its_pose(evidence: Evidence, piece: Piece) -> bool:
     """True for keypoints without which the pose of their view would be open: they test nothing."""
     if piece.kind != "keypoints" or piece.view is None:
         return False
-    rig, keypoints = evidence.rig, keypoints_in(evidence, piece.view)
-    contours = (evidence.sightings.image == piece.view).sum() > keypoints.sum()
+    rig, sightings = evidence.rig, evidence.sightings
+    others = (sightings.image == piece.view) & ~told_by(sightings)["keypoints"]
     depths = (evidence.planes.image == piece.view).any()
-    return (rig.pose == rig.pose[piece.view]).sum() == 1 and not contours and not depths
-
-
-def _worst(evidence: Evidence, state: State, pieces: list[Piece]) -> list[Piece]:
-    """The pieces of the largest own cost, as many as are tested."""
-    if len(pieces) <= _MOST_TESTED:
-        return pieces
-    trials = [without(evidence, state, piece) for piece in pieces]
-    rests = [joint_cost(Joint(rest, False), packed(start)) for rest, start in trials]
-    return [pieces[k] for k in sorted(np.argsort(rests, kind="stable")[:_MOST_TESTED].tolist())]
+    return (rig.pose == rig.pose[piece.view]).sum() == 1 and not others.any() and not depths
 
 
 def _is_suspicious(
-    evidence: Evidence, state: State, cost: float, pieces: Sequence[Piece], level: float
+    evidence: Evidence, state: State, cost: float, piece: Piece, level: float
 ) -> bool:
     """True if leaving out a piece, by a short refinement, saves more than is likely."""
-    from scipy.special import chdtri  # takes longer to import than all that is compiled
-
-    least = chdtri(1, level)
-    for piece in pieces:
-        rest, start = without(evidence, state, piece)
-        lower, refitted, _, _ = refine_joint(rest, _REFITTING, start)
-        if not cost - lower >= least:  # of one equation; of more, more is likely
-            continue
-        trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
-        if trial is not None and _is_unlikely(trial, level):
-            return True
-    return False
+    rest, start = without(evidence, state, piece)
+    lower, refitted, _, _ = refine_joint(rest, _REFITTING, start)
+    if not cost - lower >= chi_square_quantile(1, level):  # of one equation; of more, more
+        return False
+    trial = _trial(piece, _determined(evidence, state), rest, refitted, cost, lower)
+    return trial is not None and trial.is_unlikely(level)
 
 
 def _without_hidden(evidence: Evidence, state: State) -> Evidence:
     """The evidence without depths that differ from most of their image: of something else."""
-    expected, measured, weights, images = plane_distances(evidence, state)
-    kept = np.ones(len(images), dtype=bool)
-    for view in np.unique(images):
-        rows = images == view
-        factor = np.median(measured[rows] / expected[rows])
-        kept[rows] = np.abs(measured / factor - expected)[rows] * weights[rows] < _HIDDEN
-    return evidence._replace(planes=kept_rows(evidence.planes, kept))
+    planes, expected = evidence.planes, plane_distances(evidence, state)
+    kept = np.ones(len(expected), dtype=bool)
+    for view in np.unique(planes.image):
+        rows = planes.image == view
+        factor = np.median(planes.depth[rows] / expected[rows])
+        kept[rows] = (np.abs(planes.depth / factor - expected) * planes.weight)[rows] < _HIDDEN
+    return evidence._replace(planes=kept_rows(planes, kept))
 
 
 def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:
@@ -159,6 +157,51 @@ def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_
         for trial in found
         if trial is best or trial.piece.kind != "keypoints" or trial.piece.view not in freed
     ]
+
+
+def _searched(
+    evidence: Evidence, state: State, cost: float, whole: tuple[int, int], piece: Piece
+) -> _Trial | None:
+    """The trial of a piece by a search, since the estimate may lie far from that without it."""
+    rest, start = without(evidence, state, piece)
+    lower, refitted, _, _ = refine_joint(rest, 10 * _REFITTING, start)
+    starts = starts_of(rest)
+    minima = search_joint(rest, *starts)[0] if len(starts.poses) else None
+    if minima is not None and minima.states:
+        best = int(np.argmin(minima.costs))
+        if minima.costs[best] < lower:
+            refitted, lower = minima.states[best], float(minima.costs[best])
+    return _trial(piece, whole, rest, refitted, cost, lower)
+
+
+def _trial(
+    piece: Piece, whole: tuple[int, int], rest: Evidence, state: State, cost: float, lower: float
+) -> _Trial | None:
+    """Trial of leaving out a piece; None if the rest does not determine the estimate."""
+    redundancy, rank = _determined(rest, state)
+    equations = whole[0] - redundancy
+    if equations <= 0 or not lower < np.inf:
+        return None
+    if piece.kind != "rig" and rank < whole[1]:
+        return None
+    misfit = lower / redundancy if redundancy > 0 else 1.0
+    return _Trial(piece, cost - lower, equations, max(misfit, 1.0), state)
+
+
+def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
+    """Equations beyond the unknowns that they determine, and the number of these."""
+    _, information = information_of(*reduced(evidence, state))
+    rank = 0
+    if np.isfinite(information).all():
+        sizes = np.sqrt(np.maximum(information.diagonal(), 0.0))
+        safe = np.where(sizes > 0, sizes, 1.0)
+        values = np.linalg.eigvalsh(information / np.outer(safe, safe))
+        rank = int((values > _LEAST_INFORMATION * len(values)).sum())
+    held = int(3 - evidence.scales.free.sum())
+    return count_equations(evidence) - (rank - held), rank
+
+
+# Hints -------------------------------------------------------------------------------------------
 
 
 def _wrong_unit(evidence: Evidence, trial: _Trial) -> str:
@@ -186,73 +229,6 @@ def _wrong_axis(evidence: Evidence, trial: _Trial) -> str:
     return f": the model's {name} axis points {way} there, is it the up axis (up_axis={name!r})?"
 
 
-def _searched(
-    evidence: Evidence,
-    state: State,
-    cost: float,
-    whole: _Determined,
-    piece: Piece,
-) -> _Trial | None:
-    """The trial of a piece by a search, since the estimate may lie far from that without it."""
-    rest, start = without(evidence, state, piece)
-    lower, refitted, _, _ = refine_joint(rest, 10 * _REFITTING, start)
-    found = _best_of(rest)
-    if found is not None and found[1] < lower:
-        refitted, lower = found
-    return _trial(piece, whole, rest, refitted, cost, lower)
-
-
-def _trial(
-    piece: Piece, whole: _Determined, rest: Evidence, state: State, cost: float, lower: float
-) -> _Trial | None:
-    """Trial of leaving out a piece; None if the rest does not determine the estimate."""
-    left = _determined(rest, state)
-    equations = whole.redundancy - left.redundancy
-    if equations <= 0 or not lower < np.inf:
-        return None
-    if piece.kind != "rig" and left.rank < whole.rank:
-        return None
-    misfit = lower / left.redundancy if left.redundancy > 0 else 1.0
-    return _Trial(piece, cost - lower, equations, max(misfit, 1.0), state)
-
-
-def _is_unlikely(trial: _Trial, level: float) -> bool:
-    from scipy.special import chdtrc  # takes longer to import than all that is compiled
-
-    return bool(chdtrc(trial.equations, max(trial.saved / trial.misfit, 0.0)) < level)
-
-
-def _determined(evidence: Evidence, state: State) -> _Determined:
-    """Equations beyond the unknowns that they determine, and the number of these."""
-    _, information = information_of(*reduced(evidence, state))
-    rank = _rank(information)
-    held = int(3 - evidence.scales.free.sum())
-    return _Determined(count_equations(evidence) - (rank - held), rank)
-
-
-def _rank(hessian: FloatArray) -> int:
-    diagonal = np.sqrt(np.maximum(hessian.diagonal(), 0.0))
-    if not np.isfinite(hessian).all():
-        return 0
-    safe = np.where(diagonal > 0, diagonal, 1.0)
-    values = np.linalg.eigvalsh(hessian / np.outer(safe, safe))
-    return int((values > _LEAST_INFORMATION * len(values)).sum())
-
-
-def warnings_of(
-    evidence: Evidence, state: State, cost: float, tails: ShapeTails
-) -> tuple[str, ...]:
-    """Warnings about evidence that contradicts the rest, and residuals beyond their sigma.
-
-    ``tails`` are those of the shape's prior.
-    """
-    contradicting = contradictions(evidence, state, cost)
-    warnings = [*_wrong_units(evidence, state, contradicting), *contradicting]
-    if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
-        warnings += misfits(cost, redundancy_of(evidence), tails)
-    return tuple(warnings)
-
-
 def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str]) -> Iterator[str]:
     """Warnings about measurements in another unit than the model and the rest of the evidence.
 
@@ -276,14 +252,3 @@ def _wrong_units(evidence: Evidence, state: State, contradicting: Sequence[str])
 
 def _is_plausible(factor: float) -> bool:
     return 1 / _WRONG_UNIT < factor < _WRONG_UNIT
-
-
-def _best_of(evidence: Evidence) -> tuple[State, float] | None:
-    starts = starts_of(evidence)
-    if not len(starts.poses):
-        return None
-    minima, _ = search_joint(evidence, *starts)
-    if not minima.states:
-        return None
-    best = int(np.argmin(minima.costs))
-    return minima.states[best], float(minima.costs[best])

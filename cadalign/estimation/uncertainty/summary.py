@@ -83,7 +83,7 @@ def weaknesses_of_keypoints(
             "the residuals say nothing about the quality of the fit"
         )
     if std.focal > UNDETERMINED:
-        why = _why_focal_is_weak(points_3d, alignment)
+        why = _why_focal_is_weak(alignment.apply(points_3d))
         warnings.append(_known_only("the focal length", percent(std.focal), why))
     if doubt is not None:
         warnings.append(doubt)
@@ -132,8 +132,7 @@ def _distance(alignment: Alignment, std: Uncertainty) -> tuple[float, float]:
     return float(np.linalg.norm(alignment.translation)), float(np.linalg.norm(std.translation))
 
 
-def _why_focal_is_weak(points_3d: FloatArray, alignment: Alignment) -> str:
-    in_camera = alignment.apply(points_3d)
+def _why_focal_is_weak(in_camera: FloatArray) -> str:
     thickness = np.linalg.svd(in_camera - in_camera.mean(axis=0), compute_uv=False)
     if thickness[-1] < _THIN * thickness[0]:
         return "the keypoints lie nearly in one plane"
@@ -286,12 +285,11 @@ class Misfit:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, for JSON."""
-        outliers = [{"row": row, "distance_px": px} for row, px in self.outliers.items()]
         return {
             "chi_square": self.chi_square,
             "redundancy": self.redundancy,
             "free_scale": None if self.free_scale is None else list(self.free_scale),
-            "outliers": outliers,
+            "outliers": [{"row": row, "distance_px": px} for row, px in self.outliers.items()],
             "camera": None if self.camera is None else self.camera.to_dict(),
         }
 

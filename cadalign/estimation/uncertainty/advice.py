@@ -5,7 +5,7 @@ The effect is predicted on a scene in which all evidence agrees with the estimat
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -44,7 +44,7 @@ _LEAST_SPREAD = 1e-6  # of points whose displacements a shape leaves out [model 
 
 @dataclass(frozen=True)
 class Advice:
-    """One piece of evidence that could be added, and its predicted effect.
+    """One piece of evidence that could be added, and the standard deviations with it.
 
     Parameters
     ----------
@@ -52,11 +52,11 @@ class Advice:
     detail : int or str
         Id of the keypoint; names of the two lengths; empty otherwise.
     rotation_deg : float
-        Standard deviation of the rotation with the piece [degrees].
+        Of the rotation [degrees].
     position : float
-        Standard deviation of the translation, over the distance.
+        Of the translation, over the distance.
     stretch : tuple of 3 float
-        Relative standard deviations of the lengths along x, y, z.
+        Of the lengths along x, y, z, relative.
     view : int
         Number of the view that a keypoint or a mask is added to.
     """
@@ -129,42 +129,40 @@ def rank_evidence(
     ('lengths', 3)
     """
     given = (views,) if isinstance(views, View) else tuple(views)
-    scene = scene_of(model, given, estimate, size)
+    scene = _scene_of(model, given, estimate, size)
     found = [each for name in candidates for each in _keypoints(scene, name)]
     # Beside several views, a further one stands on the side that tells more.
     turns = (TURN_DEG,) if len(given) == 1 else (TURN_DEG, -TURN_DEG)
-    found.append(_best(_advice("view", "", scene.with_view(_turned(scene, t))) for t in turns))
+    found.append(min((_advice("view", "", _with_view(scene, t)) for t in turns), key=_worst))
     found.extend(_lengths(scene))
     if mask is not None and given[0].mask is None:
         first = replace(_without_scale(given[0]), mask=mask, mask_sigma=_MASK_SIGMA)
-        masked = scene_of(model, (first, *given[1:]), estimate, size)
+        masked = _scene_of(model, (first, *given[1:]), estimate, size)
         found.append(_advice("mask", "", masked))
-    return tuple(sorted(found, key=lambda each: each.worst))
+    return tuple(sorted(found, key=_worst))
 
 
-def _best(advice: Iterable[Advice]) -> Advice:
-    return min(advice, key=lambda each: each.worst)
+def _worst(advice: Advice) -> float:
+    return advice.worst
 
 
-def _turned(scene: KnownScene, turn_deg: float) -> tuple[View, Alignment]:
-    """The first view's keypoints in a camera that went around the object."""
+def _with_view(scene: _KnownScene, turn_deg: float) -> _KnownScene:
+    """The scene, and the first view's keypoints in a camera that went around the object."""
     view, pose = scene.views[0], scene.poses[0]
     centre = pose.apply(scene.bounds.mean(axis=0)[None])[0]
     turn = rotation_from_vector(np.array([0.0, np.radians(turn_deg), 0.0]))
-    shift = centre - turn @ centre
-    moved = Alignment(turn @ pose.rotation, turn @ pose.translation + shift, pose.scale)
-    motion = None
+    step = Alignment(turn, centre - turn @ centre, np.ones(3))
+    moved, motion = step @ pose, None
     if view.cam_from_rig is not None:
-        step = np.eye(4)
-        step[:3, :3], step[:3, 3] = turn, shift
-        motion = step @ cast(FloatArray, view.cam_from_rig)
+        motion = step.cam_from_model @ cast(FloatArray, view.cam_from_rig)
         motion[:3, :3] = nearest_rotation(motion[:3, :3])
     points = view.camera.project(moved.apply(scene.points_of(view.keypoint_ids)))
     ids, sigma = view.keypoint_ids, view.sigma
-    return View(view.camera, points, ids=ids, sigma=sigma, cam_from_rig=motion), moved
+    added = View(view.camera, points, ids=ids, sigma=sigma, cam_from_rig=motion)
+    return replace(scene, views=(*scene.views, added), poses=(*scene.poses, moved))
 
 
-def _lengths(scene: KnownScene) -> Iterator[Advice]:
+def _lengths(scene: _KnownScene) -> Iterator[Advice]:
     """The unknown one of the width and another length, or both, that leaves the least open."""
     lengths = np.ptp(scene.bounds, axis=0) * scene.poses[0].scale
     known = np.full(3, np.nan) if scene.size is None else scene.size.lengths
@@ -183,18 +181,18 @@ def _lengths(scene: KnownScene) -> Iterator[Advice]:
         detail = " and ".join(LENGTHS[axis] for axis in new)
         found.append(_advice("lengths", detail, replace(scene, size=size)))
     if found:
-        yield _best(found)
+        yield min(found, key=_worst)
 
 
-def _keypoints(scene: KnownScene, name: Hashable) -> Iterator[Advice]:
+def _keypoints(scene: _KnownScene, name: Hashable) -> Iterator[Advice]:
     """A keypoint in every view that lacks it and can show it."""
     lacking = [n for n, view in enumerate(scene.views) if name not in view.keypoint_ids]
     if not lacking:
         fix = "give those that a view lacks"
         raise InputError(f"every view has the keypoint {quote(name)}", where="candidates", fix=fix)
     for number in lacking:
-        place = scene.project((name,), number, "candidates")
-        camera = scene.views[number].camera
+        camera, point = scene.views[number].camera, scene.points_of((name,), "candidates")
+        place = camera.project(scene.poses[number].apply(point))
         if len(scene.views) == 1 or camera.contains(place).all():
             views = list(scene.views)
             views[number] = _with_keypoint(views[number], name, place)
@@ -232,11 +230,8 @@ def _without_scale(view: View) -> View:
     return replace(view, depth_scale=None)
 
 
-def _advice(kind: str, detail: Hashable, scene: KnownScene) -> Advice:
-    """The effect of evidence that agrees with the estimate.
-
-    Deviations are those up to scale, which is known or not according to the evidence.
-    """
+def _advice(kind: str, detail: Hashable, scene: _KnownScene) -> Advice:
+    """The effect of evidence that agrees with the estimate, up to scale."""
     covariance, alignment = scene.covariance(), scene.poses[0]
     distance = float(np.linalg.norm(alignment.translation))
     # Translation over the distance, and lengths, relative to the length along x.
@@ -248,17 +243,12 @@ def _advice(kind: str, detail: Hashable, scene: KnownScene) -> Advice:
     terms[6:, 6] -= 1.0
     deviations = np.sqrt(np.maximum((terms @ covariance @ terms.T).diagonal(), 0.0))
     x, y, z = deviations[6:].tolist()
-    return Advice(
-        kind,
-        detail,
-        float(np.degrees(np.linalg.norm(deviations[:3]))),
-        float(np.linalg.norm(deviations[3:6])),
-        (x, y, z),
-    )
+    rotation_deg = float(np.degrees(np.linalg.norm(deviations[:3])))
+    return Advice(kind, detail, rotation_deg, float(np.linalg.norm(deviations[3:6])), (x, y, z))
 
 
 @dataclass(frozen=True, eq=False)
-class KnownScene:
+class _KnownScene:
     """Views of an object whose pose, stretch and shape are taken as known."""
 
     model: Model | ShapeModel
@@ -269,29 +259,18 @@ class KnownScene:
     bounds: FloatArray  # (2, 3)
     size: Size | None
 
-    def with_view(self, added: tuple[View, Alignment]) -> KnownScene:
-        """The scene with one more view and the alignment in its camera."""
-        view, pose = added
-        return replace(self, views=(*self.views, view), poses=(*self.poses, pose))
-
     def points_of(self, ids: Sequence[Hashable], where: str = "ids") -> FloatArray:
         """Keypoints (n, 3) by their ids."""
         return np.asarray(self.points_3d[self.prior.rows_of(tuple(ids), where)])
-
-    def project(self, ids: Sequence[Hashable], number: int, where: str) -> FloatArray:
-        """Places (n, 2) of keypoints in a view [px]."""
-        seen = self.poses[number].apply(self.points_of(ids, where))
-        return self.views[number].camera.project(seen)
 
     def covariance(self) -> FloatArray:
         """Covariance (9, 9) of an estimate, as `cadalign.Result.covariance`, linearised."""
         if needs_facing([view.camera for view in self.views]):
             views = tuple(facing_view(view, number) for number, view in enumerate(self.views))
             turns = [view.camera.lens_from_camera for view in views]
-            poses = [
-                turned_alignment(pose, turn.T) for pose, turn in zip(self.poses, turns, strict=True)
-            ]
-            facing = replace(self, views=views, poses=tuple(poses))
+            pairs = zip(self.poses, turns, strict=True)
+            poses = tuple(turned_alignment(pose, turn.T) for pose, turn in pairs)
+            facing = replace(self, views=views, poses=poses)
             return turned_covariance(facing.covariance(), turns[0])
         evidence = evidence_of(self.prior, self.views, self.size, loss=LINEAR, loss_scale=1.0)
         evidence, state = widened(evidence, self._state(evidence), self.prior.inflation)
@@ -299,9 +278,8 @@ class KnownScene:
         if margins is not None:  # the box that results state of a learned shape
             evidence, state = with_box(evidence, state, len(self.points_3d), margins)
         if isinstance(self.model, Model) and any(view.mask is not None for view in self.views):
-            from cadalign.estimation.contours.view_contour import (
-                with_contours,  # with OpenCV and embree
-            )
+            # With OpenCV and embree.
+            from cadalign.estimation.contours.view_contour import with_contours
 
             evidence, state = with_contours(self.model, self.views, evidence, state)
         found = joint_covariance(evidence, state)
@@ -324,12 +302,9 @@ class KnownScene:
         return State(np.array(packed), np.zeros(0), np.log(first.scale), coefficients, rest)
 
 
-def scene_of(
-    model: Model | ShapeModel,
-    views: tuple[View, ...],
-    estimate: object,
-    size: Size | None,
-) -> KnownScene:
+def _scene_of(
+    model: Model | ShapeModel, views: tuple[View, ...], estimate: object, size: Size | None
+) -> _KnownScene:
     """The scene of views, a size, and the estimate from them.
 
     Raises InputError if the estimate is neither an Alignment nor a Result, or does not tell shape
@@ -338,11 +313,15 @@ def scene_of(
     if not views:
         raise InputError("none is given", where="views")
     prior = prior_of(model)
-    _check_masks(model, views)
+    masked = [number for number, view in enumerate(views) if view.mask is not None]
+    if masked and not _is_exact_model(model):
+        what = "the effect of a mask is predicted for an exact model only"
+        fix = "leave it away, or give a Model without `shape_sigma`"
+        raise InputError(what, where=f"views[{masked[0]}].mask", fix=fix)
     if isinstance(estimate, Alignment):
         poses = _poses_from(model, views, estimate)
         shape = prior.components[0].mean
-        return KnownScene(model, prior, views, poses, shape[:-2], shape[-2:], size)
+        return _KnownScene(model, prior, views, poses, shape[:-2], shape[-2:], size)
     if not isinstance(estimate, Result):
         what = f"expected an Alignment or a Result, got {type(estimate).__name__}"
         raise InputError(what, where="estimate")
@@ -351,17 +330,11 @@ def scene_of(
         raise InputError(what, where="views", fix="give the views that it is from")
     own = replace(prior, components=(prior.components[estimate.component],), weights=(1.0,))
     points = np.asarray(estimate.points_3d)
-    return KnownScene(model, own, views, estimate.poses, points, estimate.bounds, size)
+    return _KnownScene(model, own, views, estimate.poses, points, estimate.bounds, size)
 
 
-def _check_masks(model: Model | ShapeModel, views: Sequence[View]) -> None:
-    if isinstance(model, Model) and model.shape_sigma is None:
-        return
-    masked = [number for number, view in enumerate(views) if view.mask is not None]
-    if masked:
-        what = "the effect of a mask is predicted for an exact model only"
-        fix = "leave it away, or give a Model without `shape_sigma`"
-        raise InputError(what, where=f"views[{masked[0]}].mask", fix=fix)
+def _is_exact_model(model: Model | ShapeModel) -> bool:
+    return isinstance(model, Model) and model.shape_sigma is None
 
 
 def _poses_from(
@@ -369,7 +342,7 @@ def _poses_from(
 ) -> tuple[Alignment, ...]:
     """Poses in every camera from that in the first."""
     fix = "give the Result of `align`"
-    if isinstance(model, ShapeModel) or model.shape_sigma is not None:
+    if not _is_exact_model(model):
         raise InputError("an alignment does not tell the shape", where="estimate", fix=fix)
     if len(views) == 1:
         return (first,)
@@ -379,15 +352,7 @@ def _poses_from(
         what = "an alignment does not tell the poses of the other views"
         raise InputError(what, where="estimate", fix=fix)
     steps = [camera @ np.linalg.inv(known[0]) for camera in known[1:]]
-    others = [
-        Alignment(
-            step[:3, :3] @ first.rotation,
-            step[:3, :3] @ first.translation + step[:3, 3],
-            first.scale,
-        )
-        for step in steps
-    ]
-    return (first, *others)
+    return (first, *(Alignment(step[:3, :3], step[:3, 3], np.ones(3)) @ first for step in steps))
 
 
 def _explained(shape: Shape, points: FloatArray) -> tuple[FloatArray, FloatArray]:

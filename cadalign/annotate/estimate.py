@@ -24,7 +24,7 @@ from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.scene import SceneObject, focal_prior_by_others
-from cadalign.estimation.uncertainty.misfit import Rows, find_outliers
+from cadalign.estimation.uncertainty.misfit import PlacedRows, Rows, find_outliers
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -284,7 +284,7 @@ class LiveProblem:
         observed = np.asarray(view.points_2d)
         return find_outliers(points, observed, pairs.fit_rows, unknowns=unknowns)
 
-    def fit_rows(self, rows: Rows, robust: bool) -> Result:
+    def fit_rows(self, rows: Rows, robust: bool) -> PlacedRows:
         """Align some pairs of the only view; see `find_outliers`."""
         (view,) = self.views
         ids = tuple(view.keypoint_ids[row] for row in rows)
@@ -296,7 +296,7 @@ class LiveProblem:
             median = float(np.median(np.linalg.norm(result.residuals, axis=1)))
             sigma = max(LEAST_SIGMA, median / _ROBUST_SHARE)
             result = alone.weighted(sigma).align(loss="cauchy")
-        return result
+        return result.alignment, result.camera, result.fisher_covariance
 
     def left_out(self) -> dict[int, float]:
         """Distances [px] of the pairs that a robust search among the only view's leaves out."""

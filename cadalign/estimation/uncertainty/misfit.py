@@ -24,7 +24,6 @@ from cadalign.solvers.projection import predicted_covariances, projection_jacobi
 
 if TYPE_CHECKING:
     from cadalign.estimation.mistakes import Explained, Mistake
-    from cadalign.estimation.result_data import ResultData
 
 Rows = npt.NDArray[np.intp]
 _FALSE_OUTLIERS = 0.01
@@ -42,9 +41,10 @@ _CHANCE_OF_RATIO = 1e-3  # that residuals of an unknown noise differ by as much
 _LARGE = 0.02  # estimated sigma, over the keypoints' extent, that asks for a mistake
 _LEAST_SQUARES = 1e-9  # of exact keypoints
 
-FitRows = Callable[[Rows, bool], "FittedKeypoints | ResultData"]
-"""Fits some rows at the noise of `find_outliers`; with a robust loss if the second argument is
-True."""
+PlacedRows = tuple[Alignment, Camera, FloatArray | None]
+FitRows = Callable[[Rows, bool], PlacedRows]
+"""Alignment, camera and inverse Fisher information of a fit of some rows at the noise of
+`find_outliers`; with a robust loss if the second argument is True."""
 
 
 def find_outliers(
@@ -73,18 +73,18 @@ def find_outliers(
     covariances = np.tile(np.eye(2), (count, 1, 1)) if noise is None else noise
     start = max(least, count // 2 + 1)
 
-    def residuals_of(result: FittedKeypoints | ResultData) -> FloatArray:
+    def residuals_of(placed: PlacedRows) -> FloatArray:
         """Projected minus observed (n, 2) [px]; infinite behind the camera."""
-        in_camera = result.alignment.apply(points_3d)
-        return result.camera.project_where_ahead(in_camera) - points_2d
+        alignment, camera, _ = placed
+        return camera.project_where_ahead(alignment.apply(points_3d)) - points_2d
 
     def statistic(rows: Rows) -> tuple[FloatArray, float]:
         """Squared residuals (n,) per equation over their expectation, and their quantile.
 
         For keypoints outside the fit, the covariance of the prediction adds to the noise.
         """
-        result = fit_rows(rows, False)
-        residuals = residuals_of(result)
+        placed = alignment, camera, covariance = fit_rows(rows, False)
+        residuals = residuals_of(placed)
         variance, equations = 1.0, math.inf
         if noise is None:
             equations = 2 * len(rows) - unknowns + _CLICK_EQUATIONS
@@ -92,10 +92,9 @@ def find_outliers(
             variance = (total + _CLICK_EQUATIONS * _CLICK**2) / equations
         expected = covariances.copy()
         others = np.setdiff1d(np.arange(count), rows)
-        others = others[result.camera.sees(result.alignment.apply(points_3d[others]))]
-        covariance = result.fisher_covariance
+        others = others[camera.sees(alignment.apply(points_3d[others]))]
         if len(others) and covariance is not None:
-            jacobian = projection_jacobian(points_3d[others], result.camera, result.alignment)
+            jacobian = projection_jacobian(points_3d[others], camera, alignment)
             expected[others] += predicted_covariances(jacobian, covariance)
         quantile = _f_quantile_of_two(_FALSE_OUTLIERS / count, equations)
         return _squares(residuals, expected) / 2 / variance, quantile
@@ -312,15 +311,19 @@ def _contradicting_camera(tested: _Tested) -> Camera | None:
 def _outliers(tested: _Tested) -> dict[int, float]:
     """The few keypoints without which the others pass the test, with their distances [px]."""
 
-    def fit_rows(rows: Rows, robust: bool) -> FittedKeypoints:
+    def fit(rows: Rows, robust: bool) -> FittedKeypoints:
         loss = "cauchy" if robust else "linear"
         return tested.fit(rows, loss=loss, loss_scale=FitOptions.loss_scale)
+
+    def fit_rows(rows: Rows, robust: bool) -> PlacedRows:
+        fitted = fit(rows, robust)
+        return fitted.alignment, fitted.camera, fitted.fisher_covariance
 
     points, unknowns = (tested.points_3d, tested.points_2d), tested.options.unknowns
     found = find_outliers(*points, fit_rows, unknowns=unknowns, noise=tested.covariances)
     if not 0 < len(found) <= _MOST_OUTLIERS * len(tested.rows):
         return {}
-    rest = fit_rows(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
+    rest = fit(np.setdiff1d(np.arange(len(tested.rows)), list(found)), False)
     if not _Tested.of(rest).passes:
         return {}
     return {int(tested.rows[row]): length for row, length in found.items()}

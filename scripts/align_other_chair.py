@@ -15,7 +15,8 @@ import numpy as np
 import tyro
 from common import Picture, write_row
 
-from cadalign.annotate.model import ClickableModel, Wireframe
+from cadalign.annotate.lines import Wireframe
+from cadalign.annotate.model import ClickableModel
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.estimation.fit import fit
 from cadalign.geometry.alignment import Alignment

@@ -28,7 +28,7 @@ from cadalign import (
     Symmetry,
     View,
 )
-from cadalign.annotate.history import history_path
+from cadalign.annotate.document import history_path
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.page_state import worklist_state

@@ -11,12 +11,18 @@ from typing import Any, get_type_hints
 import msgspec
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
-from cadalign.annotate.masks import nearest_corner
+from cadalign.annotate.evidence import nearest_corner
 from cadalign.annotate.models import SAME_PLACE
-from cadalign.annotate.object_actions import EVIDENCE_ACTIONS, OBJECT_ACTIONS, bring_back
+from cadalign.annotate.object_actions import (
+    EVIDENCE_ACTIONS,
+    OBJECT_ACTIONS,
+    ActionOutcome,
+    bring_back,
+)
 from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.photos import Mark
-from cadalign.annotate.session import ActionOutcome, Session
+from cadalign.annotate.session import Session
+from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert
 
@@ -37,34 +43,30 @@ def perform(
         state = session.photo_state(number, slot)
         if slot == 0 and session.objects[number][0].is_shown:
             state = session.objects[number][0]  # which is not listed while nothing is marked
-        elif slot not in (None, session.place_of(state)[1]):
-            raise InputError(
-                "this object was deleted, or the photo is no longer one of its photos",
-                where="object",
-                fix="reload the page",
-            )
+        elif slot not in (None, state.place[1]):
+            what = "this object was deleted, or the photo is no longer one of its photos"
+            raise InputError(what, where="object", fix="reload the page")
         name = action.get("do")
         function = ACTIONS.get(name) if isinstance(name, str) else None
         if function is None:
-            raise InputError(
-                f"{quote(name)} is not an action", where="do", fix=f"known are {', '.join(ACTIONS)}"
-            )
+            fix = f"known are {', '.join(ACTIONS)}"
+            raise InputError(f"{quote(name)} is not an action", where="do", fix=fix)
         before = {id(each): each.history.document for each in session.states}
-        arguments = convert(action, _arguments_of(function))
-        outcome = function(session, state, **msgspec.structs.asdict(arguments))
+        arguments = msgspec.structs.asdict(convert(action, _arguments_of(function)))
+        outcome = function(state, **arguments) or ActionOutcome()
         owners = [each for each in session.states if each.lead is None]
         changed = [each for each in owners if before.get(id(each)) is not each.document]
         for each in changed:
             session.save(each)
         if changed and name not in _DELETING:
-            session.deletions.note_change(number)
+            session.just_deleted.discard(number)
         if name in _RENAMING:
             session.save(state)
         return outcome
 
 
 @cache
-def _arguments_of(function: Callable[..., ActionOutcome]) -> type[msgspec.Struct]:
+def _arguments_of(function: Callable[..., ActionOutcome | None]) -> type[msgspec.Struct]:
     """The document of a function's keyword arguments."""
     hints = get_type_hints(function, include_extras=True)
     fields = [
@@ -76,22 +78,17 @@ def _arguments_of(function: Callable[..., ActionOutcome]) -> type[msgspec.Struct
 
 
 def place_uv(
-    session: Session,
-    state: PhotoState,
-    *,
-    uv: Point2,
-    pair: Index | None = None,
-    snap: NotNegative = 0.0,
+    state: PhotoState, *, uv: Point2, pair: Index | None = None, snap: NotNegative = 0.0
 ) -> ActionOutcome:
     """Place a photo half, by preference of the given pair; see `move` for ``snap``."""
-    place = _snapped(uv, snap, session, state)
+    place, message = _snapped(uv, snap, state)
     document, number = state.document.place_uv(place, pair)
     state.record(document)
-    return ActionOutcome(number, _no_corner(snap, moved=place != uv))
+    return ActionOutcome(number, message)
 
 
 def place_keypoint(
-    session: Session, state: PhotoState, *, keypoint: Index, pair: Index | None = None
+    state: PhotoState, *, keypoint: Index, pair: Index | None = None
 ) -> ActionOutcome:
     """Place a model half, a keypoint of the registry, by preference of the given pair."""
     state.model.registry[keypoint]  # refuses an unknown one
@@ -101,7 +98,6 @@ def place_keypoint(
 
 
 def pick(
-    session: Session,
     state: PhotoState,
     *,
     origin: Point3,
@@ -114,11 +110,10 @@ def pick(
     keypoint = _aimed_at(state, origin, direction, near, snap)
     if keypoint is None:
         return ActionOutcome(message=_MISSED)
-    return place_keypoint(session, state, keypoint=keypoint, pair=pair)
+    return place_keypoint(state, keypoint=keypoint, pair=pair)
 
 
 def repick(
-    session: Session,
     state: PhotoState,
     *,
     pair: Index,
@@ -135,35 +130,30 @@ def repick(
     return ActionOutcome(pair)
 
 
-def mirrored(session: Session, state: PhotoState, *, pair: Index) -> ActionOutcome:
+def mirrored(state: PhotoState, *, pair: Index) -> ActionOutcome:
     """Begin a pair at the mirror image of another's model point."""
     keypoint = state.document.pair(pair).keypoint
     registry, model = state.model.registry, state.model.cad
     point = None if keypoint is None else model.mirrored(registry[keypoint].xyz)
     if point is None:
-        raise InputError(
-            "its model point has no mirror image", where="pair", fix="choose another pair"
-        )
-    known = registry.find(point.xyz, tolerance=MIRRORED * model.diagonal)
-    image = registry.add(point) if known is None else known
-    return place_keypoint(session, state, keypoint=image)
+        what = "its model point has no mirror image"
+        raise InputError(what, where="pair", fix="choose another pair")
+    return place_keypoint(state, keypoint=_registered(state, point, MIRRORED))
 
 
-def suggested(session: Session, state: PhotoState, *, pair: Index | None = None) -> ActionOutcome:
+def suggested(state: PhotoState, *, pair: Index | None = None) -> ActionOutcome:
     """Place the suggested keypoint, by preference of the given pair."""
-    _, suggestion = session.live(state)
+    _, suggestion = state.session.live(state)
     if suggestion is None:
-        raise InputError(
-            "there is no suggested keypoint yet", where="suggestion", fix="place more pairs"
-        )
+        what = "there is no suggested keypoint yet"
+        raise InputError(what, where="suggestion", fix="place more pairs")
     keypoint = suggestion.point.semantic_id
     if keypoint is None:
         keypoint = state.model.registry.add(suggestion.point)
-    return place_keypoint(session, state, keypoint=keypoint, pair=pair)
+    return place_keypoint(state, keypoint=keypoint, pair=pair)
 
 
 def move(
-    session: Session,
     state: PhotoState,
     *,
     pair: Index,
@@ -175,44 +165,39 @@ def move(
 
     It goes to a corner of the photo at most ``snap`` px away.
     """
-    place = _snapped(uv, snap, session, state)
+    place, message = _snapped(uv, snap, state)
     step = None if gesture is None else (pair, gesture)
     state.record(state.document.move(pair, place), step=step)
-    return ActionOutcome(pair, _no_corner(snap, moved=place != uv))
+    return ActionOutcome(pair, message)
 
 
-def release(session: Session, state: PhotoState, *, pair: Index) -> ActionOutcome:
+def release(state: PhotoState, *, pair: Index) -> ActionOutcome:
     """Remove the model half of a pair."""
     state.record(state.document.release_keypoint(pair))
     return ActionOutcome(pair)
 
 
-def delete(session: Session, state: PhotoState, *, pair: Index) -> ActionOutcome:
+def delete(state: PhotoState, *, pair: Index) -> None:
     """Delete a pair."""
     state.record(state.document.delete(pair))
-    return ActionOutcome()
 
 
-def rename(session: Session, state: PhotoState, *, pair: Index, name: Text) -> ActionOutcome:
+def rename(state: PhotoState, *, pair: Index, name: Text) -> ActionOutcome:
     """Rename the keypoint of a pair."""
     keypoint = state.document.pair(pair).keypoint
     if keypoint is None:
-        raise InputError(
-            "this pair has no model point yet", where="pair", fix="click on the model first"
-        )
+        what = "this pair has no model point yet"
+        raise InputError(what, where="pair", fix="click on the model first")
     state.model.registry.rename(keypoint, name)
     return ActionOutcome(pair)
 
 
-def identify(
-    session: Session, state: PhotoState, *, pair: Index, label: Index | Text
-) -> ActionOutcome:
+def identify(state: PhotoState, *, pair: Index, label: Index | Text) -> ActionOutcome:
     """Say which keypoint of the category's shape the model point of a pair is."""
-    keypoint, shape = state.document.pair(pair).keypoint, session.shape
+    keypoint, shape = state.document.pair(pair).keypoint, state.session.shape
     if keypoint is None or shape is None or label not in shape.ids:
-        raise InputError(
-            f"{quote(label)} is no keypoint of the shape", where="label", fix="choose one"
-        )
+        what = f"{quote(label)} is no keypoint of the shape"
+        raise InputError(what, where="label", fix="choose one")
     registry = state.model.registry
     if shape.is_named:
         registry.rename(keypoint, str(label))
@@ -224,12 +209,10 @@ def identify(
     return ActionOutcome(pair)
 
 
-def accept(
-    session: Session, state: PhotoState, *, keypoints: list[Index] | None = None
-) -> ActionOutcome:
+def accept(state: PhotoState, *, keypoints: list[Index] | None = None) -> ActionOutcome:
     """Place pairs at a detector's proposals for some keypoints, or for all that are left."""
     document, number = state.document, None
-    for proposal in session.proposals(state):
+    for proposal in state.session.proposals(state):
         keypoint = proposal.keypoint
         if (keypoints is None or keypoint in keypoints) and keypoint not in document.keypoints:
             number = document.next_number
@@ -240,32 +223,36 @@ def accept(
     return ActionOutcome(number)
 
 
-def mark(session: Session, state: PhotoState, *, mark: Mark | None = None) -> ActionOutcome:
+def mark(state: PhotoState, *, mark: Mark | None = None) -> None:
     """Say that a photo is done or skipped, or neither."""
+    session = state.session
     session.before_saving()
     session.worklist = session.worklist.marked(state.photo.path.name, mark)
-    return ActionOutcome()
 
 
-def undo(session: Session, state: PhotoState) -> ActionOutcome:
+def undo(state: PhotoState) -> ActionOutcome:
     """Undo the last change."""
-    deleted = session.deletions.last(session.place_of(state)[0], at_once=True)
+    deleted = state.session.last_deleted(state.place[0], at_once=True)
     if deleted is not None:
         return bring_back(deleted)
-    before = state.marked
-    return _gone(state, before, "" if state.history.undo() else "There is nothing to undo.")
+    before = replace(state.document, further_views=())
+    if not state.history.undo():
+        return ActionOutcome(message="There is nothing to undo.")
+    return _gone_on(state, before)
 
 
-def redo(session: Session, state: PhotoState) -> ActionOutcome:
+def redo(state: PhotoState) -> ActionOutcome:
     """Redo the last undone change."""
-    before = state.marked
+    before = replace(state.document, further_views=())
     is_done = state.history.redo()
     if state.owner.document.is_gone:
-        session.deletions.add(session.place_of(state)[0], state.owner)
-    return _gone(state, before, "" if is_done else "There is nothing to redo.")
+        state.session.note_deletion(state.owner)
+    if not is_done:
+        return ActionOutcome(message="There is nothing to redo.")
+    return _gone_on(state, before)
 
 
-ACTIONS: dict[str, Callable[..., ActionOutcome]] = {
+ACTIONS: dict[str, Callable[..., ActionOutcome | None]] = {
     function.__name__: function
     for function in (
         *(place_uv, place_keypoint, pick, repick, mirrored, suggested, move, release, delete),
@@ -280,16 +267,14 @@ _DELETING = ("delete_object", "undo", "redo")
 _RENAMING = ("rename", "identify")
 
 
-def _gone(state: PhotoState, before: AnnotationDocument, nothing: str) -> ActionOutcome:
+def _gone_on(state: PhotoState, before: AnnotationDocument) -> ActionOutcome:
     """The outcome of undoing or redoing, which may concern another photo of the object.
 
-    ``nothing`` says that nothing was done, if so; ``before`` is what was marked in the photo.
+    ``before`` is what was marked in the photo.
     """
-    if nothing:
-        return ActionOutcome(message=nothing)
     if not state.is_shown:
         return ActionOutcome(message="This photo is no longer one of the object's.")
-    if len(state.all_views) > 1 and state.marked == before:
+    if len(state.all_views) > 1 and replace(state.document, further_views=()) == before:
         return ActionOutcome(message="That was a change in another photo of this object.")
     return ActionOutcome()
 
@@ -301,25 +286,28 @@ def _aimed_at(
 
     It is the keypoint ``near`` it if that is visible. For ``snap`` see `ClickableModel.pick`.
     """
-    model, registry = state.model.cad, state.model.registry
+    model = state.model.cad
     start = model.from_display(origin)
-    if near is not None and model.is_seen(start, registry[near].xyz):
+    if near is not None and model.is_seen(start, state.model.registry[near].xyz):
         return near
     point = model.pick(start, direction, snap=snap)
-    if point is None:
-        return None
-    known = registry.find(point.xyz, tolerance=SAME_PLACE * model.diagonal)
+    return None if point is None else _registered(state, point, SAME_PLACE)
+
+
+def _registered(state: PhotoState, point: ModelKeypoint, tolerance: float) -> int:
+    """The keypoint within the tolerance [diagonals] of a point, or a new one."""
+    registry = state.model.registry
+    known = registry.find(point.xyz, tolerance=tolerance * state.model.cad.diagonal)
     return registry.add(point) if known is None else known
 
 
-def _snapped(uv: Pixel, reach: float, session: Session, state: PhotoState) -> Pixel:
-    """The nearest corner of the photo within reach [px], or the place itself."""
+def _snapped(uv: Pixel, reach: float, state: PhotoState) -> tuple[Pixel, str]:
+    """The nearest corner of the photo within reach [px], or the place itself, and a message."""
     state.require_inside(uv)
     if not reach > 0:
-        return uv
-    corner = nearest_corner(session.pixels(state), uv, reach=min(reach, _LONGEST_REACH))
-    return uv if corner is None else corner
-
-
-def _no_corner(snap: float, *, moved: bool) -> str:
-    return "No corner of the photo near this place." if snap > 0 and not moved else ""
+        return uv, ""
+    pixels = state.session.pixels(state)
+    corner = nearest_corner(pixels, uv, reach=min(reach, _LONGEST_REACH))
+    if corner is None or corner == uv:
+        return uv, "No corner of the photo near this place."
+    return corner, ""

@@ -83,7 +83,7 @@ def _coco_object(image: int, state: PhotoState, category: int, numbers: list[int
 def glb_of(session: Session, number: int, *, slot: int | None = None) -> bytes:
     """The aligned, textured model before its photo; raises InputError without an alignment."""
     with session.lock:
-        exported = _aligned_object(session, session.photo_state(number, slot))
+        exported = _aligned_object(session.photo_state(number, slot))
     if exported is None:
         raise InputError("there is no alignment yet", where="export", fix="place more pairs")
     with tempfile.TemporaryDirectory() as folder:
@@ -96,13 +96,13 @@ def annotated_photos(session: Session) -> list[AnnotatedPhoto]:
         choice = session.choice
         found = []
         for state in (each for each in session.states if each.is_shown):
-            exported = _aligned_object(session, state)
+            exported = _aligned_object(state)
             if exported is None or session.work_state(state) == "skipped":
                 continue
             key = None if choice is None else choice.key_of(state.files.model)
-            image = session.observer.image(state).evidence
+            image = state.image().evidence
             photo = AnnotatedPhoto(
-                _named(session, state, exported),
+                _named(state, exported),
                 state.photo.path,
                 "object" if key is None else key[0],
                 image.mask,
@@ -127,20 +127,21 @@ def zipped_photo_set(session: Session, form: str) -> bytes:
         return Path(archive).read_bytes()
 
 
-def _aligned_object(session: Session, state: PhotoState) -> AlignedObject | None:
+def _aligned_object(state: PhotoState) -> AlignedObject | None:
     """The model as it is aligned in a photo; None without an alignment."""
-    live, _ = session.live(state)
+    live, _ = state.session.live(state)
     if live.result is None or live.wireframe is None:
         return None
-    mesh = state.model.cad.scene.mesh if session.shape is None else live.wireframe.scene.mesh
-    images = [view.image for view in session.observed(state)[0].views]
+    lines, cad = live.wireframe, state.model.cad
+    mesh = cad.scene.mesh if state.session.shape is None else lines.scene.mesh
+    images = [view.image for view in state.observation().views]
     result = replace(live.result, model=None)  # or the mesh, which is warped, would be once more
     return object_of(result, mesh=mesh, images=images, name=state.files.model.stem)
 
 
-def _named(session: Session, state: PhotoState, exported: AlignedObject) -> AlignedObject:
+def _named(state: PhotoState, exported: AlignedObject) -> AlignedObject:
     """The object in its photo alone, with its keypoints by name."""
-    live, _ = session.live(state)
+    live, _ = state.session.live(state)
     names: dict[Hashable, Hashable] = {number: point.name for number, point in state.model.registry}
     view = exported.views[live.place]
     view = replace(view, ids=tuple(names.get(each, each) for each in view.ids))

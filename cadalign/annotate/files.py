@@ -39,7 +39,6 @@ from cadalign.io.documents import (
     path_from,
     read_json,
     within,
-    written_path,
 )
 from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.files import write_json, writing
@@ -50,9 +49,10 @@ logger = logging.getLogger("cadalign")
 
 _RENAME = "rename it: the annotator writes a file of this name"
 _EARLIER_FORMAT = "cadalign unfinished pairs"
+# Fields that are not of one image.
 _OF_THE_OBJECT = (
     *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
-)  # fields that are not of one image
+)
 
 
 class _Half(SeenKeypoint, kw_only=True):
@@ -105,13 +105,12 @@ class Stored:
 
         Where no prior on the focal length is stored, `cadalign fit` takes the likely one, too.
         """
+        options = self.fit_options
         if self.camera is None or not self.document.complete_pairs:
             return likely
-        focal = likely.focal
-        if "focal_prior" in self.fit_options:
-            stored = self.fit_options["focal_prior"]
-            focal = None if stored is None else FocalPrior(**stored)
-        return Priors(self.fit_options.get("stretch_sigma"), focal)
+        stored = options.get("focal_prior", likely.focal)
+        focal = FocalPrior(**stored) if isinstance(stored, Mapping) else stored
+        return Priors(options.get("stretch_sigma"), focal)
 
 
 @dataclass(frozen=True)
@@ -131,14 +130,14 @@ class AnnotationFiles:
         """Read an earlier session's annotation; new model points are added to the registry."""
         registry, tolerance = model.registry, SAME_PLACE * model.cad.diagonal
         stored = Stored(AnnotationDocument(), None, FurtherEvidence(), {})
+        parts = []
         if self.observation.exists():
             observation = self._load()
             further = FurtherEvidence.of(observation, self.image, where=self.observation)
             photo = observation.views[further.place]
             self._warn_of_options(observation, further, shape)
-            document = replace(
-                _document_of(photo, registry, tolerance), name=observation.object_name or ""
-            )
+            document = _document_of(photo, registry, tolerance)
+            document = replace(document, name=observation.object_name or "")
             views = tuple(
                 StoredView(
                     view.image, _document_of(view, registry, tolerance), view.camera, view.evidence
@@ -148,11 +147,10 @@ class AnnotationFiles:
             )
             stored = Stored(document, photo.camera, further, observation.fit_options, views)
             with in_file(self.observation), within("unfinished"):
-                unfinished: _Unfinished = convert(observation.unfinished or {}, _Unfinished)
-            stored = self._with_unfinished(stored, unfinished, registry)
+                parts.append(convert(observation.unfinished or {}, _Unfinished))
         earlier = self._earlier_unfinished()
-        if earlier is not None:
-            stored = self._with_unfinished(stored, earlier, registry)
+        for unfinished in parts if earlier is None else [*parts, earlier]:
+            stored = self._with_unfinished(stored, unfinished, registry)
         self._refuse_other_fit()
         return stored
 
@@ -264,36 +262,15 @@ class AnnotationFiles:
                 raise DataError("not an alignment of cadalign", where=str(self.fit), fix=_RENAME)
 
 
-def written_unfinished(
-    pairs: Sequence[Pair], views: Sequence[Mapping[str, Any]]
-) -> dict[str, Any] | None:
-    """The observation's field of pairs, and of further photos by `written_view`; None for none."""
-    parts = {"pairs": [_written_half(pair) for pair in pairs], "views": list(views)}
-    return {name: part for name, part in parts.items() if part} or None
-
-
-def written_view(files: AnnotationFiles, camera: Camera, pairs: Sequence[Pair]) -> dict[str, Any]:
-    """A further photo with the pairs that the observation has no keypoints for."""
-    return {
-        "image": written_path(files.image, folder=files.observation.parent),
-        "camera": camera.to_dict(pixel_origin="corner"),
-        "pairs": [_written_half(pair) for pair in pairs],
-    }
-
-
 def _remove(path: Path) -> None:
     with writing(path):
         path.unlink(missing_ok=True)
 
 
-def _written_half(pair: Pair) -> dict[str, Any]:
-    fields = {
-        "semantic_id": pair.keypoint,
-        "uv": None if pair.uv is None else list(pair.uv),
-        "sigma": pair.sigma,
-        "score": pair.score,
-        "depth": pair.depth,
-    }
+def written_half(pair: Pair) -> dict[str, Any]:
+    """A pair as the observation's field of unfinished ones holds it."""
+    fields = {"semantic_id": pair.keypoint, "uv": None if pair.uv is None else list(pair.uv)}
+    fields |= {name: getattr(pair, name) for name in ("sigma", "score", "depth")}
     return {name: value for name, value in fields.items() if value is not None}
 
 
@@ -321,23 +298,15 @@ def _document_of(
 ) -> AnnotationDocument:
     document = AnnotationDocument()
     ids, names = observation.ids, observation.names
+    columns = (observation.sigma, observation.scores, observation.depths)
     for row, (xyz, uv) in enumerate(
         zip(observation.points_3d.tolist(), observation.points_2d.tolist(), strict=True)
     ):
-        point = ModelKeypoint(
-            name="" if names is None else names[row],
-            xyz=tuple(xyz),
-            semantic_id=None if ids is None else int(ids[row]),
-        )
-        pair = Pair(
-            document.next_number,
-            uv=tuple(uv),
-            keypoint=_registered(point, registry, tolerance, document.keypoints),
-            sigma=_entry(observation.sigma, row),
-            score=_entry(observation.scores, row),
-            depth=_entry(observation.depths, row),
-        )
-        document = document.append(pair)
+        number = None if ids is None else int(ids[row])
+        point = ModelKeypoint("" if names is None else names[row], tuple(xyz), number)
+        keypoint = _registered(point, registry, tolerance, document.keypoints)
+        known = (_entry(values, row) for values in columns)
+        document = document.append(Pair(document.next_number, tuple(uv), keypoint, *known))
     return document
 
 

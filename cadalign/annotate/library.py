@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -63,7 +62,7 @@ class ModelChoice:
     @cached_property
     def ids(self) -> frozenset[int]:
         """Semantic ids of the models' keypoints."""
-        return frozenset(number for model in self._models() for number in model.ids.tolist())
+        return frozenset(number for key in self.keys for number in self.library[key].ids.tolist())
 
     def model(self, key: ModelKey) -> LibraryModel:
         """Find a model that can be chosen; raises InputError if there is none with a mesh."""
@@ -98,41 +97,35 @@ class ModelChoice:
             for number, (x, y, z) in zip(model.ids.tolist(), model.xyz.tolist(), strict=True)
         )
 
-    def first_model(self, observations: Iterable[Path]) -> Path:
-        """The mesh to begin with: an earlier session's, else the one with the most keypoints."""
-        for path in observations:
-            mesh = named_model(path)
-            if mesh is not None and self.key_of(mesh) is not None:
-                return mesh
-        having = [model for model in self._models() if model.mesh_path is not None]
-        if not having:
-            raise InputError("none of its models has a mesh", where="--library")
-        best = max(having, key=lambda model: len(model.ids))  # the first of several
-        assert best.mesh_path is not None
-        return best.mesh_path
-
-    def _models(self) -> Iterator[LibraryModel]:
-        return (self.library[key] for key in self.keys)
-
     @cached_property
     def _keys_by_mesh(self) -> dict[Path, ModelKey]:
         return {
-            model.mesh_path.resolve(): model.key
-            for model in self._models()
-            if model.mesh_path is not None
+            path.resolve(): key
+            for key in self.keys
+            if (path := self.library[key].mesh_path) is not None
         }
 
 
 def starting_model(options: FileOptions, image: Path) -> Path:
-    """The model of a session for which only a library is given; raises a CadalignError."""
+    """The model of a session for which only a library is given.
+
+    That of an earlier session, else the one with the most keypoints. Raises a CadalignError.
+    """
     choice = ModelChoice.open(options)
     if choice is None:
         raise InputError("no model is given", where="--model", fix="give one, or a --library")
     photos = find_photos(image)
-    if options.observation is not None:
-        return choice.first_model([options.observation])
     out = options.out or photos[0].parent
-    return choice.first_model(observation_file(photo, out) for photo in photos)
+    given = options.observation
+    for path in (observation_file(photo, out) for photo in photos) if given is None else [given]:
+        mesh = named_model(path)
+        if mesh is not None and choice.key_of(mesh) is not None:
+            return mesh
+    models = [choice.library[key] for key in choice.keys]
+    having = [(len(model.ids), model.mesh_path) for model in models if model.mesh_path is not None]
+    if not having:
+        raise InputError("none of its models has a mesh", where="--library")
+    return max(having, key=lambda each: each[0])[1]  # the first of several
 
 
 def thumbnail_of(choice: ModelChoice, number: int) -> bytes:

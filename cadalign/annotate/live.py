@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple, cast
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 
-from cadalign.annotate.estimate import (
-    LEAST_JOINT_PAIRS,
-    LEAST_PAIRS,
-    LEAST_SIGMA,
-    Known,
-    LiveEstimate,
-)
+from cadalign.annotate.estimate import LEAST_JOINT_PAIRS, LEAST_PAIRS, Known, LiveAlignment
 from cadalign.annotate.evidence import evidence_labels
-from cadalign.annotate.model import Wireframe, box_lines
+from cadalign.annotate.lines import Wireframe, box_lines
 from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
@@ -31,47 +24,8 @@ from cadalign.render.drawing.keypoint_layer import confidence_regions
 from cadalign.shapes.model import ShapeModel
 
 
-@dataclass(frozen=True, eq=False)
-class LiveAlignment:
-    """Alignment of what is marked so far, as one photo of the object shows it."""
-
-    result: Result | None = None  # the estimate from all photos, as it is shown and saved
-    message: str = ""  # reason for a missing result, or an assumption that was made
-    provisional: bool = False  # True if the marks alone did not suffice, so that nothing is saved
-    place: int = 0  # the photo's number among the views
-    sigma: float = LEAST_SIGMA  # standard deviation of the pairs [px], larger if the residuals are
-    fit_options: Mapping[str, Any] = field(default_factory=dict)
-    """With which, and the priors, `cadalign fit` finds the result of this object alone."""
-    others_focal: FocalPrior | None = None
-    """Prior on the focal length that other objects of the photo and the object's own prior say."""
-    contradictions: tuple[str, ...] = ()  # of objects of the photo about its focal length
-    counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
-    """(n,), the complete pairs whose keypoints the shape knows."""
-    residuals: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
-    """(n, 2), projected minus placed points of all complete pairs [px]."""
-    outliers: Mapping[int, float] = field(default_factory=dict)
-    """Distances [px] of the pairs that contradict the others, by their rows."""
-    wireframe: Wireframe | None = None
-    """Lines of the model, warped to an own shape, in its frame before the stretch."""
-    prior_lengths: FloatArray = field(default_factory=lambda: np.zeros(3))
-    """(3,), standard deviations of the logarithms of the lengths before any pair."""
-    also_used: tuple[str, ...] = ()  # evidence beyond the photo's pairs
-
-    @property
-    def camera(self) -> Camera:
-        """The photo's camera."""
-        assert self.result is not None
-        return self.result.cameras[self.place]
-
-    @property
-    def alignment(self) -> Alignment:
-        """The alignment in the photo's camera."""
-        assert self.result is not None
-        return self.result.poses[self.place]
-
-
 def live_alignment(
-    estimate: LiveEstimate,
+    estimate: LiveAlignment,
     known: Known,
     wireframe: Wireframe,
     observation: Observation,
@@ -85,6 +39,8 @@ def live_alignment(
     the photo; the estimate was computed from the observation, and the wireframe is the model's.
     """
     result, problem, shape = estimate.result, estimate.problem, known.shape
+    assert result is not None
+    assert problem is not None
     counts = known_points(shape, points)
     free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
     lines, carried = _warped(wireframe, result, problem.model, known, free)
@@ -93,41 +49,29 @@ def live_alignment(
     residuals[counts] = result.views[place].residuals
     residuals[~counts] = camera.project(result.poses[place].apply(carried)) - uv[~counts]
     rows = np.flatnonzero(counts)
-    if not problem.exact:
-        problem = problem.at_focal(result.cameras)
-    outliers = {int(rows[row]): off for row, off in problem.contradicting(place).items()}
-    message = _assumed_text(known.assumed_focal, camera) or estimate.assumed
+    judged = problem if problem.exact else problem.at_focal(result.cameras)
     prior = known.stretch or np.inf
-    lengths = np.array([0.0, prior, prior])
-    return LiveAlignment(
-        result,
-        message,
-        provisional=bool(message),
-        place=place,
-        sigma=estimate.sigma,
+    message = _assumed_text(known.assumed_focal, camera) or estimate.message
+    return replace(
+        estimate,
+        message=message,
         fit_options={} if message else estimate.fit_options,
-        others_focal=estimate.others_focal,
-        contradictions=estimate.contradictions,
+        place=place,
         counts=counts,
         residuals=residuals,
-        outliers=outliers,
+        outliers={int(rows[row]): off for row, off in judged.contradicting(place).items()},
         wireframe=lines,
-        prior_lengths=lengths if shape is None else shape.length_sigmas(problem.model),
+        prior_lengths=(
+            np.array([0.0, prior, prior]) if shape is None else shape.length_sigmas(problem.model)
+        ),
         also_used=evidence_labels(observation),
     )
 
 
-class Candidate(NamedTuple):
-    """An alignment that a mask alone allows, with its likelihood over the best one's."""
-
-    alignment: Alignment
-    likelihood: float
-
-
-def candidates_of(result: Result) -> list[Candidate]:
-    """The alignments that the evidence cannot tell apart, the best first."""
-    others = (Candidate(each.alignment, each.relative_likelihood) for each in result.alternatives)
-    return [Candidate(result.alignment, 1.0), *others]
+def candidates_of(result: Result) -> list[tuple[Alignment, float]]:
+    """Alignments that the evidence cannot tell apart, and their likelihoods over the first's."""
+    others = ((each.alignment, each.relative_likelihood) for each in result.alternatives)
+    return [(result.alignment, 1.0), *others]
 
 
 def known_points(shape: ObjectShape | None, points: Sequence[ModelKeypoint]) -> BoolArray:

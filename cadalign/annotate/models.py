@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.model import ClickableModel, Wireframe
+from cadalign.annotate.lines import Wireframe
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.names import keypoints_file
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.photos import PhotoFile

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.annotate.document import AnnotationDocument, FocalChoice, FurtherView, Pair, Priors
+from cadalign.annotate.document import AnnotationDocument, FurtherView, History, Pair, Priors
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import (
     ChosenStart,
@@ -16,136 +16,172 @@ from cadalign.annotate.evidence import (
     MarkedLengths,
     MaskDrawing,
     Stroke,
+    cut_out,
+    decode_runs,
+    encode_runs,
     find_up,
 )
 from cadalign.annotate.files import AnnotationFiles
-from cadalign.annotate.history import History
 from cadalign.annotate.live import candidates_of
-from cadalign.annotate.masks import cut_out, decode_runs, encode_runs
-from cadalign.annotate.models import KeypointRegistry, OpenedModel
+from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.names import object_file, object_number
-from cadalign.annotate.objects import PhotoState, label_of, shown_objects
-from cadalign.annotate.session import ActionOutcome, Session
+from cadalign.annotate.objects import PhotoState, shown_objects
+from cadalign.annotate.photos import FocalChoice
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Count, Finite, Index, Point2, Positive, Text
 
 _LONGEST_NAME = 60
+_FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
+_STRETCH_RANGE = (0.01, 2.0)  # of the standard deviation of a prior on the log scales
+_LEAST_VERTICAL = 5.0  # [px]
 
 
-def add_object(
-    session: Session, state: PhotoState, *, name: str = "", model: Index | None = None
-) -> ActionOutcome:
+@dataclass(frozen=True)
+class ActionOutcome:
+    """Outcome of an action beside the changed document, for the user."""
+
+    selected: int | None = None  # number of the pair that was placed or changed
+    message: str = ""  # such as that the click missed the model
+    shown: PhotoState | None = None  # the object and photo to go on with, if not the same
+
+
+def add_object(state: PhotoState, *, name: str = "", model: Index | None = None) -> ActionOutcome:
     """Add an object to the photo, with the model of a number; by default that of this object."""
-    photo, _ = session.place_of(state)
-    free = _free_name(name, session.objects[photo], None)
+    session = state.session
+    states = session.objects[state.place[0]]
+    like = states[0]
+    name = _free_name(name, states, None)
     chosen = state.model if model is None else session.models[model]
-    return ActionOutcome(shown=_add_object(session, photo, chosen, free))
+    if session.shape is not None and session.shape.learned is not None and chosen is not like.model:
+        fix = "start without --shape for objects of several models"
+        raise InputError(
+            "the shape is that of one category, with one model", where="model", fix=fix
+        )
+    first = like.files.observation
+    taken = {object_number(each.files.observation) for each in states if each.lead is None}
+    number = next(
+        number
+        for number in range(2, len(states) + 3)
+        if number not in taken and not object_file(first, number).exists()
+    )
+    stretch = LIKELY_STRETCH if session.shape is None else None
+    priors = Priors(stretch, like.intrinsics.likely_focal)
+    document = AnnotationDocument(focal=like.document.focal, priors=priors, name=name)
+    files = AnnotationFiles(object_file(first, number), like.photo.path, chosen.path)
+    alike = next((each for each in session.states if each.model is chosen), like)
+    further = FurtherEvidence(up_axis=alike.owner.further.up_axis)
+    added = PhotoState(
+        session, like.photo, files, like.intrinsics, History(document), chosen, further
+    )
+    states.append(added)
+    return ActionOutcome(shown=added)
 
 
-def rename_object(session: Session, state: PhotoState, *, name: str) -> ActionOutcome:
+def rename_object(state: PhotoState, *, name: str) -> None:
     """Rename the object; an empty name gives it its number again."""
-    photo, _ = session.place_of(state)
-    free = _free_name(name, session.objects[photo], state)
+    free = _free_name(name, state.session.objects[state.place[0]], state)
     state.record(replace(state.document, name=free))
-    return ActionOutcome()
 
 
-def delete_object(session: Session, state: PhotoState) -> ActionOutcome:
+def delete_object(state: PhotoState) -> ActionOutcome:
     """Delete the object with its files; it can be brought back while the program runs."""
-    label, owner = label_of(state), state.owner
+    label, owner = state.label, state.owner
     kept = owner.document
     owner.record(
         AnnotationDocument(focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True)
     )
     for view in (owner, *owner.views):
         view.drawn = None
-        session.deletions.add(session.place_of(view)[0], owner)
+    state.session.note_deletion(owner)
     return ActionOutcome(message=f"Deleted: {label}. Ctrl+Z brings it back.")
 
 
-def restore_object(session: Session, state: PhotoState) -> ActionOutcome:
+def restore_object(state: PhotoState) -> ActionOutcome:
     """Bring back the object of the photo that was deleted last."""
-    deleted = session.deletions.last(session.place_of(state)[0])
+    deleted = state.session.last_deleted(state.place[0])
     if deleted is None:
         raise InputError("no deleted object is left", where="restore", fix="add one")
     return bring_back(deleted)
 
 
-def add_view(session: Session, state: PhotoState, *, photo: Index) -> ActionOutcome:
-    """Add another photo as a further view of the object."""
+def bring_back(deleted: PhotoState) -> ActionOutcome:
+    """Undo the deletion of an object."""
+    deleted.history.undo()
+    return ActionOutcome(shown=deleted, message=f"Brought back: {deleted.label}.")
+
+
+def add_view(state: PhotoState, *, photo: Index) -> ActionOutcome:
+    """Add another photo as a further view of the object, or one that was taken from it again."""
+    session, owner = state.session, state.owner
     target = session.photo_state(photo)
     if any(view.key == target.key for view in state.all_views):
-        raise InputError(
-            f"{target.photo.path.name} is a photo of this object already",
-            where="photo",
-            fix="choose another one",
+        what = f"{target.photo.path.name} is a photo of this object already"
+        raise InputError(what, where="photo", fix="choose another one")
+    stored = (owner.further.image, *(each.evidence for each in owner.further.others))
+    if any(each.cam_from_rig is not None for each in stored):
+        what = "the cameras of this object's photos are known, the new one's is not"
+        fix = "write its camera pose into the observation"
+        raise InputError(what, where="photo", fix=fix)
+    like = session.objects[photo][0]
+    view = next((each for each in owner.views if each.key == like.key), None)
+    if view is None:
+        view = owner.add_view(like.photo, like.intrinsics)
+        session.objects[photo].append(view)
+    shared = owner.document
+    view.record(
+        AnnotationDocument(
+            focal=like.document.focal,
+            priors=Priors(shared.priors.stretch, like.intrinsics.likely_focal),
+            evidence=shared.evidence.shared_with(MarkedEvidence()),
+            name=shared.name,
         )
-    if state.owner.is_rigid:
-        raise InputError(
-            "the cameras of this object's photos are known, the new one's is not",
-            where="photo",
-            fix="write its camera pose into the observation",
-        )
-    return ActionOutcome(shown=_add_view(session, state.owner, photo))
+    )
+    return ActionOutcome(shown=view)
 
 
-def remove_view(session: Session, state: PhotoState) -> ActionOutcome:
+def remove_view(state: PhotoState) -> ActionOutcome:
     """Take the photo from the object, with its pairs; undo brings it back."""
     if state.lead is None:
-        raise InputError(
-            "the object's first photo cannot be taken from it",
-            where="photo",
-            fix="delete the object, or take its other photos from it",
-        )
+        what = "the object's first photo cannot be taken from it"
+        fix = "delete the object, or take its other photos from it"
+        raise InputError(what, where="photo", fix=fix)
     state.history.record(state.history.document.without_view(state.key))
     return ActionOutcome(shown=state.owner, message=f"{state.photo.path.name} is no longer used.")
 
 
-def model(session: Session, state: PhotoState, *, category: Text, model: Text) -> ActionOutcome:
+def model(state: PhotoState, *, category: Text, model: Text) -> ActionOutcome | None:
     """Go on with another model of the library, in all photos of the object.
 
     Pairs keep their keypoints by semantic id or name.
     """
-    choice = session.choice
-    if choice is None:
+    session, owner = state.session, state.owner
+    if session.choice is None:
         raise InputError("the session has no library", where="model", fix="start with --library")
-    mesh = choice.model((category, model)).mesh_path
+    mesh = session.choice.model((category, model)).mesh_path
     assert mesh is not None
     session.before_saving()  # where nothing may be written, nothing is changed either
-    owner = state.owner
     old, new = owner.model, session.models.of(mesh)
     if new is old:
-        return ActionOutcome()
+        return None
     if session.ready:
         new.prepare(has_shape=session.shape is not None)
-    carried = carry_keypoints(old.registry, new.registry, choice.ids_on(old.path))
-    before = sum(pair.keypoint is not None for pair in state.document.pairs)
+    carried = carry_keypoints(old.registry, new.registry, session.choice.ids_on(old.path))
+    before = len(state.document.keypoints)
     history = owner.history.changed(lambda document: _carried(document, carried))
     for each in (owner, *owner.views):
         each.model, each.history = new, history
         each.files = replace(each.files, model=new.path)
-        each.live = each.estimate = None
+        each.live = each.alone = None
         each.proposals = tuple(
             replace(proposal, keypoint=carried[proposal.keypoint])
             for proposal in each.proposals
             if proposal.keypoint in carried
         )
-    lost = before - sum(pair.keypoint is not None for pair in state.document.pairs)
+    lost = before - len(state.document.keypoints)
     if not lost:
-        return ActionOutcome()
+        return None
     pairs = "1 pair has" if lost == 1 else f"{lost} pairs have"
     return ActionOutcome(message=f"{pairs} no keypoint on this model: click on it.")
-
-
-OBJECT_ACTIONS = (
-    *(add_object, rename_object, delete_object, restore_object, add_view, remove_view, model),
-)
-
-
-def bring_back(deleted: PhotoState) -> ActionOutcome:
-    """Undo the deletion of an object."""
-    deleted.history.undo()
-    return ActionOutcome(shown=deleted, message=f"Brought back: {label_of(deleted)}.")
 
 
 def carry_keypoints(
@@ -185,224 +221,137 @@ def _free_name(name: str, states: list[PhotoState], own: PhotoState | None) -> s
     """The name without superfluous blanks; refuses one that is too long or another object's."""
     name = " ".join(name.split())
     if len(name) > _LONGEST_NAME:
-        raise InputError(
-            f"{quote(name[:_LONGEST_NAME])}... is too long",
-            where="name",
-            fix=f"give at most {_LONGEST_NAME} characters",
-        )
-    if any(label_of(each) == name for each in shown_objects(states) if each is not own):
-        raise InputError(
-            f"another object of this photo is called {quote(name)}",
-            where="name",
-            fix="choose another name",
-        )
+        what = f"{quote(name[:_LONGEST_NAME])}... is too long"
+        raise InputError(what, where="name", fix=f"give at most {_LONGEST_NAME} characters")
+    if any(each.label == name for each in shown_objects(states) if each is not own):
+        what = f"another object of this photo is called {quote(name)}"
+        raise InputError(what, where="name", fix="choose another name")
     return name
-
-
-def _add_object(session: Session, photo: int, model: OpenedModel, name: str) -> PhotoState:
-    """Add an object to the photo of a number; with the camera of the photo's other objects."""
-    states = session.objects[photo]
-    like = states[0]
-    if session.shape is not None and session.shape.learned is not None and model is not like.model:
-        raise InputError(
-            "the shape is that of one category, with one model",
-            where="model",
-            fix="start without --shape for objects of several models",
-        )
-    first = like.files.observation
-    taken = {object_number(each.files.observation) for each in states if each.lead is None}
-    number = next(
-        number
-        for number in range(2, len(states) + 3)
-        if number not in taken and not object_file(first, number).exists()
-    )
-    stretch = LIKELY_STRETCH if session.shape is None else None
-    priors = Priors(stretch, like.intrinsics.likely_focal)
-    document = AnnotationDocument(focal=like.document.focal, priors=priors, name=name)
-    files = AnnotationFiles(object_file(first, number), like.photo.path, model.path)
-    alike = next((each for each in session.states if each.model is model), like)
-    further = FurtherEvidence(up_axis=alike.owner.further.up_axis)
-    added = PhotoState(like.photo, files, like.intrinsics, History(document), model, further)
-    states.append(added)
-    return added
-
-
-def _add_view(session: Session, owner: PhotoState, photo: int) -> PhotoState:
-    """Add the photo of a number to an object, or one that was taken from it again."""
-    like = session.objects[photo][0]
-    view = next((each for each in owner.views if each.key == like.key), None)
-    if view is None:
-        view = owner.add_view(like.photo, like.intrinsics)
-        session.objects[photo].append(view)
-    shared = owner.document
-    view.record(
-        AnnotationDocument(
-            focal=like.document.focal,
-            priors=Priors(shared.priors.stretch, like.intrinsics.likely_focal),
-            evidence=shared.evidence.shared_with(MarkedEvidence()),
-            name=shared.name,
-        )
-    )
-    return view
 
 
 # What is known beside the pairs -------------------------------------------------------------------
 
 
-_FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
-_STRETCH_RANGE = (0.01, 2.0)  # of the standard deviation of a prior on the log scales
-_LEAST_VERTICAL = 5.0  # [px]
-
-
-def focal(
-    session: Session, state: PhotoState, *, known: bool, pixels: Finite | None = None
-) -> ActionOutcome:
+def focal(state: PhotoState, *, known: bool, pixels: Finite | None = None) -> None:
     """Choose a known or an estimated focal length."""
     low, high = (bound * state.photo.width for bound in _FOCAL_RANGE)
     if pixels is not None and not low <= pixels <= high:
-        raise InputError(
-            f"{pixels:g} px is no focal length of this photo",
-            where="pixels",
-            fix=f"give {low:.0f} to {high:.0f} px",
-        )
+        what = f"{pixels:g} px is no focal length of this photo"
+        raise InputError(what, where="pixels", fix=f"give {low:.0f} to {high:.0f} px")
     state.record(replace(state.document, focal=FocalChoice(known, pixels)))
-    return ActionOutcome()
 
 
-def prior(
-    session: Session, state: PhotoState, *, stretch: Finite | None = None, focal: bool = True
-) -> ActionOutcome:
+def prior(state: PhotoState, *, stretch: Finite | None = None, focal: bool = True) -> None:
     """Choose the prior on the stretch, and whether an estimated focal length has one."""
     low, high = _STRETCH_RANGE
     if stretch is not None and not low <= stretch <= high:
-        raise InputError(
-            f"{100 * stretch:g} % is no weak prior on the stretch",
-            where="stretch",
-            fix=f"give {100 * low:g} to {100 * high:g} %, or switch it off",
-        )
+        what = f"{100 * stretch:g} % is no weak prior on the stretch"
+        fix = f"give {100 * low:g} to {100 * high:g} %, or switch it off"
+        raise InputError(what, where="stretch", fix=fix)
     kept = state.document.priors.focal or state.intrinsics.likely_focal
     state.record(replace(state.document, priors=Priors(stretch, kept if focal else None)))
-    return ActionOutcome()
 
 
 def mask_paint(
-    session: Session,
-    state: PhotoState,
-    *,
-    points: list[Point2],
-    radius: Positive | None = None,
-    adds: bool = True,
-) -> ActionOutcome:
+    state: PhotoState, *, points: list[Point2], radius: Positive | None = None, adds: bool = True
+) -> None:
     """Add a polygon, or a brush stroke of a ``radius`` [px], to the mask, or take it away."""
     if len(points) < (1 if radius is not None else 3):
         raise InputError("a polygon has at least three corners", where="points", fix="add corners")
-    return _add(Stroke(tuple(points), radius, adds=adds), state)
+    _add(Stroke(tuple(points), radius, adds=adds), state)
 
 
-def mask_load(session: Session, state: PhotoState, *, runs: list[Count]) -> ActionOutcome:
+def mask_load(state: PhotoState, *, runs: list[Count]) -> None:
     """Take a mask as it is given; see `encode_runs`."""
     decode_runs(tuple(runs), state.photo.width, state.photo.height)
-    mask = MaskDrawing(strokes=(Stroke(runs=tuple(runs)),))
-    return _record(replace(state.document.evidence, mask=mask), state)
+    state.mark(mask=MaskDrawing(strokes=(Stroke(runs=tuple(runs)),)))
 
 
-def mask_cut(
-    session: Session, state: PhotoState, *, corners: tuple[Point2, Point2]
-) -> ActionOutcome:
+def mask_cut(state: PhotoState, *, corners: tuple[Point2, Point2]) -> None:
     """Add what GrabCut finds in a box to the mask."""
-    mask = cut_out(session.pixels(state), np.array(corners, dtype=float))
-    return _add(Stroke(runs=encode_runs(mask)), state)
+    mask = cut_out(state.session.pixels(state), np.array(corners, dtype=float))
+    _add(Stroke(runs=encode_runs(mask)), state)
 
 
-def mask_clear(session: Session, state: PhotoState) -> ActionOutcome:
+def mask_clear(state: PhotoState) -> None:
     """Remove the mask."""
-    return _record(replace(state.document.evidence, mask=None), state)
+    state.mark(mask=None)
 
 
-def vertical(session: Session, state: PhotoState, *, ends: tuple[Point2, Point2]) -> ActionOutcome:
+def _add(stroke: Stroke, state: PhotoState) -> None:
+    mask = state.document.evidence.mask or MaskDrawing()
+    state.mark(mask=replace(mask, strokes=(*mask.strokes, stroke)))
+
+
+def vertical(state: PhotoState, *, ends: tuple[Point2, Point2]) -> ActionOutcome | None:
     """Mark an edge of the scene that is vertical."""
-    first, second = ends
     for end in ends:
         state.require_inside(end)
-    if np.hypot(first[0] - second[0], first[1] - second[1]) < _LEAST_VERTICAL:
-        raise InputError(
-            "the edge is too short", where="ends", fix="mark both ends of a long vertical edge"
-        )
-    evidence = state.document.evidence
-    verticals = (*evidence.verticals, (first, second))
-    outcome = _record(replace(evidence, verticals=verticals), state)
-    message = ""
+    if np.hypot(*np.subtract(*ends)) < _LEAST_VERTICAL:
+        fix = "mark both ends of a long vertical edge"
+        raise InputError("the edge is too short", where="ends", fix=fix)
+    verticals = (*state.document.evidence.verticals, ends)
+    state.mark(verticals=verticals)
     if len(verticals) == 1:
-        message = "Mark another vertical edge, apart from the first."
-    elif find_up(verticals, state.camera) is None:
+        return ActionOutcome(message="Mark another vertical edge, apart from the first.")
+    if find_up(verticals, state.camera) is None:
         message = "These edges leave the vertical open: mark one farther away."
-    return replace(outcome, message=message)
+        return ActionOutcome(message=message)
+    return None
 
 
-def gravity_clear(session: Session, state: PhotoState) -> ActionOutcome:
+def gravity_clear(state: PhotoState) -> None:
     """Remove the vertical edges and the direction of gravity."""
-    evidence = replace(state.document.evidence, verticals=(), up=None, up_sigma_deg=None)
-    return _record(evidence, state)
+    state.mark(verticals=(), up=None, up_sigma_deg=None)
 
 
 def lengths(
-    session: Session,
     state: PhotoState,
     *,
     width: Finite | None = None,
     height: Finite | None = None,
     length: Finite | None = None,
     sigma: Finite | None = None,
-) -> ActionOutcome:
+) -> None:
     """Say which lengths are known along the model's x, y and z; ``sigma`` is relative."""
     given = MarkedLengths(width, height, length, () if sigma is None else (sigma,))
-    return _record(replace(state.document.evidence, lengths=given.checked()), state)
+    state.mark(lengths=given.checked())
 
 
-def use_photo(session: Session, state: PhotoState, *, on: bool) -> ActionOutcome:
+def use_photo(state: PhotoState, *, on: bool) -> ActionOutcome | None:
     """Choose whether the photos themselves count; the photo takes the place of its mask.
 
     What the mask alone has found is where the search in the photo begins.
     """
-    evidence = replace(state.document.evidence, photo=on)
+    evidence = state.document.evidence
     if not on or evidence.mask is None:
-        return _record(evidence, state)
-    live, _ = session.live(state)
+        state.mark(photo=on)
+        return None
+    live, _ = state.session.live(state)
+    start = evidence.start
     if live.result is not None and state.lead is None:
-        evidence = replace(evidence, start=ChosenStart.of(live.alignment))
-    outcome = _record(replace(evidence, mask=None), state)
-    return replace(outcome, message="The photo takes the place of the mask; undo brings it back.")
+        start = ChosenStart.of(live.alignment)
+    state.mark(photo=on, mask=None, start=start)
+    return ActionOutcome(message="The photo takes the place of the mask; undo brings it back.")
 
 
-def begin_at(
-    session: Session, state: PhotoState, *, candidate: Index | None = None
-) -> ActionOutcome:
+def begin_at(state: PhotoState, *, candidate: Index | None = None) -> None:
     """Begin at one of the alignments that the mask allows, 0 for the one shown; None for none."""
     if candidate is None:
-        return _record(replace(state.document.evidence, start=None), state)
-    live, _ = session.live(state)
+        state.mark(start=None)
+        return
+    live, _ = state.session.live(state)
     known = [] if live.result is None else candidates_of(live.result)
     if candidate >= len(known):
-        raise InputError(
-            f"there is no candidate {candidate}", where="candidate", fix="reload the page"
-        )
-    start = ChosenStart.of(known[candidate].alignment)
-    return _record(replace(state.document.evidence, start=start), state)
+        what = f"there is no candidate {candidate}"
+        raise InputError(what, where="candidate", fix="reload the page")
+    state.mark(start=ChosenStart.of(known[candidate][0]))
 
 
+OBJECT_ACTIONS = (
+    *(add_object, rename_object, delete_object, restore_object, add_view, remove_view, model),
+)
 EVIDENCE_ACTIONS = (
     *(focal, prior, mask_paint, mask_load, mask_cut, mask_clear, vertical, gravity_clear, lengths),
     *(use_photo, begin_at),
 )
-
-
-def _add(stroke: Stroke, state: PhotoState) -> ActionOutcome:
-    evidence = state.document.evidence
-    mask = evidence.mask or MaskDrawing()
-    drawn = replace(mask, strokes=(*mask.strokes, stroke))
-    return _record(replace(evidence, mask=drawn), state)
-
-
-def _record(evidence: MarkedEvidence, state: PhotoState) -> ActionOutcome:
-    state.record(replace(state.document, evidence=evidence))
-    return ActionOutcome()

@@ -9,11 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.annotate.document import AnnotationDocument, FocalChoice, FurtherView, Priors
+from cadalign.annotate.document import (
+    AnnotationDocument,
+    FurtherView,
+    History,
+    Priors,
+    history_path,
+    read_history,
+)
 from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
 from cadalign.annotate.files import AnnotationFiles, StoredView
-from cadalign.annotate.history import History, history_path, read_history
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.models import SAME_PLACE, Models, read_proposals
 from cadalign.annotate.names import (
@@ -28,6 +34,7 @@ from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.photos import (
+    FocalChoice,
     Intrinsics,
     PhotoFile,
     WorkList,
@@ -64,52 +71,33 @@ class SessionFiles:
 
 def find_session_files(options: SessionOptions) -> SessionFiles:
     """Find the photos and name the session's files; raises an error where files would collide."""
-    image, observation = options.image, options.observation
+    image, given = options.image, options.observation
     paths = find_photos(image)
     in_folder = image.is_dir()
-    if observation is not None and (in_folder or options.out is not None):
-        raise InputError(
-            "names the file of a single photo, but a folder is given too",
-            where="--observation",
-            fix="use --out for a folder of photos, and not both options",
-        )
-    if observation is not None and observation.name != file_name(
-        observation.stem, observation.suffix
-    ):
-        raise InputError(
-            "the name is too long for a file", where="--observation", fix="give a shorter one"
-        )
+    if given is not None and (in_folder or options.out is not None):
+        what = "names the file of a single photo, but a folder is given too"
+        fix = "use --out for a folder of photos, and not both options"
+        raise InputError(what, where="--observation", fix=fix)
+    if given is not None and given.name != file_name(given.stem, given.suffix):
+        what = "the name is too long for a file"
+        raise InputError(what, where="--observation", fix="give a shorter one")
     photos = _readable(paths) if in_folder else [PhotoFile.open(paths[0])]
     listed = {photo.path.resolve() for photo in photos}
     photos += [
         PhotoFile.open(path) for path in options.further_photos if path.resolve() not in listed
     ]
     photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
-    out = options.out or paths[0].parent
-    if observation is not None:
-        out = observation.parent
-    given = [] if observation is None else [observation]
-    found = (observation_file(photo.path, out) for photo in photos[len(given) :])
-    observations = (*given, *found)
+    out = options.out or paths[0].parent if given is None else given.parent
+    observations = [] if given is None else [given]
+    observations += [observation_file(photo.path, out) for photo in photos[len(observations) :]]
     keypoints = keypoints_file(options.model, out)
-    files = SessionFiles(tuple(photos), observations, keypoints)
-    refuse_collisions(files.written, _read_files(options, files))
+    files = SessionFiles(tuple(photos), tuple(observations), keypoints)
+    read = [options.model, options.camera, options.mask, options.detections, options.library]
+    read += [*options.models, *(photo.path for photo in photos)]
+    if options.keypoints != keypoints:
+        read.append(options.keypoints)
+    refuse_collisions(files.written, [path for path in read if path is not None])
     return files
-
-
-def _read_files(options: SessionOptions, files: SessionFiles) -> list[Path]:
-    """The files that a session reads and must not write."""
-    read = [
-        options.model,
-        options.camera,
-        options.mask,
-        options.detections,
-        options.library,
-        None if options.keypoints == files.keypoints else options.keypoints,
-        *options.models,
-        *(photo.path for photo in files.photos),
-    ]
-    return [path for path in read if path is not None]
 
 
 def open_session(
@@ -125,7 +113,7 @@ def open_session(
     prevent it by a CadalignError.
     """
     files = files or find_session_files(options)
-    folder = files.keypoints.parent
+    folder, first = files.keypoints.parent, files.photos[0]
     shape, choice = ObjectShape.open(options), ModelChoice.open(options)
     models = Models(
         [options.model, *options.models],
@@ -134,100 +122,90 @@ def open_session(
         shape=shape,
         choice=choice,
     )
-    first = files.photos[0]
     size = first.width, first.height
     camera = None if options.camera is None else read_camera(options.camera, size)
-    opener = _Opener(options, models, shape)
-    objects = [
-        opener.open_photo(photo, file, camera, is_first=photo is first)
-        for photo, file in zip(files.photos, files.observations, strict=True)
-    ]
+    session = Session(models, WorkList.open(folder), shape, choice, before_saving, reserve)
+    for photo, file in zip(files.photos, files.observations, strict=True):
+        session.objects.append(_open_photo(session, options, photo, file, camera, photo is first))
     if options.detections is not None:
         found = read_proposals(options.detections, files.photos, models[0].registry)
-        for states, proposals in zip(objects, found, strict=True):
-            states[0].proposals = proposals
-    for view in [view for states in objects for state in states for view in state.views]:
-        place = next((row for row in objects if row[0].key == view.key), None)
+        for state, proposals in zip(session.photos, found, strict=True):
+            state.proposals = proposals
+    if options.track:
+        session.track = FrameTrack.of(session.photos)
+    for view in [view for state in session.states for view in state.views]:
+        place = next((row for row in session.objects if row[0].key == view.key), None)
         if place is None:  # a photo that is nothing but a further view
             file = observation_file(view.photo.path, folder)
-            place = opener.open_photo(view.photo, file, None)
-            objects.append(place)
+            place = _open_photo(session, options, view.photo, file, None, False)
+            session.objects.append(place)
         place.append(view)
-    worklist = WorkList.open(folder)
-    track = (
-        FrameTrack.of([objects[k][0] for k in range(len(files.photos))]) if options.track else None
+    return session
+
+
+def _open_photo(
+    session: Session,
+    options: SessionOptions,
+    photo: PhotoFile,
+    file: Path,
+    camera: Camera | None,
+    is_first: bool,
+) -> list[PhotoState]:
+    """The objects of a photo, the first one first; options give evidence of the first photo."""
+    model = options.model
+    if options.library is not None and file.exists():  # another one may have been chosen
+        model = named_model(file) or model
+    if options.focal is not None or options.fov is not None:
+        camera = camera or Camera.without_focal(photo.width, photo.height)
+        camera = with_lens(camera, options.focal, fov=options.fov)
+    objects = [(file, model, is_first)]
+    for path in object_files(file, photo.path):
+        objects.append((path, named_model(path) or options.model, False))
+    return [_open_object(session, options, photo, camera, *each) for each in objects]
+
+
+def _open_object(
+    session: Session,
+    options: SessionOptions,
+    photo: PhotoFile,
+    camera: Camera | None,
+    file: Path,
+    mesh: Path,
+    is_first: bool,
+) -> PhotoState:
+    """An object in its first photo, and in its further ones; options add evidence of the first."""
+    model = session.models.of(mesh)
+    files = AnnotationFiles(file, photo.path, model.path)
+    stored = files.read(model, session.shape)
+    intrinsics, focal = _intrinsics(photo, stored.camera, camera)
+    priors = stored.priors_or(Priors(LIKELY_STRETCH, intrinsics.likely_focal))
+    if session.shape is not None:  # which has a prior of its own on the stretch
+        priors = replace(priors, stretch=None)
+    further = _with_options(stored.further, options) if is_first else stored.further
+    further = replace(further, up_axis=options.up_axis or further.up_axis)
+    evidence = MarkedEvidence.of(further)
+    document = replace(stored.document, focal=focal, priors=priors, evidence=evidence)
+    state = PhotoState(session, photo, files, intrinsics, History(document), model, further)
+    for each in stored.views:
+        document = _with_view(state, document, each)
+
+    def is_same(drawn: MarkedEvidence, view: str | None) -> bool:
+        return _is_same(drawn, next((each for each in state.views if each.key == view), state))
+
+    # Of several photos the views' documents are compared as the object's holds them.
+    own_states = (state, *state.views)
+    for each_state in own_states:
+        each_state.history = History(document)
+    history = read_history(
+        history_path(files.observation),
+        document,
+        model.registry,
+        tolerance=SAME_PLACE * model.cad.diagonal,
+        same_evidence=is_same,
     )
-    return Session(
-        models, objects, before_saving, worklist, shape, choice, reserve=reserve, track=track
-    )
-
-
-class _Opener:
-    """Opens the objects of photos with a session's options."""
-
-    def __init__(self, options: SessionOptions, models: Models, shape: ObjectShape | None) -> None:
-        self._options = options
-        self._models = models
-        self._shape = shape
-
-    def open_photo(
-        self, photo: PhotoFile, file: Path, camera: Camera | None, *, is_first: bool = False
-    ) -> list[PhotoState]:
-        """The objects of a photo, the first one first; options give evidence of the first photo."""
-        options, model = self._options, self._options.model
-        if options.library is not None and file.exists():  # another one may have been chosen
-            model = named_model(file) or model
-        files = AnnotationFiles(file, photo.path, self._models.of(model).path)
-        if options.focal is not None or options.fov is not None:
-            camera = camera or Camera.without_focal(photo.width, photo.height)
-            camera = with_lens(camera, options.focal, fov=options.fov)
-        states = [self._open_object(files, photo, camera, options if is_first else None)]
-        for path in object_files(file, photo.path):
-            model = self._models.of(named_model(path) or options.model).path
-            files = AnnotationFiles(path, photo.path, model)
-            states.append(self._open_object(files, photo, camera))
-        return states
-
-    def _open_object(
-        self,
-        files: AnnotationFiles,
-        photo: PhotoFile,
-        camera: Camera | None,
-        options: SessionOptions | None = None,
-    ) -> PhotoState:
-        """An object in its first photo, and in its further ones; options add evidence."""
-        model = self._models.of(files.model)
-        stored = files.read(model, self._shape)
-        intrinsics, focal = _intrinsics(photo, stored.camera, camera)
-        likely = Priors(LIKELY_STRETCH, intrinsics.likely_focal)
-        priors = stored.priors_or(likely)
-        if self._shape is not None:  # which has a prior of its own on the stretch
-            priors = replace(priors, stretch=None)
-        further = stored.further if options is None else _with_options(stored.further, options)
-        further = replace(further, up_axis=self._options.up_axis or further.up_axis)
-        evidence = MarkedEvidence.of(further)
-        document = replace(stored.document, focal=focal, priors=priors, evidence=evidence)
-        state = PhotoState(photo, files, intrinsics, History(document), model, further)
-        for each in stored.views:
-            document = _with_view(state, document, each)
-
-        def is_same(drawn: MarkedEvidence, view: str | None) -> bool:
-            return _is_same(drawn, next((each for each in state.views if each.key == view), state))
-
-        # Of several photos the views' documents are compared as the object's holds them.
-        state.history = History(document)
-        for view in state.views:
-            view.history = state.history
-        history = read_history(
-            history_path(files.observation),
-            document,
-            model.registry,
-            tolerance=SAME_PLACE * model.cad.diagonal,
-            same_evidence=is_same,
-        )
-        for each_state in (state, *state.views):
-            each_state.history = history
-        return state
+    for each_state in own_states:
+        each_state.history = history
+    return state
 
 
 def _with_options(further: FurtherEvidence, options: SessionOptions) -> FurtherEvidence:
@@ -236,18 +214,15 @@ def _with_options(further: FurtherEvidence, options: SessionOptions) -> FurtherE
     if mask is None and size is None:
         return further
     if options.image.is_dir():
-        raise InputError(
-            "is of a single photo, but a folder is given",
-            where="--size" if mask is None else "--mask",
-            fix="give one photo",
-        )
+        where = "--size" if mask is None else "--mask"
+        what = "is of a single photo, but a folder is given"
+        raise InputError(what, where=where, fix="give one photo")
     if mask is not None:
         image = replace(further.image, mask=mask.resolve(), mask_sigma=None)
         further = replace(further, image=image)
-    if size is not None:
-        given = convert(size, SizeFields, where="--size")
-        further = replace(further, size=read_size(given))
-    return further
+    if size is None:
+        return further
+    return replace(further, size=read_size(convert(size, SizeFields, where="--size")))
 
 
 def _readable(paths: list[Path]) -> list[PhotoFile]:

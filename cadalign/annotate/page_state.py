@@ -10,17 +10,15 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import MIRRORED
-from cadalign.annotate.estimate import LIKELY_STRETCH
-from cadalign.annotate.evidence import MarkedLengths, MaskDrawing, find_up
-from cadalign.annotate.live import LiveAlignment, box_of, candidates_of, drawing_of, flat
-from cadalign.annotate.masks import draw_mask
-from cadalign.annotate.objects import PhotoState, label_of, shown_objects
+from cadalign.annotate.estimate import LIKELY_STRETCH, LiveAlignment
+from cadalign.annotate.evidence import MarkedLengths, find_up
+from cadalign.annotate.live import box_of, candidates_of, drawing_of, flat
+from cadalign.annotate.object_actions import ActionOutcome
+from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.result_text import facts_of, name_of, next_best_text, notes_of
-from cadalign.annotate.session import ActionOutcome, Session
-from cadalign.annotate.suggestion import Suggestion
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
-from cadalign.io.documents import Point3, read_json
+from cadalign.io.documents import read_json
 from cadalign.io.evidence import LENGTHS
 
 _VIEW = re.compile(r"views\[(\d+)\]")
@@ -36,11 +34,15 @@ def page_state(
     outcome = outcome or ActionOutcome()
     with session.lock:
         state = outcome.shown or session.photo_state(number, slot)
-        number, slot = session.place_of(state)
+        number, slot = state.place
         live, suggestion = session.live(state)
-        focal = state.document.focal
+        document, registry, cad = state.document, state.model.registry, state.model.cad
+        history, used = state.history, document.keypoints
+        deleted = session.last_deleted(number)
+        photos = [_view(view) | {"is_current": view is state} for view in state.all_views]
+        taken = {photo["number"] for photo in photos}
         return {
-            "revision": state.history.revision,
+            "revision": history.revision,
             "image": {
                 "number": number,
                 "object": slot,
@@ -61,29 +63,86 @@ def page_state(
             },
             "selected": outcome.selected,
             "message": outcome.message or _moved(state),
-            "can_undo": bool(state.history.before)
-            or session.deletions.last(number, at_once=True) is not None,
-            "can_redo": bool(state.history.after),
+            "can_undo": bool(history.before)
+            or session.last_deleted(number, at_once=True) is not None,
+            "can_redo": bool(history.after),
             "focal": {
-                "known": focal.known,
+                "known": document.focal.known,
                 "pixels": round(state.camera.fx, 2),
-                "typed": focal.pixels,
+                "typed": document.focal.pixels,
                 "note": state.intrinsics.note,
             },
-            "evidence": _evidence(session, state),
-            "priors": _priors(session, state),
-            "pairs": _pairs(session, state, live),
-            "keypoints": _keypoints(state),
-            "proposals": _proposals(session, state),
-            "shape": _shape(session, state),
-            "alignment": _alignment(session, state, live),
-            "by_mask": _candidates(session, state, live),
-            "suggestion": _suggestion(state, suggestion),
-            **_objects(session, state),
+            "evidence": _evidence(state),
+            "priors": _priors(state),
+            "pairs": _pairs(state, live),
+            "keypoints": [
+                {
+                    "keypoint": keypoint,
+                    "name": point.name,
+                    "xyz": cad.to_display(point.xyz).tolist(),
+                    "used": keypoint in used,
+                }
+                for keypoint, point in registry
+            ],
+            "proposals": [
+                {**asdict(proposal), "name": registry[proposal.keypoint].name}
+                for proposal in session.proposals(state)
+                if proposal.keypoint not in used
+            ],
+            "shape": _shape(state),
+            "alignment": _alignment(state, live),
+            "by_mask": _candidates(state, live),
+            "suggestion": None
+            if suggestion is None
+            else {
+                "keypoint": suggestion.point.semantic_id,
+                "xyz": cad.to_display(suggestion.point.xyz).tolist(),
+                "uv": suggestion.uv,
+                "text": next_best_text(suggestion.next_best, name_of(suggestion)),
+            },
+            "objects": [
+                _object(each) | {"is_current": each is state}
+                for each in shown_objects(session.objects[number])
+            ],
+            "views": photos,
+            "further_photos": [
+                {"number": other, "name": states[0].photo.path.name}
+                for other, states in enumerate(session.objects)
+                if other not in taken
+            ],
+            "models": list(session.models.labels),
+            "deleted": None if deleted is None else deleted.label,
         }
 
 
-def _evidence(session: Session, state: PhotoState) -> dict[str, Any]:
+def worklist_state(session: Session) -> list[dict[str, Any]]:
+    """All photos with their state, objects, number of pairs, and residual.
+
+    The residual is the root mean square of the object whose pairs agree worst [px].
+    """
+    found = []
+    with session.lock:
+        for number, states in enumerate(session.objects):
+            shown = shown_objects(states)
+            pairs = [len(each.document.complete_pairs) for each in shown]
+            residuals = [_rms(each) for each in shown]
+            found.append(
+                {
+                    "number": number,
+                    "name": shown[0].photo.path.name,
+                    "state": session.work_state(shown[0]),
+                    "pairs": sum(pairs),
+                    "rms": max((rms for rms in residuals if rms is not None), default=None),
+                    "objects": [
+                        {"label": each.label, "pairs": count, "rms": rms}
+                        for each, count, rms in zip(shown, pairs, residuals, strict=True)
+                    ],
+                }
+            )
+    return found
+
+
+def _evidence(state: PhotoState) -> dict[str, Any]:
     """Marks beside the pairs; ``mask`` changes with the mask, None without one."""
     evidence = state.document.evidence
     found = find_up(evidence.verticals, state.camera)
@@ -100,50 +159,48 @@ def _evidence(session: Session, state: PhotoState) -> dict[str, Any]:
     }
 
 
-def _candidates(session: Session, state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
-    """Alignments that a mask alone allows, as lines x1, y1, x2, y2, ... [px], while no pair tells.
-
-    ``chosen`` says that the user has decided for one.
-    """
-    result, lines = live.result, live.wireframe
-    chosen = session.observer.begins(state) if state.lead is None else False
-    if result is None or lines is None or chosen or state.document.complete_pairs:
-        return {"chosen": chosen, "candidates": []}
-    found = candidates_of(result)
-    return {
-        "chosen": chosen,
-        "candidates": [
-            {
-                "lines": flat(lines.seen_in(live.camera, each.alignment)),
-                "likelihood": each.likelihood,
-            }
-            for each in (found if len(found) > 1 else [])
-        ],
-    }
-
-
-def mask_pixels(session: Session, number: int, *, slot: int | None = None) -> BoolArray:
-    """The mask of an object in a photo, (h, w); empty without one."""
-    with session.lock:
-        state = session.photo_state(number, slot)
-        drawing = state.document.evidence.mask or MaskDrawing()
-    return draw_mask(drawing, state.photo.width, state.photo.height)
-
-
-def _priors(session: Session, state: PhotoState) -> dict[str, Any]:
+def _priors(state: PhotoState) -> dict[str, Any]:
     """Priors on the stretch [%] and on the focal length: chosen ones and likely ones."""
     priors = state.document.priors
     likely = priors.focal or state.intrinsics.likely_focal
     source = "EXIF" if likely == state.intrinsics.prior else "usual lenses"
-    is_estimated = state.lead is None and session.estimates_focal(state)
     return {
         "stretch": None if priors.stretch is None else round(100 * priors.stretch, 4),
         "likely": 100 * LIKELY_STRETCH,
         "focal": priors.focal is not None,
         "about": f"{likely.focal:.0f} px ± {100 * likely.relative_sigma:.0f} % ({source})",
-        "has_stretch": session.shape is None,
-        "has_focal": is_estimated,
+        "has_stretch": state.session.shape is None,
+        "has_focal": state.lead is None and state.estimates_focal,
     }
+
+
+def _shape(state: PhotoState) -> dict[str, Any] | None:
+    """The object's shape, and its keypoints that the model lacks."""
+    shape = state.session.shape
+    if shape is None:
+        return None
+    known = {shape.id_of(point) for _, point in state.model.registry}
+    return {
+        "category": None if shape.learned is None else shape.learned.category,
+        "missing": [label for label in shape.ids if label not in known],
+    }
+
+
+def _candidates(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
+    """Alignments that a mask alone allows, as lines x1, y1, x2, y2, ... [px], while no pair tells.
+
+    ``chosen`` says that the user has decided for one.
+    """
+    result, lines = live.result, live.wireframe
+    chosen = state.lead is None and state.begins
+    found = [] if result is None else candidates_of(result)
+    if lines is None or chosen or state.document.complete_pairs or len(found) < 2:
+        return {"chosen": chosen, "candidates": []}
+    candidates = [
+        {"lines": flat(lines.seen_in(live.camera, alignment)), "likelihood": likelihood}
+        for alignment, likelihood in found
+    ]
+    return {"chosen": chosen, "candidates": candidates}
 
 
 def _moved(state: PhotoState) -> str:
@@ -158,27 +215,35 @@ def _moved(state: PhotoState) -> str:
     )
 
 
-def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
-    pairs, row = [], 0
-    document = state.document
-    used = state.model.registry.xyz(document.keypoints)
+def _pairs(state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
+    """The pairs with their residuals and, of pairs with one half, the other one's likely place."""
+    session, opened, document = state.session, state.model, state.document
+    cad, pairs, row = opened.cad, [], 0
+    used = opened.registry.xyz(document.keypoints)
     for pair in document.pairs:
-        point = None if pair.keypoint is None else state.model.registry[pair.keypoint]
         entry: dict[str, Any] = {
             "pair": pair.number,
             "position": pair.number,
             "uv": pair.uv,
             "keypoint": pair.keypoint,
-            "name": "" if point is None else point.name,
-            "xyz": None if point is None else state.model.cad.to_display(point.xyz).tolist(),
-            "mirrored": None
-            if pair.keypoint is None
-            else _mirrored(session, state, pair.keypoint, used),
-            "expected": None if point is None or pair.uv else _expected(session, live, point.xyz),
-            "residual": None,
-            "off": None,
-            "counts": point is None or session.shape is None or session.shape.knows(point),
+            "name": "",
+            **dict.fromkeys(("xyz", "mirrored", "expected", "residual", "off")),
+            "counts": True,
         }
+        if pair.keypoint is not None:
+            point = opened.registry[pair.keypoint]
+            image = opened.mirrored(pair.keypoint) if session.ready else None
+            if image is not None:
+                gaps = np.linalg.norm(used - image.xyz, axis=1)
+                if gaps.min() > MIRRORED * cad.diagonal:  # or there is a pair already
+                    entry["mirrored"] = cad.to_display(image.xyz).tolist()
+            in_camera = np.array([point.xyz])
+            if not pair.uv and session.shape is None and live.result is not None:
+                in_camera = live.alignment.apply(in_camera)
+                if in_camera[0, 2] > 0:
+                    entry["expected"] = live.camera.project(in_camera)[0].tolist()
+            entry["name"], entry["xyz"] = point.name, cad.to_display(point.xyz).tolist()
+            entry["counts"] = session.shape is None or session.shape.knows(point)
         if pair.complete:
             if live.result is not None:
                 residual = live.residuals[row]
@@ -189,72 +254,12 @@ def _pairs(session: Session, state: PhotoState, live: LiveAlignment) -> list[dic
     return pairs
 
 
-def _mirrored(
-    session: Session, state: PhotoState, keypoint: int, used: FloatArray
-) -> list[float] | None:
-    """The mirror image of a model point, unless there is a pair already."""
-    point = state.model.mirrored(keypoint) if session.ready else None
-    if point is None:
-        return None
-    gaps = np.linalg.norm(used - point.xyz, axis=1)
-    if gaps.min() <= MIRRORED * state.model.cad.diagonal:
-        return None
-    return [float(value) for value in state.model.cad.to_display(point.xyz)]
-
-
-def _expected(session: Session, live: LiveAlignment, xyz: Point3) -> list[float] | None:
-    """Pixel at which the alignment of the stretched model puts a point in the photo."""
-    if session.shape is not None or live.result is None:
-        return None
-    in_camera = live.alignment.apply(np.array([xyz]))
-    if not in_camera[0, 2] > 0:
-        return None
-    ((u, v),) = live.camera.project(in_camera).tolist()
-    return [u, v]
-
-
-def _keypoints(state: PhotoState) -> list[dict[str, Any]]:
-    used = state.document.keypoints
-    return [
-        {
-            "keypoint": number,
-            "name": point.name,
-            "xyz": state.model.cad.to_display(point.xyz).tolist(),
-            "used": number in used,
-        }
-        for number, point in state.model.registry
-    ]
-
-
-def _proposals(session: Session, state: PhotoState) -> list[dict[str, Any]]:
-    """Proposals of a detector or of other frames for keypoints that are not used yet."""
-    used = state.document.keypoints
-    return [
-        {**asdict(proposal), "name": state.model.registry[proposal.keypoint].name}
-        for proposal in session.proposals(state)
-        if proposal.keypoint not in used
-    ]
-
-
-def _shape(session: Session, state: PhotoState) -> dict[str, Any] | None:
-    """The object's shape, and its keypoints that the model lacks."""
-    shape = session.shape
-    if shape is None:
-        return None
-    known = {shape.id_of(point) for _, point in state.model.registry}
-    return {
-        "category": None if shape.learned is None else shape.learned.category,
-        "missing": [label for label in shape.ids if label not in known],
-    }
-
-
-def _alignment(session: Session, state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
-    result, cad = live.result, state.model.cad
+def _alignment(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
+    result, cad, session = live.result, state.model.cad, state.session
     if result is None:
-        message = _with_photo_names(session, state, live.message)
+        message = _with_photo_names(state, live.message)
         return {"status": "none" if session.ready else "preparing", "message": message}
     camera, alignment = live.camera, live.alignment
-    notes = notes_of(live, session.shape)
     # The rows of the matrix (4, 4) that places the displayed model; a warped one has none.
     matrix = np.eye(4)
     linear = alignment.rotation * alignment.scale
@@ -264,7 +269,7 @@ def _alignment(session: Session, state: PhotoState, live: LiveAlignment) -> dict
         "status": "done",
         "message": "",
         "facts": [asdict(fact) for fact in facts_of(live, session.shape)],
-        "notes": [_with_photo_names(session, state, note) for note in notes],
+        "notes": [_with_photo_names(state, note) for note in notes_of(live, session.shape)],
         "also_used": ", ".join(live.also_used),
         "alignment": alignment.to_dict(),
         "eye": cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
@@ -276,45 +281,11 @@ def _alignment(session: Session, state: PhotoState, live: LiveAlignment) -> dict
     }
 
 
-def _suggestion(state: PhotoState, suggestion: Suggestion | None) -> dict[str, Any] | None:
-    if suggestion is None:
-        return None
-    point = suggestion.point
-    return {
-        "keypoint": point.semantic_id,
-        "xyz": state.model.cad.to_display(point.xyz).tolist(),
-        "uv": suggestion.uv,
-        "text": next_best_text(suggestion.next_best, name_of(suggestion)),
-    }
-
-
-def _objects(session: Session, state: PhotoState) -> dict[str, Any]:
-    """The photo's objects with their boxes, this object's photos, and what could be added."""
-    number, _ = session.place_of(state)
-    deleted = session.deletions.last(number)
-    photos = [_view(session, view) | {"is_current": view is state} for view in state.all_views]
-    used = {photo["number"] for photo in photos}
-    return {
-        "objects": [
-            _object(session, each) | {"is_current": each is state}
-            for each in shown_objects(session.objects[number])
-        ],
-        "views": photos,
-        "further_photos": [
-            {"number": other, "name": states[0].photo.path.name}
-            for other, states in enumerate(session.objects)
-            if other not in used
-        ],
-        "models": list(session.models.labels),
-        "deleted": None if deleted is None else label_of(deleted),
-    }
-
-
-def _with_photo_names(session: Session, state: PhotoState, text: str) -> str:
+def _with_photo_names(state: PhotoState, text: str) -> str:
     """A text of the estimate with the photos' names for the views' numbers."""
     if not _VIEW.search(text):
         return text
-    images = [view.image for view in session.observed(state)[0].views]
+    images = [view.image for view in state.observation().views]
 
     def name(found: re.Match[str]) -> str:
         image = images[int(found[1])]
@@ -323,54 +294,29 @@ def _with_photo_names(session: Session, state: PhotoState, text: str) -> str:
     return _VIEW.sub(name, text)
 
 
-def _object(session: Session, state: PhotoState) -> dict[str, Any]:
+def _object(state: PhotoState) -> dict[str, Any]:
     """One object of the photo; its box as x1, y1, x2, y2, ... [px]."""
-    live, _ = session.live(state)
-    _, slot = session.place_of(state)
+    models = state.session.models
+    live, _ = state.session.live(state)
     return {
-        "object": slot,
-        "label": label_of(state),
+        "object": state.place[1],
+        "label": state.label,
         "name": state.document.name,
-        "model": session.models.labels[session.models.number_of(state.model.path)],
+        "model": models.labels[models.number_of(state.model.path)],
         "pairs": len(state.document.complete_pairs),
         "box": box_of(live),
     }
 
 
-def _view(session: Session, state: PhotoState) -> dict[str, Any]:
+def _view(state: PhotoState) -> dict[str, Any]:
     """One photo of the object."""
-    number, slot = session.place_of(state)
+    number, slot = state.place
     return {
         "number": number,
         "object": slot,
         "name": state.photo.path.name,
         "pairs": len(state.document.complete_pairs),
         "is_first": state.lead is None,
-    }
-
-
-def worklist_state(session: Session) -> list[dict[str, Any]]:
-    """All photos with their state, objects, number of pairs, and residual.
-
-    The residual is the root mean square of the object whose pairs agree worst [px].
-    """
-    with session.lock:
-        return [_photo(session, number) for number in range(len(session.objects))]
-
-
-def _photo(session: Session, number: int) -> dict[str, Any]:
-    objects = shown_objects(session.objects[number])
-    found = [rms for rms in map(_rms, objects) if rms is not None]
-    return {
-        "number": number,
-        "name": objects[0].photo.path.name,
-        "state": session.work_state(objects[0]),
-        "pairs": sum(len(each.document.complete_pairs) for each in objects),
-        "rms": max(found, default=None),
-        "objects": [
-            {"label": label_of(each), "pairs": len(each.document.complete_pairs), "rms": _rms(each)}
-            for each in objects
-        ],
     }
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 from PIL import ImageOps
 
-from cadalign.annotate.document import FocalChoice
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.focal import FocalPrior
@@ -112,6 +111,14 @@ def _is_mask(path: Path, stems: Collection[str]) -> bool:
         return False
     # The mask of a further object or view has more between the photo's name and the ending.
     return any(stem == photo or stem.startswith(f"{photo}.") for photo in stems)
+
+
+@dataclass(frozen=True)
+class FocalChoice:
+    """The user's choice of a known focal length, or of one estimated from the pairs."""
+
+    known: bool
+    pixels: float | None = None  # as typed [px]; None for the camera's
 
 
 @dataclass(frozen=True)

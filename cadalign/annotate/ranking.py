@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.objects import PhotoState, filled
+from cadalign.annotate.objects import filled
 from cadalign.annotate.result_text import evidence_text, how_text, left_text, name_of
 from cadalign.annotate.session import Session
 from cadalign.annotate.suggestion import Marked, present, rank
-from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
-from cadalign.geometry.camera import Camera
-from cadalign.retrieval.match import Match
 from cadalign.retrieval.page import score_text
 
 _LEAST_PAIRS = 4
@@ -62,15 +57,6 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
     return answer | {"now": "" if now is None else left_text(now), "pieces": pieces}
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """The pairs that the library knows: (n, 2) [px], n semantic ids, (n,) [px]."""
-
-    points_2d: FloatArray
-    ids: list[int]
-    sigma: FloatArray | float
-
-
 def ranking_state(session: Session, number: int, *, slot: int | None = None) -> dict[str, Any]:
     """Rank the models by the pairs of an object, as `cadalign retrieve` ranks them by its file.
 
@@ -78,83 +64,59 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
     alignment's, else a likely one, is taken.
     """
     with session.lock:
-        state = session.photo_state(number, slot)
-        choice = session.choice
+        state, choice = session.photo_state(number, slot), session.choice
         revision = state.history.revision
         answer: dict[str, Any] = {"revision": revision, "note": "", "none": None, "models": []}
         if choice is None:
             return answer | {"note": "The session has no library: start it with --library."}
-        marked = _marked(state, choice)
-        others = len(state.document.complete_pairs) - len(marked.ids)
-        missing = _LEAST_PAIRS - len(marked.ids)
-        if missing > 0:
-            return answer | {"note": _too_few(missing, others)}
-        camera = _camera(session, state)
+        known, complete = choice.ids_on(state.files.model), state.document.complete_pairs
+        pairs = [pair for pair in complete if pair.keypoint in known]
+        others = len(complete) - len(pairs)
+        if len(pairs) < _LEAST_PAIRS:
+            note = (
+                f"Mark {_LEAST_PAIRS - len(pairs)} more of the named keypoints, which all models "
+                "of the library share: the rings on the model, also listed under Next keypoint."
+            )
+            counted = f" {others} pairs of other points don't count." if others else ""
+            return answer | {"note": note + counted}
+        camera, is_known = state.camera, state.document.focal.known
+        live, _ = session.live(state)
+        if not is_known and live.result is not None:
+            camera = live.camera
         current = choice.key_of(state.files.model)
-        known = state.document.focal.known
+    sigma = filled(pair.sigma for pair in pairs)
     # Without the lock, for which the next click would wait.
     try:
         matches = choice.library.retrieve(
-            marked.points_2d,
-            marked.ids,
+            np.array([pair.uv for pair in pairs], dtype=float),
+            [pair.keypoint for pair in pairs if pair.keypoint is not None],
             camera,
-            sigma=marked.sigma,
+            sigma=1.0 if sigma is None else sigma,
             category=choice.category,
         )
     except CadalignError as error:
         return answer | {"note": str(error)}
-    note = f"Ranked by {len(marked.ids)} pairs of named keypoints."
+    note = f"Ranked by {len(pairs)} pairs of named keypoints."
     if others:
         note += f" {others} of other points don't count."
-    if not known:
+    if not is_known:
         note += f" The focal length is taken as {camera.fx:.0f} px."
     absent = matches[0].none_probability if matches else None
-    return answer | {
-        "note": note,
-        "none": None if absent is None else score_text(absent),
-        "models": [_entry(match, choice, current) for match in matches],
-    }
-
-
-def _marked(state: PhotoState, choice: ModelChoice) -> _Known:
-    known = choice.ids_on(state.files.model)
-    pairs = [pair for pair in state.document.complete_pairs if pair.keypoint in known]
-    sigma = filled(pair.sigma for pair in pairs)
-    return _Known(
-        np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
-        [pair.keypoint for pair in pairs if pair.keypoint is not None],
-        1.0 if sigma is None else sigma,
-    )
-
-
-def _camera(session: Session, state: PhotoState) -> Camera:
-    """The calibrated camera, else the alignment's, else a likely one."""
-    if state.document.focal.known:
-        return state.camera
-    live, _ = session.live(state)
-    return state.camera if live.result is None else live.camera
-
-
-def _too_few(missing: int, others: int) -> str:
-    text = (
-        f"Mark {missing} more of the named keypoints, which all models of the library share: the "
-        "rings on the model, also listed under Next keypoint."
-    )
-    return text + (f" {others} pairs of other points don't count." if others else "")
-
-
-def _entry(match: Match, choice: ModelChoice, current: tuple[str, str] | None) -> dict[str, Any]:
-    key = (match.category, match.model_id)
-    return {
-        "number": choice.keys.index(key),
-        "category": match.category,
-        "model": match.model_id,
-        "probability": score_text(match.score),
-        "score": match.score,
-        "rms": match.rms,
-        "shared": match.shared,
-        "marked": match.shared + len(match.missing_ids),
-        "stretch": match.alignment.scale.tolist(),
-        "has_mesh": match.mesh_path is not None,
-        "current": key == current,
-    }
+    models = [
+        {
+            "number": choice.keys.index((match.category, match.model_id)),
+            "category": match.category,
+            "model": match.model_id,
+            "probability": score_text(match.score),
+            "score": match.score,
+            "rms": match.rms,
+            "shared": match.shared,
+            "marked": match.shared + len(match.missing_ids),
+            "stretch": match.alignment.scale.tolist(),
+            "has_mesh": match.mesh_path is not None,
+            "current": (match.category, match.model_id) == current,
+        }
+        for match in matches
+    ]
+    none = None if absent is None else score_text(absent)
+    return answer | {"note": note, "none": none, "models": models}

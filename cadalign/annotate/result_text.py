@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.annotate.live import LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.suggestion import NextBest, Suggestion, Unmarked
 from cadalign.estimation.uncertainty.advice import LENGTH_SIGMA, TURN_DEG, Advice

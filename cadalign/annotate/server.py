@@ -6,6 +6,7 @@ import io
 import json
 import secrets
 import socket
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 from urllib.parse import quote
@@ -27,7 +28,7 @@ from cadalign.annotate.library import thumbnail_of
 from cadalign.annotate.locks import Claims
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
-from cadalign.annotate.page_state import mask_pixels, page_state, worklist_state
+from cadalign.annotate.page_state import page_state, worklist_state
 from cadalign.annotate.ranking import advice_state, ranking_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, InputError
@@ -39,29 +40,38 @@ _BYTES = "application/octet-stream"
 _BROWSER = "cadalign-browser"  # cookie that identifies the browser, for all of its tabs
 
 
+_OF_OBJECT = {"state": page_state, "advice": advice_state, "models": ranking_state}
+"""Plain data of one object of a photo, by the address."""
+
+
 def make_app(session: Session, access: Access) -> ASGIApp:
     """Make the guarded application."""
     routes = _Routes(session, access)
+    data = {
+        f"/{name}/{{number:int}}": partial(routes.data, answer)
+        for name, answer in _OF_OBJECT.items()
+    }
+    answers: dict[str, Callable[[Request], Response]] = {
+        "/": routes.page,
+        "/annotate.js": partial(_asset, "annotate.js", "text/javascript"),
+        "/annotate.css": partial(_asset, "annotate.css", "text/css"),
+        "/model": routes.model,
+        "/details": routes.details,
+        "/photo/{number:int}": routes.photo,
+        "/worklist": routes.worklist,
+        "/thumbnail/{number:int}": routes.thumbnail,
+        "/export/coco.json": routes.coco,
+        "/export/{number:int}.glb": routes.glb,
+        "/export/{form:str}.zip": routes.photo_set,
+        "/mask/{number:int}": routes.mask,
+        "/claim/{number:int}": routes.claim,
+        "/library/{number:int}.jpg": routes.library,
+        **data,
+    }
     app = Starlette(
         routes=[
-            Route("/", routes.page),
-            Route("/annotate.js", partial(_send, "annotate.js", "text/javascript")),
-            Route("/annotate.css", partial(_send, "annotate.css", "text/css")),
-            Route("/model", routes.model),
-            Route("/details", routes.details),
-            Route("/photo/{number:int}", routes.photo),
-            Route("/worklist", routes.worklist),
-            Route("/thumbnail/{number:int}", routes.thumbnail),
-            Route("/export/coco.json", routes.coco),
-            Route("/export/{number:int}.glb", routes.glb),
-            Route("/export/{form:str}.zip", routes.photo_set),
-            Route("/mask/{number:int}", routes.mask),
-            Route("/state/{number:int}", routes.state),
-            Route("/claim/{number:int}", routes.claim),
-            Route("/advice/{number:int}", routes.advice),
+            *(Route(path, answer) for path, answer in answers.items()),
             Route("/act/{number:int}", routes.act, methods=["POST"]),
-            Route("/models/{number:int}", routes.models),
-            Route("/library/{number:int}.jpg", routes.library),
         ],
         exception_handlers={CadalignError: _refused},
     )
@@ -121,12 +131,11 @@ class _Routes:
 
     def page(self, request: Request) -> Response:
         response = Response(asset("annotate.html"), media_type="text/html")
-        response.set_cookie(
-            self._access.cookie, self._access.token, httponly=True, samesite="strict"
-        )
+        cookies = {self._access.cookie: self._access.token}
         if _BROWSER not in request.cookies:
-            browser = secrets.token_urlsafe(12)
-            response.set_cookie(_BROWSER, browser, httponly=True, samesite="strict")
+            cookies[_BROWSER] = secrets.token_urlsafe(12)
+        for name, value in cookies.items():
+            response.set_cookie(name, value, httponly=True, samesite="strict")
         return response
 
     def model(self, request: Request) -> Response:
@@ -157,25 +166,25 @@ class _Routes:
         return _kept(thumbnail_of(choice, request.path_params["number"]))
 
     def coco(self, request: Request) -> Response:
-        return JSONResponse(coco_of(self._session), headers=_as_file("keypoints.coco.json"))
+        data = json.dumps(coco_of(self._session)).encode()
+        return _as_file("keypoints.coco.json", data, "application/json")
 
     def glb(self, request: Request) -> Response:
         number, slot = _place(request)
         data = glb_of(self._session, number, slot=slot)
         name = self._session.photo_state(number, slot).files.observation.with_suffix(".glb").name
-        return Response(data, media_type="model/gltf-binary", headers=_as_file(name))
+        return _as_file(name, data, "model/gltf-binary")
 
     def photo_set(self, request: Request) -> Response:
         form = request.path_params["form"]
-        data = zipped_photo_set(self._session, form)
-        return Response(data, media_type="application/zip", headers=_as_file(f"{form}.zip"))
+        return _as_file(f"{form}.zip", zipped_photo_set(self._session, form), "application/zip")
 
     def mask(self, request: Request) -> Response:
-        number, slot = _place(request)
-        mask = np.where(mask_pixels(self._session, number, slot=slot), 255, 0).astype(np.uint8)
+        mask = self._session.photo_state(*_place(request)).mask
         # Its opacity is what the page draws, in a colour of its own.
+        opacity = np.where(mask, 255, 0).astype(np.uint8)
         data = io.BytesIO()
-        Image.fromarray(np.stack([np.zeros_like(mask), mask], axis=2), "LA").save(data, "PNG")
+        Image.fromarray(np.stack([np.zeros_like(opacity), opacity], axis=2), "LA").save(data, "PNG")
         return Response(data.getvalue(), media_type="image/png")
 
     def claim(self, request: Request) -> Response:
@@ -185,29 +194,22 @@ class _Routes:
         elsewhere = self._claims.is_elsewhere(number, request.cookies.get(_BROWSER, ""))
         return JSONResponse({"revision": state.history.revision, "elsewhere": elsewhere})
 
-    def advice(self, request: Request) -> Response:
+    def data(self, answer: Callable[..., dict[str, Any]], request: Request) -> Response:
+        """What one of `_OF_OBJECT` says of an object."""
         number, slot = _place(request)
-        return JSONResponse(advice_state(self._session, number, slot=slot))
-
-    def models(self, request: Request) -> Response:
-        number, slot = _place(request)
-        return JSONResponse(ranking_state(self._session, number, slot=slot))
-
-    def state(self, request: Request) -> Response:
-        number, slot = _place(request)
-        return _as_json(page_state(self._session, number, slot=slot))
+        return JSONResponse(answer(self._session, number, slot=slot))
 
     async def act(self, request: Request) -> Response:
+        """Do an action of the page; answers with the state after it."""
+        fix = "send an action as JSON"
         if request.headers.get("content-type", "").partition(";")[0] != "application/json":
-            raise InputError(
-                "not application/json", where="content-type", fix="send an action as JSON"
-            )
+            raise InputError("not application/json", where="content-type", fix=fix)
         try:
             action = json.loads(await request.body())
         except (ValueError, RecursionError):
-            raise InputError("not JSON", where="body", fix="send an action as JSON") from None
+            raise InputError("not JSON", where="body", fix=fix) from None
         if not isinstance(action, dict):
-            raise InputError("not a JSON object", where="body", fix="send an action as JSON")
+            raise InputError("not a JSON object", where="body", fix=fix)
         return await run_in_threadpool(self._acted, request, action)
 
     def _acted(self, request: Request, action: dict[str, Any]) -> Response:
@@ -216,20 +218,25 @@ class _Routes:
         person = "" if request.client is None else request.client.host
         with session.lock:
             views = session.photo_state(number, slot).all_views
-            photos = {number, *(session.place_of(view)[0] for view in views)}
+            photos = {number, *(view.place[0] for view in views)}
             self._claims.take(photos, request.cookies.get(_BROWSER, ""), person)
             outcome = perform(session, number, action, slot=slot)
-            return _as_json(page_state(session, number, outcome, slot=slot))
+            return JSONResponse(page_state(session, number, outcome, slot=slot))
 
 
-def _as_json(state: dict[str, Any]) -> Response:
-    data = json.dumps(state, separators=(",", ":"), allow_nan=False).encode()
-    return Response(data, media_type="application/json")
+def _asset(name: str, media_type: str, request: Request) -> Response:
+    return Response(asset(name), media_type=media_type)
 
 
 def _kept(thumbnail: bytes) -> Response:
     """A picture that the browser keeps for an hour."""
     return Response(thumbnail, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
+
+
+def _as_file(name: str, data: bytes, media_type: str) -> Response:
+    """A file that the browser saves under a name."""
+    headers = {"Content-Disposition": f"attachment; filename*=UTF-8''{quote(name)}"}
+    return Response(data, media_type=media_type, headers=headers)
 
 
 def _place(request: Request) -> tuple[int, int | None]:
@@ -244,15 +251,6 @@ def _number(request: Request, name: str) -> int | None:
     if not given.isdecimal() or len(given) > _LONGEST_NUMBER:
         raise InputError(f"{quoted(given)} is no number", where=name, fix="reload the page")
     return int(given)
-
-
-def _as_file(name: str) -> dict[str, str]:
-    """Headers that let a browser save a response under a name."""
-    return {"Content-Disposition": f"attachment; filename*=UTF-8''{quote(name)}"}
-
-
-def _send(name: str, media_type: str, request: Request) -> Response:
-    return Response(asset(name), media_type=media_type)
 
 
 async def _refused(request: Request, error: Exception) -> Response:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.annotate.live import LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.object_shape import ObjectShape

@@ -11,19 +11,18 @@ import numpy as np
 from cadalign.annotate.document import AnnotationDocument
 from cadalign.annotate.estimate import LEAST_PAIRS
 from cadalign.annotate.models import Proposal
-from cadalign.annotate.objects import PhotoState, known_pairs
+from cadalign.annotate.objects import PhotoState
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.io.images import write_image
 from cadalign.io.video import Video, frame_numbers
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
 if TYPE_CHECKING:
     from cadalign.annotate.session import Session
@@ -73,14 +72,22 @@ class FrameTrack:
         """
         if number >= len(self.times) or not session.ready:
             return ()
-        result = self._estimate(session)
+        states = [states[0] for states in session.objects[: len(self.times)]]
+        documents = tuple(state.document for state in states)
+        if self._known is None or self._known[0] != documents:
+            self._known = documents, self._aligned(session, states)
+        result = self._known[1]
         if result is None:
             return ()
         state, view = session.objects[number][0], result.views[number]
         if view.covariance is None:
             return ()
         ids, points = _own_points(session, state, result)
-        uncertain = _uncertainty(points, view.alignment, view.camera, view.covariance)
+        uncertain = np.full(len(points), np.inf)  # standard deviations by that of the pose [px]
+        ahead = view.camera.sees(view.alignment.apply(points))
+        slopes = projection_jacobian(points[ahead], view.camera, view.alignment)
+        covariances = predicted_covariances(slopes, view.covariance[:6, :6])
+        uncertain[ahead] = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2)
         seen = np.flatnonzero(uncertain < _MOST_UNCERTAIN * view.camera.width)
         if session.shape is None:
             scene = state.model.cad.scene
@@ -92,19 +99,12 @@ class FrameTrack:
             for row, (u, v) in zip(seen[inside], pixels[inside], strict=True)
         )
 
-    def _estimate(self, session: Session) -> Result | None:
-        """The smooth estimate from all frames; None where there is none."""
-        states = [states[0] for states in session.objects[: len(self.times)]]
-        documents = tuple(state.document for state in states)
-        if self._known is None or self._known[0] != documents:
-            self._known = documents, self._aligned(session, states)
-        return self._known[1]
-
     def _aligned(self, session: Session, states: list[PhotoState]) -> Result | None:
+        """The smooth estimate from all frames; None where there is none."""
         registry = states[0].model.registry
         shape, views = session.shape, []
         for state, time in zip(states, self.times, strict=True):
-            pairs = known_pairs(state.document, registry, shape)
+            pairs = state.known_pairs
             points = [registry[pair.keypoint or 0] for pair in pairs]
             ids = [each.semantic_id if shape is None else shape.id_of(each) for each in points]
             uv = [pair.uv for pair in pairs if pair.uv is not None]
@@ -144,21 +144,3 @@ def _own_points(
             ids.append(number)
             points.append(result.points_3d[rows[shape.id_of(point)]])
     return ids, np.array(points, dtype=float).reshape(-1, 3)
-
-
-def _uncertainty(
-    points: FloatArray, pose: Alignment, camera: Camera, covariance: FloatArray
-) -> FloatArray:
-    """Standard deviations (n,) [px] of projected points, by that of the pose; inf behind it."""
-    in_camera = pose.apply(points)
-    ahead = camera.sees(in_camera)
-    turned = in_camera[ahead] - pose.translation
-    slopes = np.zeros((len(turned), 3, 6))
-    for axis, unit in enumerate(np.eye(3)):
-        slopes[:, :, axis] = np.cross(unit, turned)
-    slopes[:, :, 3:] = np.eye(3)
-    in_space = slopes @ covariance[:6, :6] @ slopes.swapaxes(1, 2)
-    projected = camera.projected_covariances(in_camera[ahead], in_space)
-    found = np.full(len(points), np.inf)
-    found[ahead] = np.sqrt(np.trace(projected, axis1=1, axis2=2) / 2)
-    return found

@@ -40,7 +40,7 @@ from support.web import axe_script
 from benchmarks.section import BenchmarkData, RatioTable, Row, clocked
 from cadalign import Camera, Mesh
 from cadalign.annotate.actions import perform
-from cadalign.annotate.masks import encode_runs
+from cadalign.annotate.evidence import encode_runs
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.session import Session

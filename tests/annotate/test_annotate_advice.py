@@ -14,9 +14,8 @@ from support.annotating import Case, place_all, served
 
 from cadalign import Camera, Model, View
 from cadalign.annotate.actions import perform
-from cadalign.annotate.estimate import LIKELY_STRETCH
+from cadalign.annotate.estimate import LIKELY_STRETCH, LiveAlignment
 from cadalign.annotate.guard import TOKEN_HEADER
-from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.ranking import advice_state
 from cadalign.annotate.result_text import evidence_text, left_text

@@ -12,12 +12,11 @@ from playwright.sync_api import Browser, Page
 from support.annotating import IDLE, Case, opened_page, place, place_all, wait
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.history import history_path
-from cadalign.annotate.masks import nearest_corner
-from cadalign.annotate.model import ClickableModel
+from cadalign.annotate.document import history_path
+from cadalign.annotate.evidence import nearest_corner
+from cadalign.annotate.model import ClickableModel, MirrorPlanes
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.annotate.snapping import MirrorPlanes
 from cadalign.errors import CadalignError
 from cadalign.geometry.mesh import Mesh
 

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cadalign.annotate.document import AnnotationDocument, FocalChoice, Pair
-from cadalign.annotate.history import History
+from cadalign.annotate.document import AnnotationDocument, History, Pair
 from cadalign.annotate.models import KeypointRegistry
+from cadalign.annotate.photos import FocalChoice
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import InputError
 

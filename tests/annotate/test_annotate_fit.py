@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from support.problems import problem_of
 
 from cadalign import Alignment, Camera, fit
-from cadalign.annotate.document import FocalChoice
-from cadalign.annotate.estimate import Known, LiveEstimate
-from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
-from cadalign.annotate.model import ClickableModel, Wireframe
-from cadalign.annotate.photos import Intrinsics
+from cadalign.annotate.estimate import Known, LiveAlignment
+from cadalign.annotate.lines import Wireframe
+from cadalign.annotate.live import live_alignment, missing_text
+from cadalign.annotate.model import ClickableModel
+from cadalign.annotate.photos import FocalChoice, Intrinsics
 from cadalign.annotate.result_text import UNKNOWNS, facts_of, next_best_text, notes_of
 from cadalign.annotate.suggestion import NextBest, find_next_best, updated_variances
 from cadalign.datasets import ModelKeypoint
@@ -59,7 +59,7 @@ def live_of(
         ModelKeypoint(f"point {row}", xyz, row)
         for row, xyz in enumerate(map(tuple, problem.points_3d.tolist()))
     ]
-    estimate = LiveEstimate.of(known, observation)
+    estimate = LiveAlignment.of(known, observation)
     lines = Wireframe.of_model(ClickableModel(BOX))
     return live_alignment(estimate, known, lines, observation, 0, points, observation.points_2d)
 

@@ -11,8 +11,14 @@ from support.annotating import Case, flat, place_all
 
 from cadalign import Camera
 from cadalign.annotate.actions import perform
-from cadalign.annotate.evidence import MaskDrawing, Stroke, find_up
-from cadalign.annotate.masks import decode_runs, draw_mask, encode_runs
+from cadalign.annotate.evidence import (
+    MaskDrawing,
+    Stroke,
+    decode_runs,
+    draw_mask,
+    encode_runs,
+    find_up,
+)
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main

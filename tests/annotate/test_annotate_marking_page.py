@@ -9,7 +9,6 @@ import pytest
 from playwright.sync_api import Browser, Page
 from support.annotating import IDLE, Case, opened_page, place_all, place_of_pixel, wait
 
-from cadalign.annotate.page_state import mask_pixels
 from cadalign.annotate.session import Session
 from cadalign.io.images import write_image
 
@@ -45,17 +44,17 @@ def test_mask_is_painted_taken_away_and_cleared(opened: tuple[Page, Session]) ->
     page, session = opened
     page.get_by_label(TOOL).select_option("brush")
     drag(page, (250, 200), (400, 200))
-    painted = mask_pixels(session, 0)
+    painted = session.photo_state(0).mask
     assert painted[200, 320]
     assert not painted[300, 320]
     assert len(session.photos[0].document.pairs) == 5
     page.keyboard.down("Shift")
     drag(page, (320, 180), (320, 220))
     page.keyboard.up("Shift")
-    assert not mask_pixels(session, 0)[200, 320]
+    assert not session.photo_state(0).mask[200, 320]
     page.keyboard.press("Control+z")
     wait(page, "annotator.api.idle && annotator.state.can_redo")
-    assert mask_pixels(session, 0)[200, 320]
+    assert session.photo_state(0).mask[200, 320]
     wait(page, "!!annotator.photo.marking.tinted")
 
     page.keyboard.press("g")
@@ -63,7 +62,7 @@ def test_mask_is_painted_taken_away_and_cleared(opened: tuple[Page, Session]) ->
         page.mouse.click(*place_of_pixel(page, place))
     page.keyboard.press("c")
     wait(page, IDLE)
-    assert mask_pixels(session, 0)[350, 350]
+    assert session.photo_state(0).mask[350, 350]
     assert "mask" in used(page)
     page.get_by_role("button", name="Mask, gravity, known size (1 used)").click()
     page.get_by_role("button", name="Clear the mask").click()
@@ -81,7 +80,7 @@ def test_box_and_file_give_masks(opened: tuple[Page, Session], case: Case) -> No
     high = np.minimum(points.max(axis=0) + 25, (634, 474))
     drag(page, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
     assert used(page) == "mask", page.locator("[role=alert]").inner_text()
-    cut = mask_pixels(session, 0)
+    cut = session.photo_state(0).mask
     assert 0.05 < cut[int(low[1]) : int(high[1]), int(low[0]) : int(high[0])].mean() < 0.98
     given = np.zeros_like(cut)
     given[100:400, 150:450] = True
@@ -89,10 +88,10 @@ def test_box_and_file_give_masks(opened: tuple[Page, Session], case: Case) -> No
     write_image(file, np.where(given, 255, 0).astype(np.uint8))
     page.get_by_label("Mask file").set_input_files(file)
     for _ in range(200):
-        if (mask_pixels(session, 0) == given).all():
+        if (session.photo_state(0).mask == given).all():
             break
         page.wait_for_timeout(30)
-    np.testing.assert_array_equal(mask_pixels(session, 0), given)
+    np.testing.assert_array_equal(session.photo_state(0).mask, given)
     write_image(file, np.zeros((10, 12), dtype=np.uint8))
     page.get_by_label("Mask file").set_input_files(file)
     wait(page, "document.querySelector('[role=alert]').textContent.includes('12 x 10 pixels')")

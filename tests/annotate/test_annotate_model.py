@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cadalign import Alignment, Camera, Mesh
-from cadalign.annotate.model import ClickableModel, Wireframe, box_lines, display_bytes
+from cadalign.annotate.lines import Wireframe, box_lines
+from cadalign.annotate.model import ClickableModel, display_bytes
 from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import simplify

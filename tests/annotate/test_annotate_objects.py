@@ -13,8 +13,8 @@ import tyro
 from support.annotating import Case, fitted, flat
 
 from cadalign.annotate.actions import perform
+from cadalign.annotate.document import history_path
 from cadalign.annotate.exporting import coco_of, glb_of
-from cadalign.annotate.history import history_path
 from cadalign.annotate.locks import WriterLocks
 from cadalign.annotate.opening import find_session_files, open_session
 from cadalign.annotate.options import SessionOptions

@@ -9,7 +9,7 @@ import pytest
 from support.annotating import Case, flat, place_all
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.masks import encode_runs
+from cadalign.annotate.evidence import encode_runs
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main

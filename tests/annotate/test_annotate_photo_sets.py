@@ -15,8 +15,8 @@ from support.annotating import Case, place, place_all, served
 
 import cadalign.datasets
 from cadalign.annotate.actions import perform
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.exporting import annotated_photos
-from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets.photos.placed import PlacedObject

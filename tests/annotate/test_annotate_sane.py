@@ -12,7 +12,7 @@ import pytest
 
 from cadalign import Alignment, Box, Camera
 from cadalign.annotate.actions import perform
-from cadalign.annotate.live import LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.session import Session

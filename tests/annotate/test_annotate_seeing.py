@@ -10,7 +10,8 @@ import pytest
 from playwright.sync_api import Browser, Page
 from support.annotating import IDLE, Case, opened_page, place_all, wait
 
-from cadalign.annotate.model import ClickableModel, Wireframe, detail_bytes
+from cadalign.annotate.lines import Wireframe
+from cadalign.annotate.model import ClickableModel, detail_bytes
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.geometry.mesh import Mesh

@@ -12,7 +12,7 @@ import pytest
 from support.annotating import Case, fitted, flat
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.live import LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.locks import Claims
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.history import history_path
+from cadalign.annotate.document import history_path
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError

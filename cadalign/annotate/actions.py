@@ -22,6 +22,7 @@ from cadalign.annotate.object_actions import (
 from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.photos import Mark
 from cadalign.annotate.session import Session
+from cadalign.annotate.track import proposals_of
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert
@@ -212,7 +213,7 @@ def identify(state: PhotoState, *, pair: Index, label: Index | Text) -> ActionOu
 def accept(state: PhotoState, *, keypoints: list[Index] | None = None) -> ActionOutcome:
     """Place pairs at a detector's proposals for some keypoints, or for all that are left."""
     document, number = state.document, None
-    for proposal in state.session.proposals(state):
+    for proposal in proposals_of(state):
         keypoint = proposal.keypoint
         if (keypoints is None or keypoint in keypoints) and keypoint not in document.keypoints:
             number = document.next_number

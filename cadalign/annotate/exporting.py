@@ -49,7 +49,7 @@ def coco_of(session: Session) -> dict[str, Any]:
                     _coco_object(
                         row, state, models.index(state.model), _marked(session, state.model)
                     ),
-                    track=_FIRST_TRACK if session.track is not None and not slot else None,
+                    track=_FIRST_TRACK if session.times and not slot else None,
                 )
                 for row, objects in enumerate(kept)
                 for slot, state in enumerate(objects)

@@ -43,7 +43,7 @@ from cadalign.annotate.photos import (
     read_camera,
 )
 from cadalign.annotate.session import Session
-from cadalign.annotate.track import FrameTrack
+from cadalign.annotate.track import times_of
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
@@ -132,7 +132,7 @@ def open_session(
         for state, proposals in zip(session.photos, found, strict=True):
             state.proposals = proposals
     if options.track:
-        session.track = FrameTrack.of(session.photos)
+        session.times = times_of(photo.path for photo in files.photos)
     for view in [view for state in session.states for view in state.views]:
         place = next((row for row in session.objects if row[0].key == view.key), None)
         if place is None:  # a photo that is nothing but a further view

@@ -17,6 +17,7 @@ from cadalign.annotate.object_actions import ActionOutcome
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.result_text import facts_of, name_of, next_best_text, notes_of
 from cadalign.annotate.session import Session
+from cadalign.annotate.track import proposals_of
 from cadalign.errors import CadalignError
 from cadalign.io.documents import read_json
 from cadalign.io.evidence import LENGTHS
@@ -86,7 +87,7 @@ def page_state(
             ],
             "proposals": [
                 {**asdict(proposal), "name": registry[proposal.keypoint].name}
-                for proposal in session.proposals(state)
+                for proposal in proposals_of(state)
                 if proposal.keypoint not in used
             ],
             "shape": _shape(state),

@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.document import history_path, write_history
+from cadalign.annotate.document import AnnotationDocument, history_path, write_history
 from cadalign.annotate.estimate import Known, LiveAlignment, warm_up
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import known_points, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.models import KeypointRegistry, Models, Proposal
+from cadalign.annotate.models import KeypointRegistry, Models
 from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
-from cadalign.annotate.track import FrameTrack
 from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import simulate_problem
 
@@ -40,7 +40,9 @@ class Session:
     """Raises a CadalignError where nothing may be written."""
     reserve: Callable[[Sequence[Path]], None] = lambda paths: None
     """Keeps other annotators off an object's files; raises a CadalignError if one has them."""
-    track: FrameTrack | None = None  # where the photos are frames of one video
+    times: tuple[float, ...] = ()  # of the first photos, where these are frames of one video [s]
+    tracked: tuple[tuple[AnnotationDocument, ...], Result | None] | None = None
+    """The last smooth estimate from the frames, with their documents."""
     objects: list[list[PhotoState]] = field(default_factory=list)
     """The objects of each photo, its own observation's first."""
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
@@ -122,13 +124,6 @@ class Session:
         """Remember an object that was deleted."""
         self.deleted.append(owner)
         self.just_deleted |= {view.place[0] for view in (owner, *owner.views)}
-
-    def proposals(self, state: PhotoState) -> tuple[Proposal, ...]:
-        """Keypoints of a detector, and of the other frames, that could be taken."""
-        number, slot = state.place
-        if self.track is None or slot:
-            return state.proposals
-        return (*state.proposals, *self.track.proposals(self, number))
 
     def work_state(self, state: PhotoState) -> State:
         """State of the annotation of a photo."""

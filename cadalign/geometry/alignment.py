@@ -56,9 +56,8 @@ class Alignment:
 
     def __post_init__(self, is_valid: bool) -> None:
         if is_valid:
-            self.rotation.setflags(write=False)
-            self.translation.setflags(write=False)
-            self.scale.setflags(write=False)
+            for array in (self.rotation, self.translation, self.scale):
+                array.flags.writeable = False
             return
         rotation = as_floats(self.rotation, name="rotation", shape=(3, 3))
         translation = as_floats(self.translation, name="translation", shape=(3,))
@@ -134,16 +133,11 @@ class Alignment:
         if not isinstance(first, Alignment):
             return NotImplemented
         if np.ptp(self.scale) > 1e-12 * self.scale.max():
-            raise InputError(
-                f"the outer alignment has the stretch {self.scale.tolist()}",
-                where="second @ first",
-                fix="only an alignment with equal scales can follow another one",
-            )
-        return Alignment(
-            self.rotation @ first.rotation,
-            self.apply(first.translation[None])[0],
-            self.scale * first.scale,
-        )
+            what = f"the outer alignment has the stretch {self.scale.tolist()}"
+            fix = "only an alignment with equal scales can follow another one"
+            raise InputError(what, where="second @ first", fix=fix)
+        (moved,) = self.apply(first.translation[None])
+        return Alignment(self.rotation @ first.rotation, moved, self.scale * first.scale)
 
     def to_dict(self) -> dict[str, list[Any]]:
         """Write the alignment as plain lists, for JSON."""
@@ -151,13 +145,7 @@ class Alignment:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Alignment:
-        """Read what `to_dict` wrote.
-
-        Raises
-        ------
-        InputError
-            If a field is missing or invalid.
-        """
+        """Read what `to_dict` wrote; raises InputError if a field is missing or invalid."""
         if not isinstance(data, Mapping):
             raise InputError(f"expected an object, got {type(data).__name__}", where="alignment")
         missing = [key for key in _FIELDS if key not in data]

@@ -63,12 +63,7 @@ class Box:
     def from_model(cls, bounds: npt.ArrayLike, alignment: Alignment) -> Box:
         """Make the box, in the camera frame, of a model that is stretched and placed.
 
-        Parameters
-        ----------
-        bounds : (2, 3) float
-            The lowest and highest coordinates of the model in its own frame.
-        alignment : Alignment
-            The model's pose and stretch.
+        ``bounds`` (2, 3) are the lowest and highest coordinates of the model in its own frame.
 
         Examples
         --------
@@ -78,9 +73,8 @@ class Box:
         ([0.0, 0.0, 4.0], [2.0, 4.0, 1.0])
         """
         bounds = as_floats(bounds, name="bounds", shape=(2, 3))
-        center, rotation, extents = oriented_box(
-            bounds, alignment.rotation, alignment.translation, alignment.scale
-        )
+        pose = alignment.rotation, alignment.translation, alignment.scale
+        center, rotation, extents = oriented_box(bounds, *pose)
         # Python's numbers: NumPy's reductions of three take longer than the rest of this.
         valid = min(extents.tolist()) >= 0 and isfinite(sum(extents.tolist() + center.tolist()))
         return cls(center, rotation, extents, is_valid=valid)

@@ -120,14 +120,7 @@ class Camera:
 
     @classmethod
     def from_fov(cls, width: int, height: int, *, fov_x: float) -> Camera:
-        """Make a camera with square pixels from its horizontal field of view.
-
-        Parameters
-        ----------
-        width, height
-            As for `Camera`.
-        fov_x : float
-            Horizontal field of view [degrees], from one edge of the image to the other.
+        """Make a camera with square pixels from its horizontal field of view ``fov_x`` [degrees].
 
         Examples
         --------
@@ -161,8 +154,6 @@ class Camera:
         ----------
         matrix : (3, 3) float
             ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` [px], without skew.
-        width, height, distortion, lens
-            As for `Camera`.
         pixel_origin : {"center", "corner"}
             Where (0, 0) lies for the principal point: at the centre of the top-left pixel (OpenCV,
             Kalibr, BOP), or at the top-left corner of the image (COLMAP, PyTorch3D, many
@@ -194,14 +185,7 @@ class Camera:
         """Make a camera of which only the image is known, for ``fit(..., focal="estimate")``.
 
         Its pixels are square. ``fx`` and ``fy`` are placeholders; `project`, `normalize` and fits
-        with a known focal length refuse it.
-
-        Parameters
-        ----------
-        width, height, distortion
-            As for `Camera`.
-        cx, cy : float, optional
-            Principal point [px]; the image's centre by default.
+        with a known focal length refuse it. The principal point is the image's centre by default.
 
         Examples
         --------
@@ -264,11 +248,8 @@ class Camera:
     def turned(self, rotation: npt.ArrayLike) -> Camera:
         """The same camera of a wide lens, its points in a frame that is turned about its centre.
 
-        Parameters
-        ----------
-        rotation : (3, 3) float
-            From this camera's frame to the new one. Image and lens stay where they are: the new
-            frame's z axis is not the optical axis.
+        The rotation (3, 3) leads from this camera's frame to the new one. Image and lens stay where
+        they are: the new frame's z axis is not the optical axis.
 
         Examples
         --------
@@ -305,29 +286,13 @@ class Camera:
         return np.asarray((angle < largest_angle(self.lens, self.distortion)) & points.any(axis=1))
 
     def require_focal(self) -> None:
-        """Refuse a camera `without_focal`.
-
-        Raises
-        ------
-        InputError
-            If the focal length is unknown.
-        """
+        """Refuse a camera `without_focal` by an InputError."""
         if not self.focal_known:
             fix = 'estimate it with focal="estimate", or give it: camera.with_focal(...)'
             raise InputError("the focal length is unknown", where="camera", fix=fix)
 
     def project(self, points_cam: npt.ArrayLike) -> FloatArray:
-        """Project points of the camera frame into the image.
-
-        Parameters
-        ----------
-        points_cam : (n, 3) float
-            Points in the camera frame, in front of it; for a wide lens, in its field.
-
-        Returns
-        -------
-        (n, 2) float
-            Pixels; they may lie outside the image.
+        """Project points (n, 3) of the camera frame to pixels (n, 2), in the image or beside it.
 
         Raises
         ------
@@ -387,17 +352,9 @@ class Camera:
         return np.asarray(slopes @ covariances @ slopes.swapaxes(1, 2))
 
     def unproject(self, points_2d: npt.ArrayLike) -> FloatArray:
-        """Directions of the rays of pixels, in the camera frame.
+        """Directions of the rays of pixels (n, 2) in the camera frame, unit vectors (n, 3).
 
-        Parameters
-        ----------
-        points_2d : (n, 2) float
-            Pixels.
-
-        Returns
-        -------
-        (n, 3) float
-            Unit vectors; for a wide lens, z may be 0 or negative.
+        For a wide lens, z may be 0 or negative.
 
         Raises
         ------
@@ -430,17 +387,9 @@ class Camera:
         return np.asarray(rays @ self.lens_from_camera), valid
 
     def normalize(self, points_2d: npt.ArrayLike) -> FloatArray:
-        """Turn pixels into normalised image coordinates, the lens distortion removed.
+        """Turn pixels (n, 2) into normalised image coordinates, the lens distortion removed.
 
-        Parameters
-        ----------
-        points_2d : (n, 2) float
-            Pixels.
-
-        Returns
-        -------
-        (n, 2) float
-            (u, v) such that (u, v, 1) is the direction of the pixel's ray.
+        These are (n, 2), such that (u, v, 1) is the direction of the pixel's ray.
 
         Raises
         ------
@@ -464,18 +413,9 @@ class Camera:
         return normalized
 
     def normalize_where_valid(self, points_2d: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
-        """Turn pixels into normalised image coordinates wherever the lens model can be inverted.
+        """Turn pixels (n, 2) into normalised image coordinates where the lens can be inverted.
 
-        Parameters
-        ----------
-        points_2d : (n, 2) float
-            Pixels.
-
-        Returns
-        -------
-        normalized : (n, 2) float
-            As `normalize` gives them; meaningless, but finite, where not valid.
-        valid : (n,) bool
+        Returns what `normalize` does, meaningless but finite elsewhere, and where it is valid (n,).
         """
         if self.is_wide:
             rays, valid = self.rays_where_valid(points_2d)

@@ -63,8 +63,8 @@ def up_from_pose(
         Rotation, or pose, of the camera: ARKit's ``camera.transform`` with ``axes="opengl"``.
     world_up : (3,) float
         Up in the world; ARKit's and ARCore's is y.
-    axes : {"opencv", "opengl"}
-        Axes of the camera.
+    axes
+        As for `up_from_gravity`.
 
     Raises
     ------
@@ -127,7 +127,6 @@ def up_from_vertical_edges(
     Parameters
     ----------
     camera : Camera
-        The calibrated camera.
     edges : (2, 2) or (k, 2, 2) float
         Two pixels on each edge, in any order [px].
     sigma : float
@@ -162,11 +161,8 @@ def up_from_vertical_edges(
     clicks = as_floats(edges, name="edges", shape=shape).reshape(-1, 2, 2)
     if not len(clicks):
         raise InputError("none is given", where="edges")
-    normals, deviations = [], []
-    for number, ends in enumerate(clicks):
-        normal, deviation = _plane(camera, ends, sigma, number)
-        normals.append(normal)
-        deviations.append(deviation)
+    found = [_plane(camera, ends, sigma, number) for number, ends in enumerate(clicks)]
+    normals, deviations = zip(*found, strict=True)
     # The forward direction is level to the deviation of the pitch: a plane like those of edges.
     rows = np.array([*normals, [0.0, 0.0, 1.0]])
     planes = np.array([*deviations, np.eye(3) * np.radians(pitch_sigma_deg) ** 2])

@@ -17,21 +17,15 @@ _LEAST_SIDE = 4  # of the part of a texture atlas that one colour takes [px]
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Look of a part of a surface.
-
-    Parameters
-    ----------
-    name : str
-        The material's name in its file.
-    color : tuple of 4 float
-        Red, green, blue and opacity, 0 to 1; multiplied with the texture where there is one.
-    texture : (h, w, 3 or 4) uint8, optional
-        The image, its first row at the top; texture coordinates start at the bottom left.
-    """
+    """Look of a part of a surface."""
 
     name: str = ""
+    """The material's name in its file."""
     color: tuple[float, float, float, float] = GREY
+    """Red, green, blue and opacity, 0 to 1; multiplied with the texture where there is one."""
     texture: npt.NDArray[np.uint8] | None = None
+    """The image (h, w, 3 or 4), its first row at the top; texture coordinates start at the bottom
+    left."""
 
 
 @dataclass(frozen=True, eq=False)

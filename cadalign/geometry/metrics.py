@@ -64,18 +64,7 @@ def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Align
 
     The model's symmetries take it to itself, so that several alignments place the same object; see
     `cadalign.geometry.symmetry_group` for what a stretch leaves of them. True scales that differ
-    by up to 1 % count as equal.
-
-    Parameters
-    ----------
-    est, gt : Alignment
-    symmetry : Symmetry
-        Symmetry of the model.
-
-    Raises
-    ------
-    InputError
-        If the symmetry's motions make no group.
+    by up to 1 % count as equal. Raises InputError if the symmetry's motions make no group.
 
     Examples
     --------
@@ -161,21 +150,16 @@ def reprojection_error(
     observed = as_points(points_2d, name="points_2d", dimension=2)
     projected = camera.project(est.apply(points_3d))
     if len(projected) != len(observed) or not len(observed):
-        raise InputError(
-            f"{len(projected)} model points, {len(observed)} observations", where="points_2d"
-        )
+        what = f"{len(projected)} model points, {len(observed)} observations"
+        raise InputError(what, where="points_2d")
     return float(np.sqrt(((projected - observed) ** 2).sum(axis=1).mean()))
 
 
 def box_iou(*, est: Box, gt: Box) -> float:
     """Volume of the intersection of two oriented boxes over that of their union, 0 to 1.
 
-    Exact to rounding; see `cadalign.geometry.clipping.intersection_volume`.
-
-    Raises
-    ------
-    InputError
-        If a box has no volume: the ratio means nothing then.
+    Exact to rounding; see `cadalign.geometry.clipping.intersection_volume`. Raises InputError if a
+    box has no volume: the ratio means nothing then.
 
     Examples
     --------
@@ -198,12 +182,7 @@ def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
     is a concave function of s (Brunn-Minkowski; the pairs of s and a point of s E form a convex
     cone), and that of the sum of their volumes is convex. The IoU increases with the ratio of the
     two, which therefore has no local maximum but the global one: a bounded scalar search finds it.
-    A linear program gives the range of s.
-
-    Raises
-    ------
-    InputError
-        If a box has no volume: the ratio means nothing then.
+    A linear program gives the range of s. Raises InputError as `box_iou` does.
 
     Examples
     --------
@@ -250,11 +229,8 @@ def alignment_box_iou(
 def _check_volumes(est: Box, gt: Box) -> None:
     for name, box in (("est", est), ("gt", gt)):
         if not have_volume(box):
-            raise InputError(
-                f"the box {box.extents.tolist()} has no volume",
-                where=name,
-                fix="leave flat models out of volume metrics",
-            )
+            what, fix = f"the box {box.extents.tolist()} has no volume", "leave flat models out"
+            raise InputError(what, where=name, fix=f"{fix} of volume metrics")
 
 
 def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
@@ -270,14 +246,9 @@ def _common_factors(est: Box, gt: Box) -> tuple[float, float] | None:
     scaled = equal / unit
     offset, half = scaled * (est.rotation.T @ est.center), scaled * est.extents / 2
     fixed, reach = gt.rotation.T @ gt.center / unit, gt.extents / (2 * unit)
-    rows = np.vstack(
-        [
-            np.column_stack([-offset - half, est.rotation.T]),
-            np.column_stack([offset - half, -est.rotation.T]),
-            np.column_stack([np.zeros(3), gt.rotation.T]),
-            np.column_stack([np.zeros(3), -gt.rotation.T]),
-        ]
-    )
+    factors = np.concatenate([-offset - half, offset - half, np.zeros(6)])
+    places = [est.rotation.T, -est.rotation.T, gt.rotation.T, -gt.rotation.T]
+    rows = np.column_stack([factors, np.concatenate(places)])
     limits = np.concatenate([np.zeros(6), reach + fixed, reach - fixed])
     bounds = [(1e-3, 1e3), (None, None), (None, None), (None, None)]
     ends = []
@@ -329,16 +300,10 @@ def box_ious(*, est: _Boxes, gt: _Boxes) -> FloatArray:
     unit = np.maximum(est.extents.max(axis=-1), gt.extents.max(axis=-1))
     to_est = est.rotation.swapaxes(-1, -2)
     centers = (to_est @ (gt.center - est.center)[..., None])[..., 0] / unit[..., None]
-    parts = (
-        est.extents / unit[..., None],
-        gt.extents / unit[..., None],
-        to_est @ gt.rotation,
-        centers,
-    )
-    shapes = ((-1, 3), (-1, 3), (-1, 3, 3), (-1, 3))
-    pairs = zip(
-        *(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)), strict=True
-    )
+    sides, gt_sides = est.extents / unit[..., None], gt.extents / unit[..., None]
+    turns = (to_est @ gt.rotation).reshape(-1, 3, 3)
+    vectors = (each.reshape(-1, 3) for each in (sides, gt_sides, centers))
+    pairs = ((a, b, turn, c) for a, b, c, turn in zip(*vectors, turns, strict=True))
     shared = np.reshape([intersection_volume(*pair) for pair in pairs], unit.shape)
     # Python's powers: NumPy rounds those of an array otherwise than that of a number.
     cubes = np.reshape([side**3 for side in unit.ravel().tolist()], unit.shape)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -35,11 +35,9 @@ PixelOrigin = Literal["center", "corner"]
 def shift_of(pixel_origin: object, *, where: str = "pixel_origin") -> float:
     """Coordinates of the top-left pixel's centre under a convention [px]: 0 or 0.5."""
     if not isinstance(pixel_origin, str) or pixel_origin not in get_args(PixelOrigin):
-        raise InputError(
-            f"{quote(pixel_origin)} is not a place of pixel (0, 0)",
-            where=where,
-            fix='give "center" (of the top-left pixel) or "corner" (of the image)',
-        )
+        fix = 'give "center" (of the top-left pixel) or "corner" (of the image)'
+        what = f"{quote(pixel_origin)} is not a place of pixel (0, 0)"
+        raise InputError(what, where=where, fix=fix)
     return PIXEL_CENTRE if pixel_origin == "corner" else 0.0
 
 
@@ -73,12 +71,9 @@ def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) 
     if min(width, height) < _LEAST_SIZE or not np.ptp(points_2d, axis=0).any():
         return
     if np.abs(points_2d).max() <= _NORMALISED:
-        raise InputError(
-            f"all {len(points_2d)} keypoints lie within {_NORMALISED:g} px of pixel (0, 0), as "
-            "normalised coordinates (0 to 1) do",
-            where=where,
-            fix=f"give pixels: multiply fractions by the image's width {width} and height {height}",
-        )
+        what = f"all {len(points_2d)} keypoints lie within {_NORMALISED:g} px of pixel (0, 0)"
+        fix = f"give pixels: multiply fractions by the image's width {width} and height {height}"
+        raise InputError(f"{what}, as normalised coordinates (0 to 1) do", where=where, fix=fix)
 
 
 def perspective(points_cam: FloatArray) -> FloatArray:
@@ -133,31 +128,15 @@ def require_perspective_lens(kind: str, *, where: str) -> None:
         raise InputError(f"the focal length of a {kind} lens is unknown", where=where, fix=fix)
 
 
-class _Terms(NamedTuple):
-    """Terms of a distortion: radial n over d, tangential p, and thin prism s."""
-
-    n1: float
-    n2: float
-    n3: float
-    n4: float
-    d1: float
-    d2: float
-    d3: float
-    p1: float
-    p2: float
-    s1: float
-    s2: float
-
-
 @lru_cache(maxsize=64)
-def _terms(kind: LensKind, coefficients: tuple[float, ...]) -> _Terms:
-    """The terms of the coefficients, missing ones 0."""
+def _terms(kind: LensKind, coefficients: tuple[float, ...]) -> tuple[float, ...]:
+    """Terms of a distortion: four radial n over three d, two tangential p, and two thin prism s."""
     if kind == "fisheye" and len(coefficients) == 4:
-        return _Terms(*coefficients, *(0.0,) * 7)
+        return (*coefficients, *(0.0,) * 7)
     k1, k2, p1, p2, k3, k4, k5, k6 = coefficients + (0.0,) * (8 - len(coefficients))
     if kind == "fisheye":
-        return _Terms(k1, k2, k3, k4, 0.0, 0.0, 0.0, p1, p2, k5, k6)
-    return _Terms(k1, k2, k3, 0.0, k4, k5, k6, p1, p2, 0.0, 0.0)
+        return k1, k2, k3, k4, 0.0, 0.0, 0.0, p1, p2, k5, k6
+    return k1, k2, k3, 0.0, k4, k5, k6, p1, p2, 0.0, 0.0
 
 
 @lru_cache(maxsize=64)
@@ -228,13 +207,11 @@ def _plane_of(
     safe = np.where(on_axis, 1.0, r)
     across = np.where(on_axis[:, None], (1.0, 0.0), points[:, :2] / safe[:, None])
     stretch = np.where(on_axis, slope, radius) / np.where(on_axis, z, safe)
-    outwards = (
-        slope[:, None] * np.column_stack([across * z[:, None], -r]) / (r * r + z * z)[:, None]
-    )
+    turned = np.column_stack([across * z[:, None], -r])
+    outwards = slope[:, None] * turned / (r * r + z * z)[:, None]
     by_point = across[:, :, None] * outwards[:, None]
-    by_point[:, :, :2] += stretch[:, None, None] * (
-        np.eye(2) - across[:, :, None] * across[:, None]
-    )
+    sideways = np.eye(2) - across[:, :, None] * across[:, None]
+    by_point[:, :, :2] += stretch[:, None, None] * sideways
     return radius[:, None] * across, by_point
 
 
@@ -262,12 +239,10 @@ def _undistort_fisheye(
     image: FloatArray, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, BoolArray]:
     """Undo a fisheye's distortion, from a table of the radial part."""
-    terms = _terms("fisheye", coefficients)
+    n1, n2, n3, n4, *_ = _terms("fisheye", coefficients)
     angles = np.linspace(0.0, largest_angle("fisheye", coefficients), _TABLE)
-    squares = angles * angles
-    factors = 1 + squares * (
-        terms.n1 + squares * (terms.n2 + squares * (terms.n3 + squares * terms.n4))
-    )
+    s = angles * angles
+    factors = 1 + s * (n1 + s * (n2 + s * (n3 + s * n4)))
     radius = np.hypot(image[:, 0], image[:, 1])
     theta = np.interp(radius, angles * factors, angles)
     start = image * (theta / np.where(radius == 0, 1.0, radius))[:, None]
@@ -285,26 +260,17 @@ def distort(
     denominator = 1 + r2 * (d1 + r2 * (d2 + r2 * d3))
     radial = numerator / denominator
     # d radial / d r2
-    slope = (n1 + r2 * (2 * n2 + r2 * (3 * n3 + r2 * 4 * n4))) / denominator - radial * (
-        d1 + r2 * (2 * d2 + 3 * d3 * r2)
-    ) / denominator
-    distorted = np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2,
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s2 * r2,
-        ],
-        axis=1,
-    )
+    slope = (n1 + r2 * (2 * n2 + r2 * (3 * n3 + r2 * 4 * n4))) / denominator
+    slope = slope - radial * (d1 + r2 * (2 * d2 + 3 * d3 * r2)) / denominator
+    distorted = np.empty((len(x), 2))
+    distorted[:, 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + s1 * r2
+    distorted[:, 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + s2 * r2
     mixed = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    of_x = radial + 2 * x * x * slope + 2 * p1 * y + (6 * p2 + 2 * s1) * x
-    of_y = radial + 2 * y * y * slope + (6 * p1 + 2 * s2) * y + 2 * p2 * x
-    jacobian = np.stack(
-        [
-            np.stack([of_x, mixed + 2 * s1 * y], axis=1),
-            np.stack([mixed + 2 * s2 * x, of_y], axis=1),
-        ],
-        axis=1,
-    )
+    jacobian = np.empty((len(x), 2, 2))
+    jacobian[:, 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + (6 * p2 + 2 * s1) * x
+    jacobian[:, 0, 1] = mixed + 2 * s1 * y
+    jacobian[:, 1, 0] = mixed + 2 * s2 * x
+    jacobian[:, 1, 1] = radial + 2 * y * y * slope + (6 * p1 + 2 * s2) * y + 2 * p2 * x
     return distorted, jacobian
 
 

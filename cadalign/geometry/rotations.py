@@ -131,11 +131,8 @@ def nearest_rotation(matrix: FloatArray, *, where: str = "rotation") -> FloatArr
     with np.errstate(over="ignore", invalid="ignore"):
         error = np.abs(matrix @ matrix.T - np.eye(3)).max()
     if not error <= _NEARLY_RIGID or np.linalg.det(matrix) < 0:
-        raise InputError(
-            "not a rotation matrix",
-            where=where,
-            fix="its rows must be orthonormal and its determinant +1",
-        )
+        fix = "its rows must be orthonormal and its determinant +1"
+        raise InputError("not a rotation matrix", where=where, fix=fix)
     if error <= _EXACT:
         return matrix
     left, _, right = np.linalg.svd(matrix)

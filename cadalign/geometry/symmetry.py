@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_floats, read_only
+from cadalign.arrays import FloatArray, as_floats, is_whole, read_only
 from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between, nearest_rigid, rotation_from_vector
@@ -34,21 +34,13 @@ _FORMS = (
 class SymmetryAxis:
     """An axis about which any rotation takes a model to itself.
 
-    Parameters
-    ----------
-    direction : (3,) float
-        Direction, of any length but 0; kept with length 1.
-    offset : (3,) float
-        A point on the axis [model units].
-
-    Raises
-    ------
-    InputError
-        If a shape is wrong, or the direction is zero.
+    Raises InputError if a shape is wrong, or the direction is zero.
     """
 
     direction: FloatArray
+    """Direction (3,), of any length but 0; kept with length 1."""
     offset: FloatArray
+    """A point (3,) on the axis [model units]."""
 
     def __post_init__(self) -> None:
         direction = as_floats(self.direction, name="direction", shape=(3,))
@@ -106,14 +98,9 @@ class Symmetry:
     def around(
         cls, direction: npt.ArrayLike, *, fold: int | None, offset: npt.ArrayLike = (0, 0, 0)
     ) -> Symmetry:
-        """Rotations about one axis.
+        """Rotations about one axis: ``fold`` of them, by equal angles, or any where it is None.
 
-        Parameters
-        ----------
-        direction, offset : (3,) float
-            The axis; see `SymmetryAxis`.
-        fold : int or None
-            Number of rotations, by equal angles, that take the model to itself; None for any.
+        ``direction`` and ``offset`` are those of `SymmetryAxis`.
         """
         axis = SymmetryAxis(np.asarray(direction), np.asarray(offset))
         if fold is None:
@@ -149,14 +136,16 @@ class Symmetry:
             if data not in SCAN2CAD_FOLDS:
                 raise InputError(f"{quote(data)} is no symmetry", where="symmetry", fix=_FORMS)
             return cls.around(_UP, fold=SCAN2CAD_FOLDS[data])
-        names = set(data) if isinstance(data, Mapping) else set()
         if not isinstance(data, Mapping):
             what = f"expected a name or an object, got {type(data).__name__}"
             raise InputError(what, where="symmetry", fix=_FORMS)
+        names = set(data)
         if names <= {"axis", "fold", "offset"} and {"axis", "fold"} <= names:
-            return cls.around(
-                _vector(data, "axis"), fold=_fold(data["fold"]), offset=_vector(data, "offset")
-            )
+            fold = data["fold"]
+            if not (fold is None or (is_whole(fold) and fold > 0)):
+                what, fix = f"{quote(str(fold))} is no number of rotations", "give 1, 2, 3 ..."
+                raise InputError(what, where="symmetry.fold", fix=f"{fix}, or null for any angle")
+            return cls.around(_vector(data, "axis"), fold=fold, offset=_vector(data, "offset"))
         if not names or not names <= {_DISCRETE, _CONTINUOUS}:
             what = f"the fields {', '.join(sorted(map(str, names)))} are no symmetry's"
             raise InputError(what, where="symmetry", fix=_FORMS)
@@ -164,21 +153,16 @@ class Symmetry:
             as_floats(each, name=f"symmetry.{_DISCRETE}[{row}]", shape=(16,))
             for row, each in enumerate(_listed(data, _DISCRETE))
         ]
-        axes = [
-            SymmetryAxis(_vector(each, "axis"), _vector(each, "offset"))
-            for each in _listed(data, _CONTINUOUS)
-        ]
+        listed = _listed(data, _CONTINUOUS)
+        axes = [SymmetryAxis(_vector(each, "axis"), _vector(each, "offset")) for each in listed]
         return cls(np.reshape(motions, (-1, 4, 4)), tuple(axes))
 
     def to_dict(self) -> dict[str, Any]:
         """Write the symmetry as plain lists, for JSON, in BOP's form."""
-        return {
-            _DISCRETE: self.motions.reshape(-1, 16).tolist(),
-            _CONTINUOUS: [
-                {"axis": axis.direction.tolist(), "offset": axis.offset.tolist()}
-                for axis in self.axes
-            ],
-        }
+        axes = [
+            {"axis": axis.direction.tolist(), "offset": axis.offset.tolist()} for axis in self.axes
+        ]
+        return {_DISCRETE: self.motions.reshape(-1, 16).tolist(), _CONTINUOUS: axes}
 
     @property
     def is_trivial(self) -> bool:
@@ -189,12 +173,8 @@ class Symmetry:
         """All motions, those about axes in steps; (n, 4, 4) float, the identity first.
 
         BOP's definition: the product of every step about every axis with every discrete motion.
-
-        Parameters
-        ----------
-        max_step : float
-            How far a point as far from the axis as the model's diameter moves at most from one
-            step to the next, as a share of that diameter; ``ceil(pi / max_step)`` steps.
+        From one of the ``ceil(pi / max_step)`` steps to the next, a point as far from the axis as
+        the model's diameter moves by ``max_step`` at most, as a share of that diameter.
         """
         count = int(np.ceil(np.pi / max_step))
         about = [
@@ -233,13 +213,6 @@ def _vector(data: Any, name: str) -> FloatArray:
     """A field of three numbers, zeros where it is missing."""
     given = data.get(name, (0.0, 0.0, 0.0)) if isinstance(data, Mapping) else data
     return as_floats(given, name=f"symmetry.{name}", shape=(3,))
-
-
-def _fold(value: object) -> int | None:
-    if value is None or (isinstance(value, int) and not isinstance(value, bool) and value > 0):
-        return value
-    what = f"{quote(str(value))} is no number of rotations"
-    raise InputError(what, where="symmetry.fold", fix="give 1, 2, 3 ..., or null for any angle")
 
 
 def _listed(data: Mapping[Any, Any], name: str) -> list[Any]:

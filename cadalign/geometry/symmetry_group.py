@@ -49,23 +49,15 @@ _ANGLES = np.pi / 6 * np.arange(12)
 
 @dataclass(frozen=True, eq=False)
 class Equal:
-    """An alignment that places the model as another one does: ``other @ motion``.
-
-    Parameters
-    ----------
-    alignment : Alignment
-    motion : (4, 4) float
-        The symmetry that leads to it; it takes the model to itself.
-    free : (k, 3) float
-        Directions in the model's frame of the axes about which any rotation is equal as well.
-    center : (3,) float
-        A point of the model that all symmetries keep.
-    """
+    """An alignment that places the model as another one does: ``other @ motion``."""
 
     alignment: Alignment
     motion: FloatArray
+    """The symmetry (4, 4) that leads to it; it takes the model to itself."""
     free: FloatArray
+    """Directions (k, 3) in the model's frame of axes about which any rotation is equal as well."""
     center: FloatArray
+    """A point (3,) of the model that all symmetries keep."""
 
     def relabelled(self, points: FloatArray) -> FloatArray:
         """Model points (n, 3) of the other alignment where this one has them; (n, 3) float."""
@@ -92,18 +84,6 @@ class _Branch:
 class SymmetryGroup:
     """All motions that follow from a symmetry: rotations about one point.
 
-    Parameters
-    ----------
-    center : (3,) float
-        The point.
-    rotations : (g, 3, 3) float
-        The rotations, the identity first; with an axis, one of those that only differ by a rotation
-        about it; with a free center, the identity alone.
-    axis : (3,) float, optional
-        Axis about which any rotation belongs to the group.
-    is_free : bool
-        Any rotation about the center belongs to it.
-
     Examples
     --------
     A quarter turn makes a group of four:
@@ -114,18 +94,20 @@ class SymmetryGroup:
     """
 
     center: FloatArray
+    """The point (3,)."""
     rotations: FloatArray
+    """The rotations (g, 3, 3), the identity first; with an axis, one of those that only differ by a
+    rotation about it; with a free center, the identity alone."""
     axis: FloatArray | None = None
+    """Axis (3,) about which any rotation belongs to the group."""
     is_free: bool = False
+    """Any rotation about the center belongs to it."""
 
     @classmethod
     def of(cls, symmetry: Symmetry) -> SymmetryGroup:
         """The group that a symmetry's motions and axes generate.
 
-        Raises
-        ------
-        InputError
-            If motions and axes share no fixed point, or make more than 240 rotations.
+        Raises InputError if these share no fixed point, or make more than 240 rotations.
         """
         center = _fixed_point(symmetry)
         generators = [motion[:3, :3] for motion in symmetry.motions]
@@ -158,18 +140,10 @@ class SymmetryGroup:
     ) -> Equal:
         """The one of all equal alignments whose rotation is nearest to a reference.
 
-        The same for all equal alignments, and itself the canonical one of its own.
-
-        Parameters
-        ----------
-        alignment : Alignment
-        held : tuple of 3 bool
-            Axes of the model whose scale must stay as it is.
-        reference : (3, 3) float, optional
-            By default `FACING`: the model upright, y up, its z axis towards the camera. Where
-            several are as near, the entries of the rotation decide.
-        tolerance : float
-            Relative difference of scales up to which they count as equal.
+        The same for all equal alignments, and itself the canonical one of its own. The scales of
+        ``held`` axes must stay as they are. The reference (3, 3) is by default `FACING`: the model
+        upright, y up, its z axis towards the camera; where several are as near, the entries of the
+        rotation decide. Scales that differ by up to ``tolerance`` count as equal.
         """
         references = (FACING, *LIKE_FACING) if reference is None else (reference, *LIKE_FACING)
         found = [
@@ -177,7 +151,15 @@ class SymmetryGroup:
             for branch, scale in self._kept(alignment.scale, held, tolerance)
         ]
         best = max(found, key=lambda each: _rank(alignment.rotation @ each[0], references))
-        return self._turned(alignment, *best)
+        rotation, scale, branch = best
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = rotation, self.center - rotation @ self.center
+        result = alignment
+        if (rotation != np.eye(3)).any():
+            shift = alignment.linear @ motion[:3, 3]
+            turned = alignment.rotation @ rotation
+            result = Alignment(turned, alignment.translation + shift, scale)
+        return Equal(result, motion, branch.free, self.center)
 
     def nearest(self, alignment: Alignment, rotation: FloatArray, *, tolerance: float) -> Equal:
         """The one of all equal alignments whose rotation is nearest to a given one."""
@@ -213,20 +195,6 @@ class SymmetryGroup:
             return [_Branch(rotation, about) for rotation in self.rotations]
         turns = [rotation_from_vector(angle * about) for angle in _ANGLES]
         return [_Branch(turn @ each) for each, turn in product(self.rotations, turns)]
-
-    def _turned(
-        self, alignment: Alignment, rotation: FloatArray, scale: FloatArray, branch: _Branch
-    ) -> Equal:
-        motion = np.eye(4)
-        motion[:3, :3] = rotation
-        motion[:3, 3] = self.center - rotation @ self.center
-        if (rotation == np.eye(3)).all():
-            result = alignment
-        else:
-            shift = alignment.linear @ motion[:3, 3]
-            turned = alignment.rotation @ rotation
-            result = Alignment(turned, alignment.translation + shift, scale)
-        return Equal(result, motion, branch.free, self.center)
 
 
 @lru_cache(maxsize=64)
@@ -280,11 +248,8 @@ def _fixed_point(symmetry: Symmetry) -> FloatArray:
     matrix, shift = np.concatenate(rows), np.concatenate(shifts)
     center = np.linalg.lstsq(matrix, shift, rcond=_PARALLEL)[0]
     if np.abs(matrix @ center - shift).max() > _SAME_POINT * max(float(np.abs(shift).max()), 1e-9):
-        raise InputError(
-            "its motions keep no common point, so they cannot all take the model to itself",
-            where="symmetry",
-            fix="give rotations about one point",
-        )
+        what = "its motions keep no common point, so they cannot all take the model to itself"
+        raise InputError(what, where="symmetry", fix="give rotations about one point")
     return read_only(center)
 
 
@@ -297,11 +262,9 @@ def _closure(generators: list[FloatArray]) -> FloatArray:
             if min(angle_between(each, product_of_both) for each in found) < _SAME_DEG:
                 continue
             if len(found) == _MOST_ROTATIONS:
-                raise InputError(
-                    f"its motions make more than {_MOST_ROTATIONS} rotations",
-                    where="symmetry",
-                    fix="give an axis where any rotation about it takes the model to itself",
-                )
+                what = f"its motions make more than {_MOST_ROTATIONS} rotations"
+                fix = "give an axis where any rotation about it takes the model to itself"
+                raise InputError(what, where="symmetry", fix=fix)
             found.append(product_of_both)
     return np.array(found)
 
@@ -321,14 +284,9 @@ def _free_branches(scale: FloatArray, tolerance: float) -> list[_Branch]:
     same: BoolArray = np.abs(scale[:, None] - scale) <= tolerance * scale
     if same.all():
         return [_Branch(np.eye(3), is_any=True)]
-    signed = _signed_permutations()
+    signed = _closure([np.array(quarter) for quarter in _QUARTERS])  # axes go to axes
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
         if same[first, second]:
             return [_Branch(each, np.eye(3)[axis]) for each in signed]
     return [_Branch(each) for each in signed]
-
-
-def _signed_permutations() -> list[FloatArray]:
-    """The 24 rotations that take coordinate axes to coordinate axes."""
-    return list(_closure([np.array(quarter) for quarter in _QUARTERS]))

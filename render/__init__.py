@@ -17,11 +17,10 @@ if TYPE_CHECKING:
         normal_picture,
     )
     from cadalign.render.drawing.stills import Angles, draw_still, pose_in_view, turntable
-    from cadalign.render.frame import Frame, Geometry, Renderer
     from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
-    from cadalign.render.raycast.shading import Studio
-    from cadalign.render.scene import Scene
+    from cadalign.render.raycast.surface import Studio
+    from cadalign.render.scene import Frame, Geometry, Renderer, Scene
     from cadalign.render.viewpoints import (
         Viewpoint,
         frame_object,

@@ -21,9 +21,8 @@ from cadalign.errors import CadalignError, RenderError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.render.frame import Renderer
-from cadalign.render.raycast.shading import Studio
-from cadalign.render.scene import Scene
+from cadalign.render.raycast.surface import Studio
+from cadalign.render.scene import Renderer, Scene
 
 RENDERERS: dict[str, str] = {
     "pyrender": "cadalign.render.opengl.renderer:PyrenderRenderer",

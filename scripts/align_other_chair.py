@@ -33,7 +33,7 @@ from cadalign.render import (
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.color import ByteImage, composite
+from cadalign.render.drawing.canvas import ByteImage, composite
 
 CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
 VIEW = Angles(azimuth=143.0, elevation=24.0)

@@ -10,8 +10,8 @@ ROOT = Path(__file__).resolve().parents[1]
 WIDTH, ROW, TOP = 1080, 34, 56
 # Layers by kind, and the kind's colour.
 KINDS = {
-    "#e8e8ec": "errors lazy arrays notebook seeding compile",
-    "#d9e8f7": "geometry metrics io solvers shapes export estimation fitting torch",
+    "#e8e8ec": "errors names arrays notebook seeding compile",
+    "#d9e8f7": "geometry metrics io solvers shapes export estimation torch jax",
     "#dcf0dc": "datasets render web",
     "#fbe9d0": "retrieval evaluation batch report annotate health cli scripts",
 }

@@ -17,7 +17,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh, mesh_edges, simplify
 from cadalign.geometry.raycaster import FaceArray, RayCaster
-from cadalign.render.drawing.color import bytes_from_linear
+from cadalign.render.drawing.canvas import bytes_from_linear
 from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene
 

@@ -15,8 +15,7 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.io.images import write_image
-from cadalign.io.video import Video, frame_numbers
+from cadalign.io.images import Video, frame_numbers, write_image
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian

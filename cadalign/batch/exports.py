@@ -32,7 +32,7 @@ from cadalign.io.images import write_image
 from cadalign.io.meshes.join import join
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model
-from cadalign.render.frame import LIGHT_GREY
+from cadalign.render.scene import LIGHT_GREY
 
 _MILLIMETRES = 1e-3
 _SAME = 1e-9

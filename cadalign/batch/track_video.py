@@ -13,8 +13,8 @@ from cadalign.export.glb import MovingObject
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.video import Video
-from cadalign.render.drawing.color import ByteImage
+from cadalign.io.images import Video
+from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.scene import Scene

@@ -16,7 +16,7 @@ from cadalign.estimation.tracks.motion import Trajectory
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.video import frame_numbers
+from cadalign.io.images import frame_numbers
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Columns, Row

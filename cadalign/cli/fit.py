@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.view import View
     from cadalign.io.observation import Observation, ObservationChanges
     from cadalign.render import OverlayStyle
-    from cadalign.render.drawing.color import ByteImage
+    from cadalign.render.drawing.canvas import ByteImage
 
 
 @dataclass(frozen=True)

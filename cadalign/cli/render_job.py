@@ -17,13 +17,12 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import read_json
 from cadalign.io.images import JPEG_ENDING
 from cadalign.io.meshes.load import load_mesh
-from cadalign.render.drawing.color import ByteImage, composite
+from cadalign.render.drawing.canvas import ByteImage, composite
 from cadalign.render.drawing.movie import MOVIES, contact_sheet
 from cadalign.render.drawing.pictures import keypoint_picture
 from cadalign.render.drawing.stills import VIEWS, Angles, draw_still, pose_in_view, turntable
-from cadalign.render.frame import LIGHT_GREY, Renderer, check_image_size
 from cadalign.render.probe import make_renderer
-from cadalign.render.scene import Scene
+from cadalign.render.scene import LIGHT_GREY, Renderer, Scene, check_image_size
 from cadalign.render.viewpoints import visible_keypoints
 
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}

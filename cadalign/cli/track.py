@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from cadalign.datasets import ImageKeypoints
     from cadalign.estimation.tracks.motion import Motion
     from cadalign.geometry.camera import Camera
-    from cadalign.io.video import Video
+    from cadalign.io.images import Video
     from cadalign.shapes.model import ShapeModel
 
 _RATE = 30.0
@@ -72,7 +72,7 @@ class TrackCommand(CameraOptions):
         from cadalign.batch.tracks import tracks_of
         from cadalign.datasets import read_image_keypoints
         from cadalign.estimation.tracks.motion import Motion
-        from cadalign.io.video import Video
+        from cadalign.io.images import Video
 
         objects, shape = read_image_keypoints(self.detections), self._read_shape()
         video = None if self.video is None else Video.open(self.video)

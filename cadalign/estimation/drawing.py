@@ -16,8 +16,7 @@ from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.images import read_photo
-from cadalign.notebook.axes import photo_axes
-from cadalign.notebook.html import card, draw_picture
+from cadalign.notebook import card, draw_picture, photo_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

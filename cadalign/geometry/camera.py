@@ -468,8 +468,7 @@ class Camera:
             focal = f"{self.fx:.5g}, {self.fy:.5g} px"
             angle = "{:.3g}° x {:.3g}°".format(*angles) if valid.all() else "the lens's whole"
         lens = ", ".join(f"{value:.3g}" for value in self.distortion)
-        from cadalign.notebook.axes import photo_axes
-        from cadalign.notebook.html import card, draw_picture
+        from cadalign.notebook import card, draw_picture, photo_axes
 
         rows = [
             ("image", f"{self.width} x {self.height} px"),

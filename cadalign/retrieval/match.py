@@ -21,7 +21,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.names import renamed
-from cadalign.notebook.html import card, draw_picture
+from cadalign.notebook import card, draw_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

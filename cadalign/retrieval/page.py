@@ -13,8 +13,8 @@ from cadalign.io.files import write_json, write_text, writing
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
-from cadalign.render.drawing.color import ByteImage
-from cadalign.render.frame import LIGHT_GREY
+from cadalign.render.drawing.canvas import ByteImage
+from cadalign.render.scene import LIGHT_GREY
 from cadalign.retrieval.by_mask import cast_match
 from cadalign.retrieval.match import Match
 from cadalign.web import asset, fill

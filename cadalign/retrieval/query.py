@@ -21,7 +21,7 @@ from cadalign.retrieval.options import RetrievalOptions
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
-    from cadalign.render.drawing.color import ByteImage
+    from cadalign.render.drawing.canvas import ByteImage
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
 

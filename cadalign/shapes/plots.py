@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.notebook.html import card, draw_picture
+from cadalign.notebook import card, draw_picture
 from cadalign.shapes.parts import BOX_ROWS
 from cadalign.shapes.shape_file import ShapeFields
 

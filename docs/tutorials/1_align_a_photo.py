@@ -31,7 +31,7 @@ from cadalign.render import (
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.color import composite
+from cadalign.render.drawing.canvas import composite
 
 folder = Path(tempfile.mkdtemp())
 chairs = KeypointNet(write_sample_dataset(folder, categories=("chair",)))

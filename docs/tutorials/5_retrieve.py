@@ -26,7 +26,7 @@ from cadalign.render import (
     pose_in_view,
     visible_keypoints,
 )
-from cadalign.render.drawing.color import composite
+from cadalign.render.drawing.canvas import composite
 
 root = write_sample_dataset(Path(tempfile.mkdtemp()), per_category=60, categories=("chair", "car"))
 dataset = KeypointNet(root)

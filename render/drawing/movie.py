@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.errors import InputError, RenderError
 from cadalign.io.files import write_whole
-from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.canvas import ByteImage
 
 if TYPE_CHECKING:
     from av import VideoStream

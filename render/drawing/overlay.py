@@ -12,8 +12,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
-from cadalign.render.drawing.canvas import Canvas, Color, LegendEntry
-from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.canvas import ByteImage, Canvas, Color, LegendEntry
 from cadalign.render.drawing.keypoint_layer import KeypointMarks
 from cadalign.render.drawing.pictures import (
     SHADED,
@@ -24,8 +23,8 @@ from cadalign.render.drawing.pictures import (
     shade,
     veil,
 )
-from cadalign.render.frame import LIGHT_GREY, Geometry, check_image_size
 from cadalign.render.raycast.posed import within_lens_field
+from cadalign.render.scene import LIGHT_GREY, Geometry, check_image_size
 
 GT_COLOR: Color = (40, 205, 80)
 EST_COLOR: Color = (240, 50, 50)

@@ -11,9 +11,8 @@ from cadalign.errors import InputError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
-from cadalign.render.drawing.canvas import CASING, Canvas, Color
-from cadalign.render.drawing.color import ByteImage, composite
-from cadalign.render.frame import Frame, Geometry
+from cadalign.render.drawing.canvas import CASING, ByteImage, Canvas, Color, composite
+from cadalign.render.scene import Frame, Geometry
 from cadalign.render.viewpoints import seen_in_image
 
 _SEEN_COLOR = (255, 222, 40)

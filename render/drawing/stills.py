@@ -13,16 +13,15 @@ from cadalign.errors import InputError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
-from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.drawing.pictures import (
     depth_picture,
     face_picture,
     line_picture,
     normal_picture,
 )
-from cadalign.render.frame import Renderer
 from cadalign.render.raycast.renderer import cast_geometry
-from cadalign.render.scene import Scene
+from cadalign.render.scene import Renderer, Scene
 from cadalign.render.viewpoints import frame_object, look_at
 
 VIEWS: dict[str, tuple[float, float]] = {

@@ -16,14 +16,13 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.render.drawing.color import ByteImage
-from cadalign.render.frame import Frame, check_image_size
+from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.probe import missing_libraries
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import Rectangle, pose_scene
 from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry, check_samples
-from cadalign.render.raycast.shading import Studio
-from cadalign.render.scene import Scene
+from cadalign.render.raycast.surface import Studio
+from cadalign.render.scene import Frame, Scene, check_image_size
 
 # Larger images are drawn in tiles of this size: no graphics memory is too small for it.
 _TILE = 2048

@@ -14,9 +14,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES, opengl_from_model, opengl_projection
 from cadalign.geometry.mesh import Material
-from cadalign.render.drawing.color import LinearArray, linear_from_srgb
-from cadalign.render.raycast.shading import DARKEST, Studio
-from cadalign.render.raycast.surface import color_channels
+from cadalign.render.drawing.canvas import LinearArray, linear_from_srgb
+from cadalign.render.raycast.surface import DARKEST, Studio, color_channels
 from cadalign.render.scene import Scene
 
 _ROUGHNESS = 0.55

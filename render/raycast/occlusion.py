@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.render.drawing.color import ByteImage
-from cadalign.render.frame import Geometry
+from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.raycast.posed import PosedScene, Rectangle, in_threads
-from cadalign.render.raycast.shading import Studio
+from cadalign.render.raycast.surface import Studio
+from cadalign.render.scene import Geometry
 
 SingleImage = npt.NDArray[np.float32]
 

@@ -17,8 +17,8 @@ from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.raycaster import FaceArray, RayCaster
-from cadalign.render.drawing.color import LinearArray
-from cadalign.render.raycast.shading import Studio
+from cadalign.render.drawing.canvas import LinearArray
+from cadalign.render.raycast.surface import Studio
 from cadalign.render.scene import Scene
 
 _MAX_LAYERS = 8

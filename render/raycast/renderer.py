@@ -13,12 +13,11 @@ from cadalign.errors import InputError, RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import FaceArray, RayCaster
-from cadalign.render.drawing.color import ByteImage, LinearArray, bytes_from_linear
-from cadalign.render.frame import Frame, Geometry, check_image_size
+from cadalign.render.drawing.canvas import ByteImage, LinearArray, bytes_from_linear
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import PosedScene, Rectangle, in_threads, pose_scene
-from cadalign.render.raycast.shading import Studio
-from cadalign.render.scene import Scene
+from cadalign.render.raycast.surface import Studio
+from cadalign.render.scene import Frame, Geometry, Scene, check_image_size
 
 # Small enough for the processor's caches, large enough for NumPy's overhead not to show.
 _RAYS_AT_ONCE = 1 << 15

@@ -15,8 +15,7 @@ from support.refusals import refusal_line
 from cadalign import ShapeModel
 from cadalign.cli import main
 from cadalign.evaluation.simulation.tracks import TRACK_CAMERA, SimulatedTrack, simulate_track
-from cadalign.io.images import write_image
-from cadalign.io.video import Video
+from cadalign.io.images import Video, write_image
 from cadalign.render.drawing.movie import write_movie
 
 pytestmark = pytest.mark.slow

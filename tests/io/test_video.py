@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from cadalign.errors import DataError
-from cadalign.io.images import write_image
-from cadalign.io.video import Video, frame_numbers
+from cadalign.io.images import Video, frame_numbers, write_image
 from cadalign.render.drawing.movie import write_movie
 
 COUNT, WIDTH, HEIGHT = 6, 64, 48

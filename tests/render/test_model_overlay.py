@@ -20,7 +20,7 @@ from cadalign.render import (
     overlay_model,
     overlay_models,
 )
-from cadalign.render.drawing.color import linear_from_bytes
+from cadalign.render.drawing.canvas import linear_from_bytes
 from cadalign.render.drawing.overlay import AXIS_COLORS, EST_COLOR
 
 pytestmark = pytest.mark.long

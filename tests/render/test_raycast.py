@@ -12,7 +12,7 @@ import trimesh
 from cadalign import Alignment, Camera, Material, Mesh
 from cadalign.errors import InputError, RenderError
 from cadalign.render import RaycastRenderer, Scene, cast_geometry, look_at
-from cadalign.render.drawing.color import bytes_from_linear, linear_from_bytes
+from cadalign.render.drawing.canvas import bytes_from_linear, linear_from_bytes
 from cadalign.render.raycast.surface import coincident_faces, corner_normals
 
 CAMERA = Camera(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)

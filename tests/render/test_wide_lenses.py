@@ -19,8 +19,8 @@ from cadalign.io.evidence import ObservedImage
 from cadalign.io.observation import Observation
 from cadalign.render import Scene, cast_geometry, draw_overlay
 from cadalign.render.drawing.model_overlay import draw_result
-from cadalign.render.frame import LIGHT_GREY
 from cadalign.render.raycast.renderer import RaycastRenderer
+from cadalign.render.scene import LIGHT_GREY
 from cadalign.render.viewpoints import visible_keypoints
 
 FISHEYE = Camera(241, 241, 70.0, 72.0, 120.0, 119.0, (0.01, -0.003, 0.0, 0.0), lens="fisheye")

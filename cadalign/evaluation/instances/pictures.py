@@ -26,7 +26,7 @@ from cadalign.geometry.mesh import Mesh, cluster, mesh_edges, simplify
 from cadalign.io.files import dense_json, write_text, write_whole
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
-from cadalign.render.drawing.color import ByteImage
+from cadalign.render.drawing.canvas import ByteImage
 
 _THUMB_WIDTH = 320
 _QUALITY, _THUMB_QUALITY = 85, 75

@@ -1,1 +1,0 @@
-"""HTML of values in notebooks: a small picture beside a table."""

@@ -23,17 +23,6 @@ BOX_EDGES = tuple((i, i | 1 << k) for k in range(3) for i in range(8) if not i >
 class Box:
     """An oriented box.
 
-    Parameters
-    ----------
-    center : (3,) float
-        The box's centre.
-    rotation : (3, 3) float
-        Its axes are the columns.
-    extents : (3,) float
-        Its full side lengths along these axes, not negative.
-    is_valid : bool
-        The arrays are known to be valid: take them over unchecked, and make them read-only.
-
     Raises
     ------
     InputError
@@ -41,10 +30,14 @@ class Box:
     """
 
     center: FloatArray
+    """The box's centre (3,)."""
     rotation: FloatArray
+    """Its axes are the columns (3, 3)."""
     extents: FloatArray
+    """Its full side lengths along these axes (3,), not negative."""
     _: KW_ONLY
     is_valid: InitVar[bool] = False
+    """The arrays are known to be valid: take them over unchecked, and make them read-only."""
 
     def __post_init__(self, is_valid: bool) -> None:
         if is_valid:

@@ -32,26 +32,6 @@ class Material:
 class Mesh:
     """A triangle mesh in model coordinates.
 
-    Parameters
-    ----------
-    vertices : (n, 3) float
-        Positions [model units].
-    faces : (m, 3) int
-        Vertex numbers of the triangles, in the order of the file.
-    polygon : (m,) int, optional
-        The number, in the file, of the face that a triangle was cut from: a quad gives two
-        triangles with the same number. By default ``0 ... m - 1``.
-    vertex_colors : (n, 4) float, optional
-        Red, green, blue, opacity, 0 to 1.
-    corner_uv : (m, 3, 2) float, optional
-        Texture coordinates of each triangle's corners.
-    materials : tuple of Material
-        The materials that ``face_material`` names.
-    face_material : (m,) int, optional
-        Which material a triangle has; by default the first of all.
-    source : str
-        The file or id the mesh comes from, for messages.
-
     Raises
     ------
     DataError
@@ -60,13 +40,22 @@ class Mesh:
     """
 
     vertices: FloatArray
+    """Positions (n, 3) [model units]."""
     faces: IntArray
+    """Vertex numbers of the triangles (m, 3), in the order of the file."""
     polygon: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """The number (m,), in the file, of the face that a triangle was cut from: a quad gives two
+    triangles with the same number. By default ``0 ... m - 1``."""
     vertex_colors: FloatArray | None = None
+    """Red, green, blue and opacity (n, 4), 0 to 1."""
     corner_uv: FloatArray | None = None
+    """Texture coordinates of each triangle's corners (m, 3, 2)."""
     materials: tuple[Material, ...] = (Material(),)
+    """The materials that ``face_material`` names."""
     face_material: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """Which material a triangle has (m,); by default the first of all."""
     source: str = "mesh"
+    """The file or id the mesh comes from, for messages."""
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)

@@ -63,13 +63,6 @@ class SymmetryAxis:
 class Symmetry:
     """The rigid motions that take a model to itself.
 
-    Parameters
-    ----------
-    motions : (k, 4, 4) float
-        Discrete motions in model coordinates, the identity left out.
-    axes : tuple of SymmetryAxis
-        Axes about which any rotation takes the model to itself.
-
     Raises
     ------
     InputError
@@ -82,7 +75,9 @@ class Symmetry:
     """
 
     motions: FloatArray
+    """Discrete motions in model coordinates (k, 4, 4), the identity left out."""
     axes: tuple[SymmetryAxis, ...] = ()
+    """Axes about which any rotation takes the model to itself."""
 
     def __post_init__(self) -> None:
         motions = as_floats(self.motions, name="motions", shape=(None, 4, 4))

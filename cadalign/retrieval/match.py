@@ -33,66 +33,45 @@ METHOD = "retrieve"
 @renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class Match:
-    """A model of the library, posed and stretched to explain an image's keypoints.
-
-    Parameters
-    ----------
-    category, model_id : str
-    alignment : Alignment
-    rms : float
-        Root mean square length of the shared keypoints' residuals [px].
-    log_likelihood : float
-        Log-likelihood of all keypoints, marked and missing; see `cadalign.retrieval.options`.
-    score : float
-        Probability that this is the model, given that it is in the library (in the category, if
-        one was named) and that all are equally likely a priori: the likelihood over the sum of
-        all models'. It is calibrated as far as the assumptions hold: nine in ten matches with the
-        score 0.9 are correct.
-    box : Box
-        Box of the model in the camera frame.
-    bounds : (2, 3) float
-        Lowest and highest coordinates in the model's frame.
-    ids : (n,) int
-        Ids of the shared keypoints.
-    points_3d : (n, 3) float
-        Shared keypoints on the model.
-    points_2d : (n, 2) float
-        Shared keypoints in the image [px].
-    residuals : (n, 2) float
-        Projected minus observed [px].
-    missing_ids : tuple of int
-        Ids of the image's keypoints that the model lacks.
-    mirrored : bool
-        True if the labels fit better with left and right exchanged.
-    mesh_path : Path or None
-    silhouette_iou : float, optional
-        With a mask: intersection over union with the model's silhouette; None without a mesh.
-    none_probability : float, optional
-        Probability that the object is none of the library's models, not even stretched: the same
-        in all matches of an image. See `cadalign.retrieval.absence`. None in a ranking by shape,
-        which takes the object for none of them.
-    camera : Camera, optional
-        The camera of the image.
-    """
+    """A model of the library, posed and stretched to explain an image's keypoints."""
 
     category: str
     model_id: str
     alignment: Alignment
     rms: float
+    """Root mean square length of the shared keypoints' residuals [px]."""
     log_likelihood: float
+    """Log-likelihood of all keypoints, marked and missing; see `cadalign.retrieval.options`."""
     score: float
+    """Probability that this is the model, given that it is in the library (in the category, if one
+    was named) and that all are equally likely a priori: the likelihood over the sum of all models'.
+    It is calibrated as far as the assumptions hold: nine in ten matches with the score 0.9 are
+    correct."""
     box: Box
+    """Box of the model in the camera frame."""
     bounds: FloatArray
+    """Lowest and highest coordinates in the model's frame (2, 3)."""
     ids: IntArray
+    """Ids of the shared keypoints (n,)."""
     points_3d: FloatArray
+    """Shared keypoints on the model (n, 3)."""
     points_2d: FloatArray
+    """Shared keypoints in the image (n, 2) [px]."""
     residuals: FloatArray
+    """Projected minus observed (n, 2) [px]."""
     missing_ids: tuple[int, ...]
+    """Ids of the image's keypoints that the model lacks."""
     mirrored: bool
+    """True if the labels fit better with left and right exchanged."""
     mesh_path: Path | None
     silhouette_iou: float | None = None
+    """With a mask: intersection over union with the model's silhouette; None without a mesh."""
     none_probability: float | None = None
+    """Probability that the object is none of the library's models, not even stretched: the same in
+    all matches of an image. See `cadalign.retrieval.absence`. None in a ranking by shape, which
+    takes the object for none of them."""
     camera: Camera | None = field(default=None, repr=False)
+    """The camera of the image."""
 
     @property
     def shared(self) -> int:

@@ -57,19 +57,6 @@ SCHEMA = pa.schema(
 class LibraryModel:
     """One model of a library.
 
-    Parameters
-    ----------
-    category, model_id : str
-    xyz : (k, 3) float
-        Keypoints [model units].
-    ids : (k,) int
-        Semantic ids, valid for all models of the category.
-    bounds : (2, 3) float
-        Lowest and highest coordinates of the mesh; of the keypoints without a mesh.
-    symmetries : Symmetries, optional
-        Reflections and rotations, as rows of ``xyz`` that exchange places.
-    mesh_path : Path, optional
-
     Raises
     ------
     InputError
@@ -79,9 +66,13 @@ class LibraryModel:
     category: str
     model_id: str
     xyz: FloatArray
+    """Keypoints (k, 3) [model units]."""
     ids: IntArray
+    """Semantic ids (k,), valid for all models of the category."""
     bounds: FloatArray
+    """Lowest and highest coordinates of the mesh (2, 3); of the keypoints without a mesh."""
     symmetries: Symmetries = field(default_factory=Symmetries)
+    """Reflections and rotations, as rows of ``xyz`` that exchange places."""
     mesh_path: Path | None = None
 
     def __post_init__(self) -> None:

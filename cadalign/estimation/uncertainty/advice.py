@@ -44,29 +44,19 @@ _LEAST_SPREAD = 1e-6  # of points whose displacements a shape leaves out [model 
 
 @dataclass(frozen=True)
 class Advice:
-    """One piece of evidence that could be added, and the standard deviations with it.
-
-    Parameters
-    ----------
-    kind : {"keypoint", "mask", "view", "lengths"}
-    detail : int or str
-        Id of the keypoint; names of the two lengths; empty otherwise.
-    rotation_deg : float
-        Of the rotation [degrees].
-    position : float
-        Of the translation, over the distance.
-    stretch : tuple of 3 float
-        Of the lengths along x, y, z, relative.
-    view : int
-        Number of the view that a keypoint or a mask is added to.
-    """
+    """One piece of evidence that could be added, and the standard deviations with it."""
 
     kind: str
     detail: Hashable
+    """Id of the keypoint; names of the two lengths; empty otherwise."""
     rotation_deg: float
+    """Of the rotation [degrees]."""
     position: float
+    """Of the translation, over the distance."""
     stretch: tuple[float, float, float]
+    """Of the lengths along x, y, z, relative."""
     view: int = 0
+    """Number of the view that a keypoint or a mask is added to."""
 
     @property
     def worst(self) -> float:

@@ -47,39 +47,28 @@ class Sensitivity:
     frame of one view's camera [rad], the translation [model units], the logarithms of the object's
     lengths along x, y, z and, where it was estimated, of the focal length. Rows of what is held are
     0.
-
-    Parameters
-    ----------
-    ids : tuple of int or str
-        Ids or rows of the n keypoints of all views, one view after the other.
-    views : (n,) int
-        Numbers of the views that they are in.
-    by_points_2d : (u, n, 2) float
-        Derivatives by the observed keypoints [per px].
-    by_log_sigma : (u, n) float
-        Derivatives by the logarithm of each keypoint's standard deviation.
-    by_points_3d : (u, n, 3) float
-        Derivatives by the model's keypoints [per model unit]; of a learned shape, by its mean's.
-        Rows of one keypoint in several views are equal: the model's moves in all.
-    points_by_points_2d : (m, 3, n, 2) float, optional
-        Derivatives of all keypoints of a shape that is not exact [model units per px].
-    points_by_log_sigma : (m, 3, n) float, optional
-        The same by the logarithms of the standard deviations.
-    sigma : (n,) float
-        Standard deviations of the keypoints that the estimate took [px].
-    covariance : (u, u) float
-        `cadalign.Result.covariance`, in that view's frame.
     """
 
     ids: tuple[Hashable, ...]
+    """Ids or rows of the n keypoints of all views, one view after the other."""
     views: IntArray
+    """Numbers of the views that they are in (n,)."""
     by_points_2d: FloatArray
+    """Derivatives by the observed keypoints (u, n, 2) [per px]."""
     by_log_sigma: FloatArray
+    """Derivatives by the logarithm of each keypoint's standard deviation (u, n)."""
     by_points_3d: FloatArray
+    """Derivatives by the model's keypoints (u, n, 3) [per model unit]; of a learned shape, by its
+    mean's. Rows of one keypoint in several views are equal: the model's moves in all."""
     points_by_points_2d: FloatArray | None
+    """Derivatives of all keypoints of a shape that is not exact (m, 3, n, 2) [model units per
+    px]."""
     points_by_log_sigma: FloatArray | None
+    """The same by the logarithms of the standard deviations (m, 3, n)."""
     sigma: FloatArray
+    """Standard deviations of the keypoints that the estimate took (n,) [px]."""
     covariance: FloatArray
+    """`cadalign.Result.covariance` (u, u), in that view's frame."""
 
     @property
     def influence(self) -> FloatArray:

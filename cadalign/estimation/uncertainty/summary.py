@@ -28,24 +28,16 @@ _MOST_NAMED = 5  # outliers, in a sentence
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Predicted standard deviations of an alignment.
-
-    Parameters
-    ----------
-    rotation_deg : float
-        Rotation [degrees]: the root of the sum of the variances about three axes.
-    translation : tuple of 3 float
-        Along the camera's axes [model units].
-    scale : tuple of 3 float
-        Scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known.
-    focal : float
-        Focal length, relative; 0 where it is known.
-    """
+    """Predicted standard deviations of an alignment."""
 
     rotation_deg: float
+    """Rotation [degrees]: the root of the sum of the variances about three axes."""
     translation: tuple[float, float, float]
+    """Along the camera's axes [model units]."""
     scale: tuple[float, float, float]
+    """Scale along the model's x, y, z, relative (0.02 is 2 %); 0 where it is known."""
     focal: float
+    """Focal length, relative; 0 where it is known."""
 
 
 def uncertainty_of(covariance: FloatArray) -> Uncertainty:
@@ -181,34 +173,23 @@ def another_pose(
 
 @dataclass(frozen=True)
 class EvidenceSummary:
-    """Agreement of one piece of evidence with a joint estimate.
-
-    Parameters
-    ----------
-    kind : str
-        "keypoints", "mask", "photo", "depth", "gravity", "size", "camera height", "rig", or the
-        name of a registered kind.
-    view : int, optional
-        Number of the view; None for the object's size.
-    count : int
-        Number of measurements: keypoints, contour pixels, depths, directions, lengths.
-    rms_sigmas : float
-        Root mean square residual, in standard deviations of the measurements.
-    rms : float
-        Root mean square residual in ``unit``.
-    unit : str
-        "px", "deg" or "" (the unit of lengths). A camera's motion has no residual of its own.
-    share : float, optional
-        Share of the model's outline that was found in a photo, 0 where the photo was left out.
-    """
+    """Agreement of one piece of evidence with a joint estimate."""
 
     kind: str
+    """Name of the kind: "keypoints", "mask", "photo", "depth", "gravity", "size", "camera height",
+    "rig", or that of a registered one."""
     view: int | None
+    """Number of the view; None for the object's size."""
     count: int
+    """Number of measurements: keypoints, contour pixels, depths, directions, lengths."""
     rms_sigmas: float
+    """Root mean square residual, in standard deviations of the measurements."""
     rms: float
+    """Root mean square residual in ``unit``."""
     unit: str
+    """One of "px", "deg", "" (the unit of lengths). A camera's motion has no residual."""
     share: float | None = None
+    """Share of the model's outline that was found in a photo, 0 where the photo was left out."""
 
     @property
     def name(self) -> str:
@@ -224,19 +205,13 @@ class EvidenceSummary:
 
 @dataclass(frozen=True)
 class Contribution:
-    """Deviations of a joint estimate with all evidence but one piece.
-
-    Parameters
-    ----------
-    kind, view
-        As of `EvidenceSummary`.
-    without : Uncertainty
-        Standard deviations without the piece, infinite for what nothing else determines.
-    """
+    """Uncertainty of a joint estimate with all evidence but one piece."""
 
     kind: str
     view: int | None
+    """As of `EvidenceSummary`."""
     without: Uncertainty
+    """Standard deviations without the piece, infinite for what nothing else determines."""
 
     @property
     def name(self) -> str:
@@ -259,29 +234,20 @@ def name_of(kind: str, view: int | None) -> str:
 
 @dataclass(frozen=True)
 class Misfit:
-    """Residuals that are larger than the standard deviations of the keypoints explain.
-
-    Parameters
-    ----------
-    chi_square : float
-        Sum of the losses on the whitened residuals: of their squares, with the linear loss.
-    redundancy : int
-        What is expected of it: the equations minus the unknowns.
-    free_scale : tuple of 3 float, optional
-        The scales without the constraints on them (stretch=, stretch_sigma), where it is these
-        that contradict the keypoints.
-    outliers : mapping of int to float
-        The keypoints without which the others fit, and their distances from where the others put
-        them [px]; empty where no few keypoints are to blame.
-    camera : Camera, optional
-        The camera that the keypoints fit, where they contradict the given one.
-    """
+    """Residuals that are larger than the standard deviations of the keypoints explain."""
 
     chi_square: float
+    """Sum of the losses on the whitened residuals: of their squares, with the linear loss."""
     redundancy: int
+    """What is expected of it: the equations minus the unknowns."""
     free_scale: tuple[float, float, float] | None = None
+    """The scales without the constraints on them (stretch=, stretch_sigma), where it is these that
+    contradict the keypoints."""
     outliers: Mapping[int, float] = field(default_factory=dict)
+    """The keypoints without which the others fit, and their distances from where the others put
+    them [px]; empty where no few keypoints are to blame."""
     camera: Camera | None = None
+    """The camera that the keypoints fit, where they contradict the given one."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, for JSON."""
@@ -326,39 +292,27 @@ class Misfit:
 
 @dataclass(frozen=True, eq=False)
 class MaskResiduals:
-    """The model's rim beside a mask's contour, at samples 2 px apart along it.
-
-    Parameters
-    ----------
-    points : (s, 2) float
-        Samples of the contour, without those near the image's border [px]; of the mask's convex
-        hull where the model is similar to the object in its outermost points alone.
-    normals : (s, 2) float
-        Unit normals, from the object outwards.
-    residuals : (s,) float
-        How far outside of the contour the model's rim lies along the normal, ``offset`` added [px];
-        NaN where no rim is near.
-    inliers : (s,) bool
-        Samples that agree with the rest.
-    sigma : float
-        Standard deviation of the residuals, given or estimated [px].
-    correlation : float
-        Number of neighbouring samples that count as one, for their residuals are alike.
-    offset : float
-        How far outside of the model's rim the whole contour lies, as that of a dilated mask does
-        [px].
-    is_used : bool
-        False for a mask that contradicts the rest of the evidence, which was left out.
-    """
+    """The model's rim beside a mask's contour, at samples 2 px apart along it."""
 
     points: FloatArray
+    """Samples of the contour (s, 2), without those near the image's border [px]; of the mask's
+    convex hull where the model is similar to the object in its outermost points alone."""
     normals: FloatArray
+    """Unit normals (s, 2), from the object outwards."""
     residuals: FloatArray
+    """How far outside of the contour the model's rim lies along the normal (s,), ``offset`` added
+    [px]; NaN where no rim is near."""
     inliers: BoolArray
+    """Samples that agree with the rest (s,)."""
     sigma: float
+    """Standard deviation of the residuals, given or estimated [px]."""
     correlation: float
+    """Number of neighbouring samples that count as one, for their residuals are alike."""
     offset: float
+    """How far outside of the model's rim the whole contour lies, as that of a dilated mask does
+    [px]."""
     is_used: bool = True
+    """False for a mask that contradicts the rest of the evidence, which was left out."""
 
     @property
     def rms(self) -> float:

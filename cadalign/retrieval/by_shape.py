@@ -22,7 +22,7 @@ effect.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -61,19 +61,13 @@ _INAPPLICABLE = {"method": "optimal", "symmetries": False}
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Models of a category in the terms of its shape model.
+    """Models of a category in the terms of its shape model; means are weighted by `_weights`."""
 
-    ``centred`` (n, m + 2, 3) holds their keypoints and boxes, completed, about their ``centres``
-    (n, 3), and ``squares`` (n, 3) their variances, all weighted by `_weights`; ``has`` (n, m) says
-    which keypoints they have; ``deviation`` is their distance from their nearest ones per
-    coordinate.
-    """
-
-    centred: FloatArray
-    centres: FloatArray
-    squares: FloatArray
-    has: BoolArray
-    deviation: float
+    centred: FloatArray  # (n, m + 2, 3), keypoints and boxes, completed, about their centres
+    centres: FloatArray  # (n, 3)
+    squares: FloatArray  # (n, 3), variances
+    has: BoolArray  # (n, m), which keypoints they have
+    deviation: float  # distance from their nearest ones per coordinate
 
 
 def shapes_by_category(
@@ -134,14 +128,14 @@ def rank_by_shape(
         camera.
     """
     parts = []
-    for category, shape in sorted(shapes.items()):
+    for category, shape, view, gains in _shown(observed, options, shapes):
         own = table.rows_of(category)
         chosen = (candidates.models >= own.start) & (candidates.models < own.stop)
-        if np.isin(observed.query.ids, shape.ids).sum() >= _LEAST_KEYPOINTS and chosen.any():
-            rows = np.flatnonzero(chosen)
+        if chosen.any():
+            rows, known = np.flatnonzero(chosen), _shapes_of(table, category, shape)
             models = candidates.models[rows] - own.start
-            known = _shapes_of(table, category, shape)
-            parts.append(_rank_category(rows, models, known, observed, options, shape))
+            logs, poses, kept = _rank_category(models, known, view, gains, options, shape)
+            parts.append((rows[kept], logs[kept], poses[kept]))
     if not parts:
         raise _no_shape()
     ranked, logs, poses = map(np.concatenate, zip(*parts, strict=True))
@@ -172,15 +166,11 @@ def camera_by_shape(
     found: list[tuple[float, Camera]] = []
     unknown = replace(observed.camera, focal_known=False)
     loss: dict[str, Any] = {"loss": options.loss, "loss_scale": options.loss_scale}
-    for _, shape in sorted(shapes.items()):
-        in_image = np.isin(observed.query.ids, shape.ids)
-        if in_image.sum() < _LEAST_KEYPOINTS:
-            continue
-        view = replace(_view(observed, in_image, options), camera=unknown)
+    for _, shape, view, gains in _shown(observed, options, shapes):
+        view = replace(view, camera=unknown)
         free = align(shape, view, focal="estimate", focal_prior=prior, **loss)
         view = replace(view, camera=free.camera)
         posterior = shape_posterior(align(shape, view, **loss), view, **loss)
-        gains = float(observed.query.gains[in_image].sum())
         found.append((posterior.log_evidence + gains, free.camera))
     if not found:
         raise _no_shape()
@@ -188,24 +178,34 @@ def camera_by_shape(
 
 
 def _no_shape() -> InputError:
-    return InputError(
-        f"no shape model has {_LEAST_KEYPOINTS} of the keypoints",
-        where="ids",
-        fix="check them, or rank without shape",
-    )
+    what = f"no shape model has {_LEAST_KEYPOINTS} of the keypoints"
+    return InputError(what, where="ids", fix="check them, or rank without shape")
+
+
+def _shown(
+    observed: Observed, options: RetrievalOptions, shapes: Mapping[str, ShapeModel]
+) -> Iterator[tuple[str, ShapeModel, View, float]]:
+    """Categories and shape models with 3 of the image's keypoints, these, and their gains."""
+    sigma, query = options.sigma, observed.query
+    assert sigma is not None
+    for category, shape in sorted(shapes.items()):
+        has = np.isin(query.ids, shape.ids)
+        if has.sum() >= _LEAST_KEYPOINTS:
+            own = np.asarray(sigma)[observed.order][has] if np.ndim(sigma) else sigma
+            ids, points_2d = query.ids[has].tolist(), observed.points_2d[has]
+            view = View(observed.camera, points_2d, ids=ids, sigma=own)
+            yield category, shape, view, float(query.gains[has].sum())
 
 
 def _rank_category(
-    rows: IntArray,
     models: IntArray,
     known: _Shapes,
-    observed: Observed,
+    view: View,
+    gains: float,
     options: RetrievalOptions,
     shape: ShapeModel,
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Candidates of a category, their log probabilities (c,), and their poses (c, 15)."""
-    in_image = np.isin(observed.query.ids, shape.ids)
-    view = _view(observed, in_image, options)
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Log probabilities (c,) of a category's models, their poses (c, 15), and which are ahead."""
     result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
     posterior = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
     estimate = np.concatenate([result.points_3d, result.bounds])
@@ -220,29 +220,19 @@ def _rank_category(
     logs = log_likelihoods(
         placed.reshape(len(models), -1), _widened(posterior, estimate, deviation)
     )
-    seen = np.isin(shape.ids, observed.query.ids)
+    seen = np.isin(shape.ids, view.keypoint_ids)
     has = known.has[models]
     logs = logs + (~has[:, seen]).sum(axis=1) * np.log(options.spurious)
     logs += has[:, ~seen].sum(axis=1) * np.log(options.missing_prob)
     logs += has[:, seen].sum(axis=1) * np.log1p(-options.missing_prob)
-    evidence = posterior.log_evidence + float(observed.query.gains[in_image].sum())
     axes, centres = options.fitting.stretched_axes, known.centres[models]
     scales = _scales(squares, products, axes)
     poses = _poses(result, scales, aim - scales * centres, axes, options.max_stretch)
     # Models share the probability of their category.
-    logs += evidence - np.logaddexp.reduce(logs)
-    kept = _least_depths(poses, centred[:, :-BOX_ROWS], centres) > 0
-    return rows[kept], logs[kept], poses[kept]
-
-
-def _view(observed: Observed, in_image: BoolArray, options: RetrievalOptions) -> View:
-    """The image's keypoints that a shape model has."""
-    sigma = options.sigma
-    assert sigma is not None
-    if np.ndim(sigma):
-        sigma = np.asarray(sigma)[observed.order][in_image]
-    ids = observed.query.ids[in_image].tolist()
-    return View(observed.camera, observed.points_2d[in_image], ids=ids, sigma=sigma)
+    logs += posterior.log_evidence + gains - np.logaddexp.reduce(logs)
+    across = poses[:, 6:9] * poses[:, 12:]  # the last row of the linear part
+    depths = np.einsum("nka,na->nk", centred[:, :-BOX_ROWS], across).min(axis=1)
+    return logs, poses, np.asarray(depths + (centres * across).sum(axis=1) + poses[:, 11] > 0)
 
 
 def _widened(posterior: ShapePosterior, estimate: FloatArray, deviation: float) -> Gaussians:
@@ -294,13 +284,6 @@ def _poses(
     translation = (pose.translation + (shifts * pose.scale) @ pose.rotation.T) / size
     turned = np.broadcast_to(pose.rotation.ravel(), (len(stretch), 9))
     return np.concatenate([turned, translation, stretch * pose.scale], axis=1)
-
-
-def _least_depths(poses: FloatArray, centred: FloatArray, centres: FloatArray) -> FloatArray:
-    """Depth of the keypoint of each model that is nearest to the camera."""
-    across = poses[:, 6:9] * poses[:, 12:]
-    depths = np.einsum("nka,na->nk", centred, across)
-    return np.asarray(depths.min(axis=1) + (centres * across).sum(axis=1) + poses[:, 11])
 
 
 @lru_cache(maxsize=32)

@@ -93,31 +93,30 @@ class KeypointStatistics(FittedKeypoints):
         placed = self._placed()
         if self.covariance is None:
             return placed
+        if self.misfit is not None:
+            doubts = [str(self.misfit)]
+        else:
+            from cadalign.estimation.uncertainty.misfit import unverified_stretch
+
+            unverified = unverified_stretch(self)
+            doubts = [] if unverified is None else [unverified]
         kept, options = self.points_3d[self.inliers], self.options
         is_estimated = options.focal == "estimate"
-        return (
-            placed
-            + self._contradictions()
-            + weaknesses_of_keypoints(
-                kept,
-                self.alignment,
-                uncertainty_of(self.covariance),
-                redundancy=2 * len(kept) - options.unknowns,
-                stretch_sigma=options.stretch_sigma,
-                doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
-            )
+        weak = weaknesses_of_keypoints(
+            kept,
+            self.alignment,
+            uncertainty_of(self.covariance),
+            redundancy=2 * len(kept) - options.unknowns,
+            stretch_sigma=options.stretch_sigma,
+            doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
         )
-
-    @property
-    def _observed(self) -> FloatArray:
-        """Keypoints in the image (m, 2) [px], without those that lie behind the camera."""
-        ahead = np.isfinite(self.residuals).all(axis=1)
-        in_camera = self.alignment.apply(self.points_3d[ahead])
-        return np.asarray(self.camera.project_where_ahead(in_camera) - self.residuals[ahead])
+        return (*placed, *doubts, *weak)
 
     def _placed(self) -> tuple[str, ...]:
         """Warnings about keypoints and a principal point outside of the image."""
-        observed = self._observed
+        ahead = np.isfinite(self.residuals).all(axis=1)
+        in_camera = self.alignment.apply(self.points_3d[ahead])
+        observed = self.camera.project_where_ahead(in_camera) - self.residuals[ahead]
         if self.camera.is_centred and self.camera.contains(observed).all():
             return ()
         from cadalign.estimation.mistakes import outside_image  # rarely asked
@@ -136,15 +135,6 @@ class KeypointStatistics(FittedKeypoints):
         from cadalign.estimation.consensus import mistake_in  # with the kernels of the search
 
         return mistake_in(self.search, self.search.explained(self.alignment, self.residuals))
-
-    def _contradictions(self) -> tuple[str, ...]:
-        """Warnings about a misfit, or about a constraint that cannot be tested."""
-        if self.misfit is not None:
-            return (str(self.misfit),)
-        from cadalign.estimation.uncertainty.misfit import unverified_stretch
-
-        doubt = unverified_stretch(self)
-        return () if doubt is None else (doubt,)
 
     @cached_property
     def evidence(self) -> tuple[EvidenceSummary, ...]:

@@ -220,7 +220,8 @@ def _rank_category(
     logs = log_likelihoods(
         placed.reshape(len(models), -1), _widened(posterior, estimate, deviation)
     )
-    seen = np.isin(shape.ids, view.keypoint_ids)
+    shown = set(view.keypoint_ids)
+    seen = np.array([label in shown for label in shape.ids])
     has = known.has[models]
     logs = logs + (~has[:, seen]).sum(axis=1) * np.log(options.spurious)
     logs += has[:, ~seen].sum(axis=1) * np.log(options.missing_prob)

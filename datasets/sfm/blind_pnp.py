@@ -9,15 +9,13 @@ Optimization", ECCV 2020 (github.com/dylan-campbell/bpnpnet).
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, as_floats
 from cadalign.datasets.sfm.correspondences import (
-    CorrespondenceFormat,
     Correspondences,
     CorrespondenceSet,
     rigid_pose,
@@ -31,9 +29,23 @@ DEFAULT_FOCAL = 800.0
 """The virtual camera's focal length [px] where the files don't say one."""
 
 _LARGEST_IMAGE = 2**30
-_FOLDERS = (".", "preprocessed")
 # Pairs whose median distance under the true pose [normalised] is larger don't belong together.
 _PAIRED = 0.05
+
+
+class _Layout(NamedTuple):
+    """The names of the pickles; rotations and translations are the last two of the required."""
+
+    required: tuple[str, ...]
+    optional: tuple[str, ...]
+
+
+_MATCHES = _Layout(("matches", "R", "t"), ("inlier_matches", "focal"))
+_PREPROCESSED = _Layout(
+    ("p2d", "p3d", "R_gt", "t_gt"), ("W_gt", "num_points_2d", "num_points_3d", "focal")
+)
+LAYOUTS = (_MATCHES, _PREPROCESSED)
+FOLDERS = (".", "preprocessed")
 
 
 class BlindPnP(CorrespondenceSet):
@@ -86,15 +98,14 @@ class BlindPnP(CorrespondenceSet):
         if focal is not None and not (np.isfinite(focal) and focal > 0):
             raise InputError(f"{focal!r} is not a focal length", where="focal")
         self._focal = focal
-        folder, self._layout = _find_layout(Path(path))
-        self._files = {
-            name: folder / f"{name}.pkl"
-            for name in (*self._layout.required, *self._layout.optional)
-            if name in self._layout.required or (folder / f"{name}.pkl").is_file()
-        }
+        folder, layout = _find_layout(Path(path))
+        self._is_matches = layout == _MATCHES
+        *_, self._rotation, self._translation = layout.required
+        optional = [name for name in layout.optional if (folder / f"{name}.pkl").is_file()]
+        self._files = {name: folder / f"{name}.pkl" for name in (*layout.required, *optional)}
         # The smallest file is enough to count the samples.
-        translations = _load_samples(self._files[self._layout.translation])
-        self._data: dict[str, Any] = {self._layout.translation: translations}
+        translations = _load_samples(self._files[self._translation])
+        self._data: dict[str, Any] = {self._translation: translations}
         super().__init__(folder, [str(position) for position in range(len(translations))])
 
     def _prepare(self) -> None:
@@ -102,24 +113,21 @@ class BlindPnP(CorrespondenceSet):
             if name not in self._data:
                 samples = _load_samples(file)
                 if len(samples) != len(self):
-                    raise DataError(
-                        f"holds {len(samples)} samples, {self._layout.translation}.pkl {len(self)}",
-                        where=str(file),
-                        fix="the files must be of one split; get them again",
-                    )
+                    what = f"holds {len(samples)} samples, {self._translation}.pkl {len(self)}"
+                    fix = "the files must be of one split; get them again"
+                    raise DataError(what, where=str(file), fix=fix)
                 self._data[name] = samples
 
     def _read(self, position: int) -> Correspondences:
-        pose = rigid_pose(
-            self._array(self._layout.rotation, position, shape=(3, 3)),
-            self._flat(self._layout.translation, position),
-        )
-        if self._layout == _MATCHES:
+        rotation = self._array(self._rotation, position, shape=(3, 3))
+        pose = rigid_pose(rotation, self._flat(self._translation, position))
+        if self._is_matches:
             rays, points_3d = self._matched(position)
         else:
             rays, points_3d = self._paired(position, pose)
         if not len(rays):
-            raise InputError("there are no correspondences", where=self._layout.points[0])
+            where = "matches" if self._is_matches else "p2d"
+            raise InputError("there are no correspondences", where=where)
         distance = _distance(rays, points_3d, pose)
         if not distance <= _PAIRED:
             raise InputError(
@@ -129,13 +137,8 @@ class BlindPnP(CorrespondenceSet):
                 fix="is W_gt.pkl or inlier_matches.pkl, which says what belongs together, missing?",
             )
         camera = _virtual_camera(self._focal_lengths(position), rays)
-        return Correspondences(
-            id=self.ids[position],
-            points_3d=points_3d,
-            points_2d=camera.pixels_from_normalized(rays),
-            camera=camera,
-            cam_from_world=pose,
-        )
+        pixels = camera.pixels_from_normalized(rays)
+        return Correspondences(self.ids[position], points_3d, pixels, camera, pose)
 
     def _matched(self, position: int) -> tuple[FloatArray, FloatArray]:
         """Image points (n, 2) and scene points (n, 3) out of ``matches``."""
@@ -156,11 +159,9 @@ class BlindPnP(CorrespondenceSet):
         points_3d = self._array("p3d", position, shape=(None, 3))[: self._count("3d", position)]
         if "W_gt" not in self._data:
             if len(rays) != len(points_3d):
-                raise InputError(
-                    f"{len(rays)} image points but {len(points_3d)} scene points",
-                    where="p2d",
-                    fix="W_gt.pkl, which says which belong together, is missing",
-                )
+                what = f"{len(rays)} image points but {len(points_3d)} scene points"
+                fix = "W_gt.pkl, which says which belong together, is missing"
+                raise InputError(what, where="p2d", fix=fix)
             return rays, points_3d
         partners = _rows(self._flat("W_gt", position))
         scene_rows, image_rows = _pairs(partners, len(points_3d), len(rays))
@@ -205,43 +206,20 @@ class BlindPnP(CorrespondenceSet):
             raise InputError("there is no such sample", where=name) from None
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """The names of the pickles."""
-
-    points: tuple[str, ...]
-    rotation: str
-    translation: str
-    optional: tuple[str, ...]
-
-    @property
-    def required(self) -> tuple[str, ...]:
-        return (*self.points, self.rotation, self.translation)
-
-
-_MATCHES = _Layout(("matches",), "R", "t", ("inlier_matches", "focal"))
-_PREPROCESSED = _Layout(
-    ("p2d", "p3d"), "R_gt", "t_gt", ("W_gt", "num_points_2d", "num_points_3d", "focal")
-)
-
-
 def _find_layout(root: Path) -> tuple[Path, _Layout]:
     if not root.is_dir():
         raise DataError("no such folder", where=str(root), fix="give a split's folder")
     closest: tuple[int, str] = (0, "there are no correspondences")
-    for folder in (root / name for name in _FOLDERS):
-        for layout in (_MATCHES, _PREPROCESSED):
+    for folder in (root / name for name in FOLDERS):
+        for layout in LAYOUTS:
             missing = [n for n in layout.required if not (folder / f"{n}.pkl").is_file()]
             if not missing:
                 return folder, layout
             found = len(layout.required) - len(missing)
             text = ", ".join(f"{name}.pkl" for name in missing)
             closest = max(closest, (found, f"{text} missing in {folder}"))
-    raise DataError(
-        closest[1],
-        where=str(root),
-        fix="give a split's folder, which holds matches.pkl, R.pkl and t.pkl, or preprocessed/",
-    )
+    fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl, or preprocessed/"
+    raise DataError(closest[1], where=str(root), fix=fix)
 
 
 def _load_samples(file: Path) -> Any:
@@ -284,16 +262,3 @@ def _virtual_camera(focal_lengths: FloatArray, rays: FloatArray) -> Camera:
         raise InputError(f"image points reach {reach.max():g} px from the centre", where="points")
     width, height = (2 * int(length) + 1 for length in reach)
     return Camera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2)
-
-
-FORMAT = CorrespondenceFormat(
-    "blind-pnp",
-    BlindPnP,
-    "matches.pkl, R.pkl and t.pkl, or p2d.pkl, p3d.pkl, R_gt.pkl and t_gt.pkl "
-    "(also in preprocessed)",
-    tuple(
-        tuple(f"{folder}/{stem}.pkl" for stem in layout.required)
-        for folder in _FOLDERS
-        for layout in (_MATCHES, _PREPROCESSED)
-    ),
-)

@@ -9,14 +9,13 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets.sfm.correspondences import (
-    CorrespondenceFormat,
     Correspondences,
     CorrespondenceSet,
     rigid_pose,
@@ -87,7 +86,8 @@ class Bundler(CorrespondenceSet):
         row = int(self._rows[position])
         name = self.ids[position]
         focal, k1, k2 = self._model.cameras[row, :3].tolist()
-        points, centred = self._model.views(row)
+        views = slice(self._model.view_starts[row], self._model.view_starts[row + 1])
+        points, centred = self._model.view_points[views], self._model.view_pixels[views]
         width, height = self._size(row, centred, name)
         middle = np.array([(width - 1) / 2, (height - 1) / 2])
         pose = self._model.cameras[row, 3:].reshape(4, 3)
@@ -113,9 +113,11 @@ class Bundler(CorrespondenceSet):
         if size is None:
             return 2 * int(np.ceil(reach[0])) + 1, 2 * int(np.ceil(reach[1])) + 1
         if (reach > (np.array(size) - 1) / 2 + _MARGIN).any():
+            what = (
+                f"observations reach {reach[0]:.1f} and {reach[1]:.1f} px from the middle, outside"
+            )
             raise DataError(
-                f"observations reach {reach[0]:.1f} and {reach[1]:.1f} px from the middle, outside "
-                f"an image of {size[0]} x {size[1]}",
+                f"{what} an image of {size[0]} x {size[1]}",
                 where=f"{self.source}, image {name}",
                 fix="give the sizes of the photos that the model was made from",
             )
@@ -140,32 +142,24 @@ def _find_file(path: Path) -> Path:
 def _find_photos(file: Path, count: int) -> tuple[list[str], list[Path | None]]:
     """Ids and files, where there are any, of a model's list, or of a folder ``images``."""
     # Bundler writes bundle/bundle.out beside list.txt.
-    for folder in (file.parent, file.parent.parent):
-        if (folder / "list.txt").is_file():
-            return _listed_photos(folder / "list.txt", file, count)
+    for listing in (file.parent / "list.txt", file.parent.parent / "list.txt"):
+        if not listing.is_file():
+            continue
+        # A line is a path, optionally followed by 0 and the focal length that the EXIF data give.
+        lines = read_text(listing, errors="replace").split("\n")
+        names = [line.split()[0].removeprefix("./") for line in lines if line.strip()]
+        if len(names) != count:
+            what = f"names {len(names)} photos, {file.name} has {count}"
+            fix = "the list must be the one that the model was made with"
+            raise DataError(what, where=str(listing), fix=fix)
+        places = ((listing.parent / n, listing.parent / "images" / Path(n).name) for n in names)
+        return names, [next(filter(Path.is_file, place), None) for place in places]
     folder = file.parent / "images"
     found = sorted(folder.iterdir()) if folder.is_dir() else []
     found = [path for path in found if path.suffix.lower() in _IMAGE_SUFFIXES]
     if len(found) == count:
         return [path.name for path in found], [*found]
     return [str(row) for row in range(count)], [None] * count
-
-
-def _listed_photos(listing: Path, file: Path, count: int) -> tuple[list[str], list[Path | None]]:
-    # A line is a path, optionally followed by 0 and the focal length that the EXIF data give.
-    lines = read_text(listing, errors="replace").split("\n")
-    names = [line.split()[0].removeprefix("./") for line in lines if line.strip()]
-    if len(names) != count:
-        raise DataError(
-            f"names {len(names)} photos, {file.name} has {count}",
-            where=str(listing),
-            fix="the list must be the one that the model was made with",
-        )
-    paths = []
-    for name in names:
-        candidates = [listing.parent / name, listing.parent / "images" / Path(name).name]
-        paths.append(next((path for path in candidates if path.is_file()), None))
-    return names, paths
 
 
 def _as_sizes(
@@ -185,8 +179,7 @@ def _as_sizes(
 # The file -----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Model:
+class _Model(NamedTuple):
     """Content of the file; observations are ordered by camera."""
 
     # (c, 15) focal length [px], k1, k2, rotation (row by row) and translation, world to camera;
@@ -196,11 +189,6 @@ class _Model:
     view_points: IntArray  # (v,) the point that each observation shows
     view_pixels: FloatArray  # (v, 2) where, from the image's middle [px], x to the right and y up
     view_starts: IntArray  # (c + 1,) where each camera's observations begin
-
-    def views(self, camera: int) -> tuple[IntArray, FloatArray]:
-        """One camera's observations: points (n,) and positions (n, 2)."""
-        chosen = slice(self.view_starts[camera], self.view_starts[camera + 1])
-        return self.view_points[chosen], self.view_pixels[chosen]
 
 
 def _read_bundler(path: Path) -> _Model:
@@ -216,15 +204,13 @@ def _read_bundler(path: Path) -> _Model:
     view_points = np.repeat(np.arange(point_count), [len(each) for each in views])
     table = np.concatenate([np.empty((0, _VIEW_VALUES)), *views])
     cameras = table[:, 0]
-    bad = np.flatnonzero(
-        ~((cameras >= 0) & (cameras < camera_count) & (cameras == np.floor(cameras)))
-    )
-    if len(bad):
-        raise damaged(
-            f"point {view_points[bad[0]]} is observed in camera {cameras[bad[0]]:g}, which doesn't "
-            f"exist; there are {camera_count}",
-            path,
+    is_known = (cameras >= 0) & (cameras < camera_count) & (cameras == np.floor(cameras))
+    if not is_known.all():
+        row = int(np.argmin(is_known))
+        what = (
+            f"point {view_points[row]} is observed in camera {cameras[row]:g}, which doesn't exist"
         )
+        raise damaged(f"{what}; there are {camera_count}", path)
     order = np.argsort(cameras, kind="stable")
     return _Model(
         cameras=values[2:start].reshape(-1, _CAMERA_VALUES),
@@ -260,41 +246,25 @@ def _read_values(path: Path) -> FloatArray:
     text = read_text(path, errors="replace")
     header, _, body = text.partition("\n")
     if header.strip() != _HEADER:
-        raise DataError(
-            f"begins with {header.strip()[:40]!r}",
-            where=str(path),
-            fix=f"only files that begin with {_HEADER!r} can be read",
-        )
+        fix = f"only files that begin with {_HEADER!r} can be read"
+        raise DataError(f"begins with {header.strip()[:40]!r}", where=str(path), fix=fix)
     try:
         # Deprecated for a long time: to stop at text that is no number with a mere warning.
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)
             return np.fromstring(body, dtype=float, sep=" ")
     except (ValueError, DeprecationWarning):
-        raise _not_a_number(body, path) from None
-
-
-def _not_a_number(body: str, path: Path) -> DataError:
+        pass
     for number, line in enumerate(body.split("\n"), start=2):
         for word in line.split():
             try:
                 float(word)
             except ValueError:
-                return damaged(f"{word[:40]!r} is not a number", f"{path}, line {number}")
-    return damaged("holds something else than numbers", path)
+                raise damaged(f"{word[:40]!r} is not a number", f"{path}, line {number}") from None
+    raise damaged("holds something else than numbers", path)
 
 
 def _as_count(value: float, path: Path, where: str) -> int:
     if not (0 <= value < np.inf and value % 1 == 0):
         raise damaged(f"{value:g} is not a number of things", f"{path}, {where}")
     return int(value)
-
-
-FORMAT = CorrespondenceFormat(
-    "bundler",
-    Bundler,
-    "bundle.out (also in bundle, or one *.out)",
-    (("bundle.out",), ("bundle/bundle.out",), ("*.out",)),
-    # Many a program calls its log something.out.
-    header=b"# Bundle file",
-)

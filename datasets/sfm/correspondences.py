@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -17,11 +16,8 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_onl
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import open_input
 
 logger = logging.getLogger("cadalign")
-
-# Files hold rotations with 6 digits or more.
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,31 +262,3 @@ def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment
     matrix = as_floats(rotation, name="rotation", shape=(3, 3))
     shift = as_floats(np.reshape(translation, -1), name="translation", shape=(3,))
     return Alignment(matrix, shift, np.ones(3))
-
-
-@dataclass(frozen=True)
-class CorrespondenceFormat:
-    """A format of correspondences, and the files that it is recognised by."""
-
-    name: str
-    load: Callable[[Path], CorrespondenceSet]  # makes the set of a folder
-    sought: str  # the files of this format, for messages
-    layouts: tuple[tuple[str, ...], ...]
-    """Patterns of the files below a folder, which all belong to one of the layouts."""
-    header: bytes = b""  # the first bytes of each file
-
-    def fit(self, folder: Path) -> int:
-        """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""
-        best = 0
-        for layout in self.layouts:
-            files = [[file for file in folder.glob(name) if file.is_file()] for name in layout]
-            if all(any(begins_with(file, self.header) for file in found) for found in files):
-                return 2
-            best = max(best, int(any(files)))
-        return best
-
-
-def begins_with(file: Path, header: bytes) -> bool:
-    """True if a file begins with these bytes."""
-    with open_input(file, most=sys.maxsize) as stream:
-        return stream.read(len(header)) == header

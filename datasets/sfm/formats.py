@@ -3,20 +3,70 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.datasets.sfm import blind_pnp, bundler, colmap
-from cadalign.datasets.sfm.correspondences import (
-    CorrespondenceFormat,
-    CorrespondenceSet,
-    begins_with,
-)
+from cadalign.datasets.sfm import blind_pnp, colmap
+from cadalign.datasets.sfm.bundler import Bundler
+from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
+from cadalign.io.files import open_input
 
+
+@dataclass(frozen=True)
+class _Format:
+    """A format of correspondences, and the files that it is recognised by."""
+
+    load: Callable[[Path], CorrespondenceSet]  # makes the set of a folder
+    sought: str  # the files of this format, for messages
+    layouts: tuple[tuple[str, ...], ...]
+    """Patterns of the files below a folder, which all belong to one of the layouts."""
+    header: bytes = b""  # the first bytes of each file
+
+    def fit(self, folder: Path) -> int:
+        """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""
+        best = 0
+        for layout in self.layouts:
+            files = [[file for file in folder.glob(name) if file.is_file()] for name in layout]
+            if all(any(_begins_with(file, self.header) for file in found) for found in files):
+                return 2
+            best = max(best, int(any(files)))
+        return best
+
+
+_BUNDLER_HEADER = b"# Bundle file"  # many a program calls its log something.out
+_FORMATS = {
+    "colmap": _Format(
+        colmap.Colmap,
+        "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)",
+        tuple(
+            tuple(f"{folder}/{stem}{suffix}" for stem in colmap.STEMS)
+            for folder in colmap.SUBFOLDERS
+            for suffix in colmap.SUFFIXES
+        ),
+    ),
+    "bundler": _Format(
+        Bundler,
+        "bundle.out (also in bundle, or one *.out)",
+        (("bundle.out",), ("bundle/bundle.out",), ("*.out",)),
+        header=_BUNDLER_HEADER,
+    ),
+    "blind-pnp": _Format(
+        blind_pnp.BlindPnP,
+        "matches.pkl, R.pkl and t.pkl, or p2d.pkl, p3d.pkl, R_gt.pkl and t_gt.pkl "
+        "(also in preprocessed)",
+        tuple(
+            tuple(f"{folder}/{stem}.pkl" for stem in layout.required)
+            for folder in blind_pnp.FOLDERS
+            for layout in blind_pnp.LAYOUTS
+        ),
+    ),
+}
 AUTO = "auto"
 """Recognise the format by the names of the files."""
-_FORMATS = (colmap.FORMAT, bundler.FORMAT, blind_pnp.FORMAT)
-CORRESPONDENCE_FORMATS = (AUTO, *(known.name for known in _FORMATS))
+CORRESPONDENCE_FORMATS = (AUTO, *_FORMATS)
 """The names that `open_correspondences` knows."""
 
 
@@ -29,10 +79,6 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
         A folder, as `Colmap`, `Bundler` or `BlindPnP` takes it, or Bundler's file.
     format : {"auto", "colmap", "bundler", "blind-pnp"}
         ``auto`` goes by the names of the files.
-
-    Returns
-    -------
-    CorrespondenceSet
 
     Raises
     ------
@@ -47,42 +93,34 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
     Colmap('reconstruction/images.txt', 4 images)
     """
     if format not in CORRESPONDENCE_FORMATS:
-        raise InputError(
-            f"unknown format {format!r}",
-            where="format",
-            fix=f"known are {', '.join(CORRESPONDENCE_FORMATS)}",
-        )
+        fix = f"known are {', '.join(CORRESPONDENCE_FORMATS)}"
+        raise InputError(f"unknown format {format!r}", where="format", fix=fix)
     root = Path(path)
-    if format == AUTO:
-        return _recognize(root).load(root)
-    return next(known for known in _FORMATS if known.name == format).load(root)
+    return _FORMATS[_recognize(root) if format == AUTO else format].load(root)
 
 
-def _recognize(root: Path) -> CorrespondenceFormat:
+def _recognize(root: Path) -> str:
     if root.is_file():
-        if begins_with(root, bundler.FORMAT.header):
-            return bundler.FORMAT
-        raise DataError(
-            f"not a Bundler file: it does not begin with {bundler.FORMAT.header.decode()!r}",
-            where=str(root),
-            fix="for other formats, give the folder",
-        )
+        if _begins_with(root, _BUNDLER_HEADER):
+            return "bundler"
+        what = f"not a Bundler file: it does not begin with {_BUNDLER_HEADER.decode()!r}"
+        raise DataError(what, where=str(root), fix="for other formats, give the folder")
     if not root.is_dir():
         fix = "give the folder of the correspondences"
         raise DataError("no such folder", where=str(root), fix=fix)
     # A layout with files missing is better named by its loader, which says which ones.
-    fits = [known.fit(root) for known in _FORMATS]
-    found = [known for known, fit in zip(_FORMATS, fits, strict=True) if fit and fit == max(fits)]
+    fits = {name: known.fit(root) for name, known in _FORMATS.items()}
+    found = [name for name, fit in fits.items() if fit and fit == max(fits.values())]
     if not found:
-        sought = "; ".join(f"{known.name}: {known.sought}" for known in _FORMATS)
-        raise DataError(
-            f"there are no correspondences of a known format. Looked for {sought}",
-            where=str(root),
-            fix="give the folder that holds such files",
-        )
+        sought = "; ".join(f"{name}: {known.sought}" for name, known in _FORMATS.items())
+        what = f"there are no correspondences of a known format. Looked for {sought}"
+        raise DataError(what, where=str(root), fix="give the folder that holds such files")
     if len(found) > 1:
-        names = " and ".join(known.name for known in found)
-        raise DataError(
-            f"the folder holds files of {names}", where=str(root), fix="say which format to read"
-        )
+        what = f"the folder holds files of {' and '.join(found)}"
+        raise DataError(what, where=str(root), fix="say which format to read")
     return found[0]
+
+
+def _begins_with(file: Path, header: bytes) -> bool:
+    with open_input(file, most=sys.maxsize) as stream:
+        return stream.read(len(header)) == header

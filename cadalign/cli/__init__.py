@@ -26,7 +26,7 @@ from tyro.constructors import (
 )
 
 from cadalign import __version__
-from cadalign.cli.options import UsageError
+from cadalign.cli.common import UsageError
 from cadalign.errors import CadalignError
 
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
@@ -115,7 +115,9 @@ class _Command(NamedTuple):
 
 COMMANDS = {
     "demo": _Command(
-        "demo", "Demo", "Align stretched models to pictures of the originals and show the result."
+        "evaluate",
+        "Demo",
+        "Align stretched models to pictures of the originals and show the result.",
     ),
     "fit": _Command(
         "fit", "Fit", "Align a model to what an observation file holds, and draw the result."
@@ -138,7 +140,7 @@ COMMANDS = {
     "shape": _Command("shape", "ShapeCommand", "Learn and inspect the shapes of categories."),
     "evaluate": _Command("evaluate", "Evaluate", "Evaluate methods on a dataset."),
     "simulate": _Command(
-        "simulate",
+        "evaluate",
         "Simulate",
         "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
     ),

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
 
 from cadalign.annotate.options import LOOPBACK, VIDEOS, FileOptions, SessionOptions
-from cadalign.cli.options import UsageError, flag_of, make_folder, new_console
+from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
+from cadalign.cli.options import flag_of
 from cadalign.io.files import write_json, writing
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class Annotate(FileOptions):
         from cadalign.annotate.track import write_frames
 
         folder = (self.out or video.parent) / f"{video.stem}_frames"
-        with new_console().status("reading the video"):
+        with waiting("reading the video"):
             return write_frames(video, folder, every=self.every)
 
     def run(self) -> int:
@@ -106,9 +106,8 @@ class Annotate(FileOptions):
         from cadalign.annotate.server import listen, make_app, serve
 
         options = self.session
-        console = new_console()
         if self.export is not None:
-            return _export(options, self.export, self.form, console)
+            return _export(options, self.export, self.form)
         listener = listen(self.port, self.host)
         with ExitStack() as opened:
             opened.enter_context(listener)
@@ -124,23 +123,20 @@ class Annotate(FileOptions):
                     files.written, whole_folder=options.image.is_dir(), address=access.address
                 )
             )
-            with console.status("reading photos and model"):
+            with waiting("reading photos and model"):
                 session = open_session(
                     options, files, before_saving=locks.confirm, reserve=locks.reserve
                 )
             threading.Thread(target=session.warm_up, daemon=True).start()
-            new_console(stderr=False).print(access.url, markup=False, soft_wrap=True)
-            console.print(
-                f"Open this address in a browser; end with Ctrl+C. {_reach(self.host)}",
-                markup=False,
-            )
+            answer(access.url)
+            say(f"Open this address in a browser; end with Ctrl+C. {_reach(self.host)}")
             if not self.no_open:
                 webbrowser.open(access.url)
             # Ends as Ctrl+C does, with everything saved and unlocked.
             signal.signal(signal.SIGTERM, signal.default_int_handler)
             with suppress(KeyboardInterrupt):
                 serve(make_app(session, access), listener)
-            return _save_and_say_where(session, console)
+            return _save_and_say_where(session)
 
 
 def _reach(host: str) -> str:
@@ -152,7 +148,7 @@ def _reach(host: str) -> str:
     )
 
 
-def _export(options: SessionOptions, to: Path, form: str, console: Console) -> int:
+def _export(options: SessionOptions, to: Path, form: str) -> int:
     from cadalign.annotate.exporting import annotated_photos, coco_of
     from cadalign.annotate.opening import open_session
     from cadalign.export.aligned_object import write_photo_set
@@ -162,30 +158,30 @@ def _export(options: SessionOptions, to: Path, form: str, console: Console) -> i
         data = coco_of(session)
         write_json(to, data)
         count = len(data["annotations"])
-        console.print(f"{to}: keypoints of {count} photos as COCO annotations", markup=False)
+        say(f"{to}: keypoints of {count} photos as COCO annotations")
         return 0
-    with console.status("aligning (the first time after an installation takes a minute)"):
+    with waiting("aligning (the first time after an installation takes a minute)"):
         session.ready = True  # the first alignment compiles what is not
         photos = annotated_photos(session)
     problems = write_photo_set(to, photos, form)
     for problem in problems:
-        console.print(f"Left out: {problem}", markup=False)
+        say(f"Left out: {problem}")
     count = len(photos) - len(problems)
-    console.print(f"{to}: {count} photos in the form of {form}", markup=False)
+    say(f"{to}: {count} photos in the form of {form}")
     return 0
 
 
-def _save_and_say_where(session: Session, console: Console) -> int:
+def _save_and_say_where(session: Session) -> int:
     """Save what could not be saved before, elsewhere if need be; returns the exit code."""
     folder = session.keypoints_path.parent.absolute()
     session.save_unsaved()
     if not session.unsaved:
-        console.print(f"Saved in {folder}", markup=False)
+        say(f"Saved in {folder}")
         return 0
     for trouble in sorted({state.save_error for state in session.unsaved}):
-        console.print(f"Not saved: {trouble}", markup=False)
+        say(f"Not saved: {trouble}")
     elsewhere = Path(tempfile.mkdtemp(prefix="cadalign-annotate-"))
     session.save_unsaved(elsewhere)
     if not session.unsaved:
-        console.print(f"Saved in {elsewhere} instead", markup=False)
+        say(f"Saved in {elsewhere} instead")
     return 1

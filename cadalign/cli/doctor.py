@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cadalign.cli.options import JsonOption, new_console
+from cadalign.cli.common import JsonOption, answer, new_console, print_json, waiting
 
 if TYPE_CHECKING:
     from cadalign.datasets import PhotoSummary
@@ -41,10 +39,10 @@ class Doctor(JsonOption):
             return self._compile()
         from cadalign.health import examine
 
-        with new_console().status("trying the renderers, each in a process of its own ..."):
+        with waiting("trying the renderers, each in a process of its own ..."):
             health = examine()
         if self.json:
-            sys.stdout.write(json.dumps(asdict(health), indent=2) + "\n")
+            print_json(asdict(health))
         else:
             _print(health)
         return 0 if health.renderers[-1].works else 1
@@ -54,25 +52,22 @@ class Doctor(JsonOption):
         from cadalign.health import compiled_cache
 
         began = time.perf_counter()
-        with new_console().status("compiling ...") as status:
-            compile_ahead(progress=lambda text: status.update(f"compiled: {text} ..."))
+        with waiting("compiling ...") as show:
+            compile_ahead(progress=lambda text: show(f"compiled: {text} ..."))
         found = {"seconds": round(time.perf_counter() - began, 1), "cache": compiled_cache()}
         if self.json:
-            sys.stdout.write(json.dumps(found, indent=2) + "\n")
+            print_json(found)
         else:
-            sys.stdout.write(f"Compiled in {found['seconds']} s: {found['cache']}\n")
+            answer(f"Compiled in {found['seconds']} s: {found['cache']}")
         return 0
 
     def _check_data(self, folder: Path) -> int:
         from cadalign.health import examine_data
 
-        with new_console().status("reading the annotations ...") as status:
-            summary = examine_data(
-                folder, progress=lambda count: status.update(f"{count} photos read ...")
-            )
+        with waiting("reading the annotations ...") as show:
+            summary = examine_data(folder, progress=lambda count: show(f"{count} photos read ..."))
         if self.json:
-            found = {**asdict(summary), "root": str(summary.root)}
-            sys.stdout.write(json.dumps(found, indent=2) + "\n")
+            print_json({**asdict(summary), "root": str(summary.root)})
         else:
             _print_data(summary)
         return 0 if summary.photos else 1
@@ -81,7 +76,6 @@ class Doctor(JsonOption):
 def _print(health: Health) -> None:
     from rich.table import Column, Table
 
-    console = new_console(stderr=False)
     heads = (
         "renderer",
         "works",
@@ -99,32 +93,29 @@ def _print(health: Health) -> None:
             renderer.versions,
             renderer.detail,
         )
-    console.print(table)
-    console.print(f"--renderer auto takes: {health.best}", markup=False)
+    new_console(stderr=False).print(table)
+    answer(f"--renderer auto takes: {health.best}")
     for name, command in health.remedies.items():
-        console.print(f"To enable {name}: {command}", markup=False)
-    console.print(f"Python {health.python}, NumPy {health.numpy}, Numba {health.numba}")
-    console.print(f"Cores: {health.cores}, of which this process may use {health.usable_cores}")
-    console.print(f"Compiled solvers: {health.cache}", markup=False)
+        answer(f"To enable {name}: {command}")
+    answer(f"Python {health.python}, NumPy {health.numpy}, Numba {health.numba}")
+    answer(f"Cores: {health.cores}, of which this process may use {health.usable_cores}")
+    answer(f"Compiled solvers: {health.cache}")
 
 
 def _print_data(summary: PhotoSummary) -> None:
     from rich.table import Column, Table
 
-    console = new_console(stderr=False)
-    console.print(f"{summary.root}: {summary.kind}", markup=False)
-    console.print(
-        f"{summary.photos} of {summary.records} photos can be read, {summary.images} with image"
-    )
+    answer(f"{summary.root}: {summary.kind}")
+    answer(f"{summary.photos} of {summary.records} photos can be read, {summary.images} with image")
     table = Table("category", Column("objects", justify="right"), title="Objects")
     for category, count in summary.categories.items():
         table.add_row(category, str(count))
-    console.print(table)
-    console.print(
+    new_console(stderr=False).print(table)
+    answer(
         f"{summary.objects} objects: {summary.with_pose} with pose, {summary.with_keypoints} with "
         f"keypoints, {summary.with_model} with CAD model, {summary.with_mask} with mask"
     )
     for problem in summary.problems[:_SHOWN]:
-        console.print(f"Left out: {problem}", markup=False)
+        answer(f"Left out: {problem}")
     if len(summary.problems) > _SHOWN:
-        console.print(f"... and {len(summary.problems) - _SHOWN} more problems; --json has all")
+        answer(f"... and {len(summary.problems) - _SHOWN} more problems; --json has all")

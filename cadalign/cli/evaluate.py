@@ -1,19 +1,19 @@
-"""`cadalign evaluate`: whole datasets, in runs that can be killed and started again."""
+"""`cadalign evaluate`, `simulate` and `demo`: runs that can be killed and started again."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, make_dataclass
-from functools import reduce
 from inspect import getdoc
-from operator import or_
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from cadalign.cli.options import JsonOption, named_as_flags
+from cadalign.cli.common import NOTHING_WORKED, SUCCESS, JsonOption, group_of, say
+from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
+from cadalign.evaluation.experiments.demo import DemoOptions
 from cadalign.evaluation.options import ExperimentOptions, FunctionOptions, PluginOption, RunOptions
 from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
 
@@ -26,6 +26,14 @@ _EXIT_CODES = (
     "Exit codes: 0 all rows are good, 3 finished but some rows failed, 1 refused, interrupted or "
     "all rows failed, 2 a wrong command line."
 )
+
+
+_SWEEPS = {
+    "noise": "Errors against the keypoints' noise, at 1,024 points.",
+    "points": "Errors against the number of points, at 2 px noise.",
+    "outliers": "Errors against the share of outliers, at 100 points and 2 px noise.",
+    "runtime": "Time of one call against the number of points.",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,12 +109,6 @@ def command_of(
     )
 
 
-def one_of(commands: dict[str, Any]) -> Any:
-    """One of some commands, chosen by name."""
-    named: list[Any] = [Annotated[c, tyro.conf.subcommand(name)] for name, c in commands.items()]
-    return reduce(or_, named)
-
-
 @dataclass(frozen=True)
 class EvaluateShow(JsonOption):
     """Show a finished run again: its summary, and its figures drawn anew."""
@@ -132,7 +134,7 @@ class EvaluateShow(JsonOption):
         return conclude(spec, spec.open(self.run_folder), json=self.json)
 
 
-def _commands() -> Any:
+def _evaluations() -> dict[str, Any]:
     """The command of every experiment that `cadalign evaluate` runs, and `show`."""
     commands = {
         options.experiment: command_of(
@@ -143,16 +145,45 @@ def _commands() -> Any:
         for options in known_options()
         if options.command == _COMMAND
     }
-    return one_of({**commands, "show": EvaluateShow})
+    return {**commands, "show": EvaluateShow}
 
 
-@dataclass(frozen=True)
-class Evaluate:
-    """Evaluate methods on a dataset."""
+def _sweeps() -> dict[str, Any]:
+    """The command of every sweep of the simulation."""
+    from cadalign.evaluation.experiments.simulation import SweepOptions
 
-    what: Annotated[Any, tyro.conf.arg(name="", constructor_factory=_commands)]
+    return {
+        name: command_of(SweepOptions, MethodsCommand, about=about, sweep=name)
+        for name, about in _SWEEPS.items()
+    }
+
+
+Evaluate = group_of("Evaluate methods on a dataset.", _evaluations)
+Simulate = group_of(
+    "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.", _sweeps
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _DemoCommand(RunCommand):
+    """The end of a demonstration: a page called index.html, whatever failed."""
+
+    out: Path = Path("demo")
+    """Folder to write to."""
 
     def run(self) -> int:
-        """Run the evaluation that was chosen; returns its exit code."""
-        code: int = self.what.run()
-        return code
+        """Run the demonstration; returns the exit code."""
+        # Renderers and solvers take a moment to import; `cadalign --help` should not wait for them.
+        from cadalign.report import write_report
+
+        spec, run = self.do_run()
+        for row in run.results.to_pylist():
+            if row["reason"]:
+                say(f"{row['category']} {row['model_id']}: {row['reason']}")
+        code = conclude(spec, run, json=self.json)
+        write_report([self.out], self.out / "index.html", title="cadalign demo")
+        say(f"Pictures: {self.out / 'index.html'}")
+        return NOTHING_WORKED if code == NOTHING_WORKED else SUCCESS
+
+
+Demo: Any = command_of(DemoOptions, _DemoCommand)

@@ -8,18 +8,15 @@ from typing import Annotated
 
 import tyro
 
-from cadalign.cli.options import OptionError, named_as_flags, new_console
+from cadalign.cli.common import SOME_FAILED, SUCCESS, say
+from cadalign.cli.options import FlaggedOptions, named_as_flags
 from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.export.formats import FORMATS, ExportOptions, export_object, format_of
 
 
 @dataclass(frozen=True)
-class _Options(ExportOptions):
+class _Options(FlaggedOptions, ExportOptions):
     """Coordinates, and ids that formats ask for."""
-
-    def __post_init__(self) -> None:
-        with named_as_flags(self, kind=OptionError):
-            super().__post_init__()
 
 
 _MOST_LISTED = 10
@@ -78,7 +75,7 @@ class Export:
                 metres=self.metres,
             )
             path = export_object(self.to, exported, format=name, options=self.options)
-        new_console().print(f"{path}: {FORMATS[name].about}", markup=False)
+        say(f"{path}: {FORMATS[name].about}")
         return 0
 
     def _export_run(self) -> int:
@@ -89,9 +86,8 @@ class Export:
             found = export_run(
                 self.fit, self.to, format=self.format, metres=self.metres, rows=self.rows
             )
-        console = new_console()
         for error in found.left_out[:_MOST_LISTED]:
-            console.print(f"left out: {error}", markup=False)
+            say(f"left out: {error}")
         rest = len(found.left_out)
-        console.print(f"{found.path}: {found.objects:,} objects, {rest:,} left out", markup=False)
-        return 3 if rest else 0
+        say(f"{found.path}: {found.objects:,} objects, {rest:,} left out")
+        return SOME_FAILED if rest else SUCCESS

@@ -2,62 +2,63 @@
 
 from __future__ import annotations
 
-import json
+import re
 import sys
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
-from cadalign.cli.evidence import CameraOptions, EvidenceOptions
-from cadalign.cli.options import (
-    ManyCommand,
-    ObservationCommand,
-    OptionError,
-    flag_of,
+from cadalign.cli.common import (
+    NOTHING_WORKED,
+    answer,
+    exit_code,
     make_folder,
-    named_as_flags,
+    print_json,
     say,
     waiting,
 )
-from cadalign.errors import InputError
+from cadalign.cli.fitted import FittedFile, overlay_style
+from cadalign.cli.options import (
+    CameraOptions,
+    EvidenceOptions,
+    FlaggedOptions,
+    ManyCommand,
+    ObservationCommand,
+    flag_of,
+    named_as_flags,
+)
+from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.observation_fit import ObservationFit, refuse_photo
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
-from cadalign.io.documents import read_json, written_path
+from cadalign.io.documents import read_json
 from cadalign.io.input_kinds import is_of_many
 
 if TYPE_CHECKING:
-    from cadalign.arrays import BoolArray, FloatArray
     from cadalign.estimation.result import Result
+    from cadalign.estimation.scene import AlignedScene, SceneObject
     from cadalign.estimation.view import View
     from cadalign.io.observation import Observation, ObservationChanges
     from cadalign.render import OverlayStyle
-    from cadalign.render.drawing.canvas import ByteImage
+
+_OBJECTS, _SHARE = "objects", "share"
 
 
 @dataclass(frozen=True)
-class _FitOptions(FitOptions):
+class _FitOptions(FlaggedOptions, FitOptions):
     """Method and model; the observation file supplies the other options."""
 
     sigma: tyro.conf.Suppress[Sigma | None] = FitOptions.sigma
     focal: tyro.conf.Suppress[str] = FitOptions.focal
     focal_prior: tyro.conf.Suppress[PriorOption] = FitOptions.focal_prior
 
-    def __post_init__(self) -> None:
-        with named_as_flags(self, kind=OptionError):
-            super().__post_init__()
-
 
 @dataclass(frozen=True)
-class _RansacOptions(RansacOptions):
+class _RansacOptions(FlaggedOptions, RansacOptions):
     """Search for outliers (LO-RANSAC), with --robust."""
-
-    def __post_init__(self) -> None:
-        with named_as_flags(self, kind=OptionError):
-            super().__post_init__()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,138 +87,6 @@ class EstimateOptions(ObservationFit, ObservationCommand):
         given["fitting"] = FitOptions(**vars(self.fitting))
         given["ransac"] = RansacOptions(**vars(self.ransac))
         return ObservationFit(**given)
-
-
-@dataclass(frozen=True, eq=False)
-class FittedFile:
-    """Result of a fit of one file, its JSON form, a table, and pictures of each view.
-
-    ``sources`` are the files of the observation and of the learned shape, which fit.json states;
-    ``overlays`` are those of the model that were asked for.
-    """
-
-    result: Result
-    data: dict[str, Any]
-    table: str
-    sources: dict[str, Path] = field(default_factory=dict)
-    pictures: tuple[ByteImage, ...] = ()
-    overlays: tuple[ByteImage, ...] = ()
-
-    def text(self, out: Path) -> str:
-        """The result as JSON text for a file in a folder, which its sources are relative to."""
-        sources = {
-            name: written_path(path.absolute(), folder=out.absolute())
-            for name, path in self.sources.items()
-        }
-        return json.dumps(self.data | sources, indent=2) + "\n"
-
-    def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
-        """Write fit.json and the pictures to a folder; returns the pictures' paths.
-
-        The ``overlays`` go to ``overlay``, those of further views beside it.
-        """
-        from cadalign.io.files import write_text
-
-        make_folder(out)
-        write_text(out / "fit.json", self.text(out))
-        paths = _write_pictures(out / "overlay.png", self.pictures)
-        return paths if overlay is None else paths + _write_pictures(overlay, self.overlays)
-
-
-def _write_pictures(path: Path, pictures: tuple[ByteImage, ...]) -> list[Path]:
-    """Write the first picture to a path, further ones to NAME_1 and so on; returns their paths."""
-    if not pictures:
-        return []
-    from cadalign.io.images import write_image
-
-    paths = [
-        path.with_name(f"{path.stem}_{row}{path.suffix}") if row else path
-        for row in range(len(pictures))
-    ]
-    for each, picture in zip(paths, pictures, strict=True):
-        write_image(each, picture)
-    return paths
-
-
-def overlay_style(path: Path, *, mode: Any, opacity: float, has_model: bool) -> OverlayStyle:
-    """The style that the options ask for.
-
-    Raises
-    ------
-    InputError
-        If the opacity is out of range, or the observation, read from ``path``, names no model.
-    """
-    from cadalign.render import OverlayStyle
-
-    if not has_model:
-        raise InputError(
-            f"{path} names no model to draw",
-            where="--overlay",
-            fix="give the file's `model` a mesh, or leave out the option",
-        )
-    try:
-        return OverlayStyle(mode=mode, opacity=opacity)
-    except InputError as error:
-        flag = f"--overlay-{error.where}"
-        raise InputError(error.what, where=flag, fix=error.fix) from None
-
-
-def draw(
-    observation: Observation,
-    result: Result,
-    *,
-    views: tuple[View, ...] | None,
-    picture: bool,
-    style: OverlayStyle | None,
-) -> tuple[tuple[ByteImage, ...], tuple[ByteImage, ...]]:
-    """Draw the pictures of all views, and their overlays in a style; each photo is read once.
-
-    ``views`` are those that were aligned, None for a stretched model and keypoints alone, whose
-    mesh is drawn as a box.
-
-    Raises
-    ------
-    InputError
-        If there is a style, and no mesh.
-    DataError
-        If a photo or the model cannot be read.
-    """
-    if not picture and style is None:
-        return (), ()
-    from cadalign.io.meshes.load import load_mesh
-    from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
-
-    photos = [
-        photo_of(image, view.camera)
-        for image, view in zip(observation.views, result.views, strict=True)
-    ]
-    shown = bounds = None
-    masks: list[FloatArray | BoolArray | None] = [None]
-    if views is not None:
-        mesh = shown = mesh_of(observation, result)
-        masks = [view.mask_image for view in views]
-    else:
-        mesh = None if observation.model is None else load_mesh(observation.model)
-        bounds = None if mesh is None else mesh.bounds
-    pictures = (
-        draw_result(image, result, photo=photo, mesh=shown, bounds=bounds, mask=mask, number=number)
-        for number, (image, photo, mask) in enumerate(
-            zip(observation.views, photos, masks, strict=True)
-        )
-    )
-    drawn = tuple(pictures) if picture else ()
-    if style is None:
-        return drawn, ()
-    if mesh is None:
-        raise InputError("no mesh of the object is known", where="--overlay")
-    from cadalign.render import Scene, overlay_model
-
-    scene = Scene(mesh)
-    overlays = (
-        overlay_model(photo, view.camera, scene, view.alignment, style=style)
-        for photo, view in zip(photos, result.views, strict=True)
-    )
-    return drawn, tuple(overlays)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,10 +124,8 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
         data = read_json(path) if is_read else None
         if len(self.observations) > 1 or is_of_many(path, data):
             return self._fit_many()
-        if isinstance(data, dict) and "objects" in data:
-            from cadalign.cli.fit_scene import fit_scene
-
-            return fit_scene(self, path, data)
+        if isinstance(data, dict) and _OBJECTS in data:
+            return _fit_scene(self, path, data)
         return self._write(self._fit_file(path, data), path)
 
     def _write(self, fitted: FittedFile, path: Path) -> int:
@@ -268,7 +135,7 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
         if self.json:
             sys.stdout.write(fitted.text(out))
             return 0
-        sys.stdout.write(f"{fitted.result}{fitted.table}\n")
+        answer(f"{fitted.result}{fitted.table}")
         if paths:
             listed = ", ".join(str(path) for path in paths)
             say(f"{'Picture' if len(paths) == 1 else 'Pictures'}: {listed}")
@@ -293,8 +160,7 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""
         from cadalign.batch.options import FitRunOptions
-        from cadalign.cli.many import inputs_of, run_command, run_folder, write_overlays
-        from cadalign.cli.runs import NOTHING_WORKED
+        from cadalign.cli.runs import inputs_of, run_command, run_folder, write_overlays
 
         style = None
         if self.overlay is not None:
@@ -341,16 +207,93 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
         *,
         style: OverlayStyle | None = None,
     ) -> FittedFile:
-        """The result of the observation in a file, its table and pictures; see `draw`."""
-        found = FittedFile(result, result.to_dict(), "")
-        if views is not None:
-            from cadalign.cli.contributions import list_contributions, tabulate_contributions
-
-            data = found.data | list_contributions(result)
-            found = FittedFile(result, data, tabulate_contributions(result))
-        pictures, overlays = draw(
-            observation, result, views=views, picture=self.picture, style=style
-        )
+        """The result of the observation in a file, with its pictures; see `FittedFile.drawn`."""
         shape = self.shape_of(observation)
         sources = {"observation": path} | ({} if shape is None else {"shape": shape})
-        return replace(found, sources=sources, pictures=pictures, overlays=overlays)
+        found = FittedFile(result, sources, is_tabulated=views is not None)
+        return found.drawn(observation, views=views, picture=self.picture, style=style)
+
+
+def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
+    """Align the objects of one photo in a file together; returns the exit code.
+
+    Writes scene.json, which tells what the objects share, and for every object a folder with its
+    observation, fit.json and overlay.png.
+    """
+    from cadalign.estimation.scene import SceneObject, align_scene
+
+    with named_as_flags(command, command.fitting, command.ransac):
+        seen = _observations(command, path, data)
+        problems = [command.problem(each, name) for name, each in seen.items()]
+        options = problems[0][2]
+        objects = []
+        for (name, each), (model, views, _) in zip(seen.items(), problems, strict=True):
+            if len(views) != 1:
+                fix = "give objects of one photo, or a file for each object"
+                raise InputError(f"{len(views)} views", where=name, fix=fix)
+            objects.append(SceneObject(model, views[0], each.size, each.init, name))
+        with waiting("fitting"):
+            scene = align_scene(
+                objects,
+                share=data.get(_SHARE, ("focal",)),
+                focal_prior=options.focal_prior,
+                loss=options.loss,
+                loss_scale=options.loss_scale,
+                ransac=command.ransac if command.robust else None,
+            )
+    folder = command.out or path.with_name(f"{path.stem}_fit")
+    texts = _write_scene(command, folder, scene, objects, list(seen.values()))
+    if command.json:
+        print_json(scene.to_dict())
+    else:
+        answer("\n".join([str(scene), *texts]))
+    say(f"Objects: {folder}")
+    return exit_code(len(scene.results.errors), len(objects))
+
+
+def _observations(command: Fit, path: Path, data: dict[str, Any]) -> dict[str, Observation]:
+    """The observation of every object, by its name; what stands beside them holds for all."""
+    listed = data[_OBJECTS]
+    if not isinstance(listed, list) or not listed:
+        fix = "give a list of observations without camera and image"
+        raise DataError("expected a list of objects", where=f"{path}: objects", fix=fix)
+    common = {name: value for name, value in data.items() if name not in (_OBJECTS, _SHARE)}
+    found: dict[str, Observation] = {}
+    for number, own in enumerate(listed):
+        where = f"{path}: objects[{number}]"
+        if not isinstance(own, dict):
+            raise DataError("expected an object", where=where)
+        seen = command.read({**common, **own}, where, folder=path.parent, changes=command.changes)
+        name = seen.object_name or f"object_{number}"
+        if name in found:
+            fix = "give each a name of its own in `object`"
+            raise DataError(f"two objects are named {name!r}", where=where, fix=fix)
+        found[name] = seen
+    return found
+
+
+def _write_scene(
+    command: Fit,
+    folder: Path,
+    scene: AlignedScene,
+    objects: list[SceneObject],
+    observations: list[Observation],
+) -> list[str]:
+    """Write the files of the scene; returns the texts of its objects."""
+    from cadalign.io.files import write_json
+
+    make_folder(folder)
+    texts, entries = [], []
+    for each, seen, result in zip(objects, observations, scene.results, strict=True):
+        if isinstance(result, CadalignError):
+            texts.append(f"{each.name}: {result}")
+            entries.append({"name": each.name, "error": str(result)})
+            continue
+        own = folder / (re.sub(r"[^\w.-]+", "_", each.name) or "object")
+        make_folder(own)
+        seen.save(own / "observation.json")
+        command.fitted(own / "observation.json", seen, result, (each.view,)).write(own)
+        texts.append(f"{each.name}: {result}")
+        entries.append({"name": each.name, "folder": own.name})
+    write_json(folder / "scene.json", scene.to_dict() | {"objects": entries})
+    return texts

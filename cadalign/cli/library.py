@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.options import make_folder, new_console
+from cadalign.cli.common import answer, group_of, make_folder, say
 
 if TYPE_CHECKING:
     from cadalign.retrieval import Library
@@ -46,7 +46,6 @@ class LibraryBuild:
         from cadalign.cli.runs import run_progress
         from cadalign.datasets import KeypointNet
 
-        console = new_console()
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
         dataset = dataset.subset(categories=self.categories, split=self.split)
         make_folder(self.out.absolute().parent)
@@ -57,17 +56,15 @@ class LibraryBuild:
             )
         library.save(self.out)
         megabytes = self.out.stat().st_size / 1e6
-        console.print(
-            f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)", markup=False
-        )
+        say(f"{_describe(library)}\nWritten: {self.out} ({megabytes:.1f} MB)")
         left_out = len(dataset.problems)
         if left_out:
-            console.print(f"Left out: {left_out} models with malformed annotations", markup=False)
+            say(f"Left out: {left_out} models with malformed annotations")
         without = sum(bool(row["warning"]) for row in troubles)
         if without:
-            console.print(f"Without their meshes, which cannot be read: {without}", markup=False)
+            say(f"Without their meshes, which cannot be read: {without}")
         if troubles:
-            console.print(f"Rows: {folder / 'results.parquet'}", markup=False)
+            say(f"Rows: {folder / 'results.parquet'}")
         else:
             shutil.rmtree(folder)
         return 0
@@ -84,23 +81,8 @@ class LibraryShow:
         """Open the library and describe it; returns the exit code."""
         from cadalign.retrieval import Library
 
-        new_console(stderr=False).print(_describe(Library.open(self.library)), markup=False)
+        answer(_describe(Library.open(self.library)))
         return 0
-
-
-@dataclass(frozen=True)
-class LibraryCommand:
-    """Build and inspect libraries of CAD models."""
-
-    library: Annotated[
-        Annotated[LibraryBuild, tyro.conf.subcommand("build")]
-        | Annotated[LibraryShow, tyro.conf.subcommand("show")],
-        tyro.conf.arg(name=""),
-    ]
-
-    def run(self) -> int:
-        """Run the chosen command; returns its exit code."""
-        return self.library.run()
 
 
 def _describe(library: Library) -> str:
@@ -108,3 +90,9 @@ def _describe(library: Library) -> str:
     counts = Counter(category for category, _ in library.keys)
     listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
     return f"{len(library)} models: {listed}"
+
+
+LibraryCommand = group_of(
+    "Build and inspect libraries of CAD models.",
+    {"build": LibraryBuild, "show": LibraryShow},
+)

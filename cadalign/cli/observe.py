@@ -12,8 +12,8 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.evidence import CameraOptions, EvidenceOptions
-from cadalign.cli.options import make_folder, named_as_flags, new_console
+from cadalign.cli.common import answer, exit_code, make_folder, new_console, say
+from cadalign.cli.options import CameraOptions, EvidenceOptions, named_as_flags
 from cadalign.datasets import (
     ImageKeypoints,
     ModelKeypoints,
@@ -88,7 +88,7 @@ class Observe(CameraOptions, EvidenceOptions):
         text = f"{len(observation.points_2d)} of {len(found)} keypoints: {out}"
         if observation.evidence.mask is not None:
             text += f"; mask: {observation.evidence.mask}"
-        new_console(stderr=False).print(text, markup=False)
+        answer(text)
         return 0
 
     def observe(
@@ -135,8 +135,7 @@ class Observe(CameraOptions, EvidenceOptions):
         camera = observation.camera
         if not camera.focal_known or observation.model is None:
             missing = "--camera" if not camera.focal_known else "a model in MODEL_KEYPOINTS"
-            text = f"The mask is left out: a fit to it needs {missing}."
-            new_console().print(text, markup=False)
+            say(f"The mask is left out: a fit to it needs {missing}.")
             return None
         with in_file(found.source):
             mask = decode_segmentation(found.segmentation, width=camera.width, height=camera.height)
@@ -185,10 +184,16 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
     make_folder(folder)
     console = new_console()
     failed = 0
-    groups = _by_track(objects) if command.tracks else [[each] for each in objects]
-    names = _slugs([each[0].track for each in groups]) if command.tracks else _names(objects)
+    if command.tracks:
+        tracks: dict[str | None, list[ImageKeypoints]] = {}  # those without are one
+        for each in objects:
+            tracks.setdefault(each.track, []).append(each)
+        groups, texts = list(tracks.values()), list(tracks)
+    else:
+        groups = [[each] for each in objects]
+        texts = [Path(each.image or "").stem or "photo" for each in objects]
     shown = track(
-        list(zip(groups, names, strict=True)),
+        list(zip(groups, _slugs(texts), strict=True)),
         "observing",
         console=console,
         transient=True,
@@ -205,11 +210,8 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
             failed += 1
             console.print(f"left out: {name}: {error}", markup=False)
     kind = "tracks" if command.tracks else "objects"
-    text = f"{len(groups) - failed} of {len(groups)} {kind}: {folder}"
-    new_console(stderr=False).print(text, markup=False)
-    if failed == len(groups):
-        return 1
-    return 3 if failed else 0
+    answer(f"{len(groups) - failed} of {len(groups)} {kind}: {folder}")
+    return exit_code(failed, len(groups))
 
 
 def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:
@@ -218,19 +220,6 @@ def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:
         return None
     path = folder / Path(found.image).name
     return path if path.exists() else None
-
-
-def _by_track(objects: Sequence[ImageKeypoints]) -> list[list[ImageKeypoints]]:
-    """The objects of each track; those without are one."""
-    tracks: dict[str | None, list[ImageKeypoints]] = {}
-    for each in objects:
-        tracks.setdefault(each.track, []).append(each)
-    return list(tracks.values())
-
-
-def _names(objects: Sequence[ImageKeypoints]) -> list[str]:
-    """File names of objects: the photo's, numbered where it has several."""
-    return _slugs([Path(found.image or "").stem or "photo" for found in objects])
 
 
 def _slugs(texts: Sequence[str | None]) -> list[str]:

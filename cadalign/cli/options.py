@@ -1,38 +1,28 @@
-"""Common parts of commands: options of the library's functions, consoles, output folders."""
+"""Options that commands share, and errors that name them as the command line does."""
 
 from __future__ import annotations
 
+import math
 import re
-import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, make_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from cadalign.cli.common import JsonOption, OptionError, UsageError
 from cadalign.errors import CadalignError, DataError, InputError
-from cadalign.io.files import printable
+from cadalign.geometry.camera import Camera
+from cadalign.io.documents import convert
+from cadalign.io.evidence import Size, evidence_fields
 from cadalign.io.input_kinds import DetectorOptions
+from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation_file import SizeFields, read_size
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
-    from rich.console import Console
-
-
-_PIPE_WIDTH = 120
-
-
-class OptionError(CadalignError):
-    """A command line option has an invalid value.
-
-    Other than InputError it is no ValueError, which the parser would report without the name.
-    """
-
-
-class UsageError(CadalignError):
-    """The command line lacks an argument, or has one too many; it exits with 2."""
 
 
 @contextmanager
@@ -59,6 +49,15 @@ def named_as_flags(
         raise kind(error.what, where=where, fix=_with_flags(error.fix, flags)) from None
 
 
+class FlaggedOptions:
+    """A group of options of the library that refuse values by the names of their flags."""
+
+    def __post_init__(self) -> None:
+        """Check the options."""
+        with named_as_flags(self, kind=OptionError):  # type: ignore[arg-type]
+            super().__post_init__()  # type: ignore[misc]
+
+
 def _with_flags(fix: str | None, flags: Mapping[str, str]) -> str | None:
     """A remedy that names flags in the place of arguments of several words."""
     for name, flag in flags.items():
@@ -76,14 +75,6 @@ def flag_of(name: str) -> str:
     '--known-axis'
     """
     return "--" + name.replace("_", "-")
-
-
-@dataclass(frozen=True, kw_only=True)
-class JsonOption:
-    """The option of the commands that print a table or JSON."""
-
-    json: bool = False
-    """Print the result as JSON."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,37 +117,90 @@ class ManyCommand(ObservationCommand, DetectorOptions):
         return self.observations[0]
 
 
-def say(text: str) -> None:
-    """Write a message to standard error."""
-    sys.stderr.write(f"{text}\n")
+@dataclass(frozen=True, kw_only=True)
+class CameraOptions:
+    """The calibrated camera."""
+
+    camera: Path | None = None
+    """File of the calibrated camera: a matrix K as text, .npy or JSON, or JSON in COLMAP's form:
+    model, width, height, params."""
+    pixel_origin: Literal["center", "corner"] | None = None
+    """Place of pixel (0, 0) for the camera's principal point: the centre of the top-left pixel
+    (OpenCV) or the corner of the image (COLMAP); by default center for a matrix, and corner for
+    COLMAP's form."""
+
+    focal: float | None = None
+    """Focal length [px], where no file has it, or in its place."""
+    fov: float | None = None
+    """Horizontal field of view [degrees], in the place of the focal length."""
+
+    def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
+        """The camera of --camera; ``size`` is the photo's, for a file of a matrix alone."""
+        return self.of_camera.read_camera(size)
+
+    @property
+    def of_camera(self) -> ObservationChanges:
+        """The camera as what takes the place of an observation's."""
+        if self.camera is None and self.pixel_origin is not None:
+            raise InputError("given without --camera", where="--pixel-origin", fix="give both")
+        focal: Any = self.focal
+        if isinstance(focal, str):  # a word of the commands that estimate
+            if self.fov is not None:
+                what = f"given beside --focal {focal}"
+                raise InputError(what, where="--fov", fix="give one of the two options")
+            focal = None
+        for name, value in (("focal", focal), ("fov", self.fov)):
+            if value is not None and not 0 < value < (180 if name == "fov" else math.inf):
+                bound = "between 0 and 180 degrees" if name == "fov" else "positive"
+                raise InputError(f"{value:g} is not {bound}", where=f"--{name}")
+        return ObservationChanges(self.camera, self.pixel_origin, focal=focal, fov=self.fov)
 
 
-@contextmanager
-def waiting(text: str) -> Iterator[None]:
-    """Show on a terminal what is waited for, and that it goes on; elsewhere show nothing."""
-    with new_console().status(text) if sys.stderr.isatty() else nullcontext():
-        yield
+@dataclass(frozen=True, kw_only=True)
+class EvidenceOptions:
+    """Evidence beyond keypoints: the declared fields are options, see `with_declared_fields`."""
 
+    size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
+    """Known lengths of the object: width, height, length (along the model's x, y, z) and sigma,
+    their relative standard deviation, as in --size height 0.91 sigma 0.005."""
 
-def new_console(*, stderr: bool = True) -> Console:
-    """Make a console: messages go to standard error, results to standard output.
+    @classmethod
+    def with_declared_fields(cls) -> type[EvidenceOptions]:
+        """The command with an option for every field of `cadalign.io.evidence`."""
+        options = []
+        for each in evidence_fields():
+            if each.option is not None:
+                kind: Any = each.option | None
+                option = Annotated[kind, tyro.conf.arg(help=each.help)]
+                options.append((each.name, option, field(default=None)))
+        command = make_dataclass(cls.__name__, options, bases=(cls,), frozen=True, kw_only=True)
+        command.__doc__, command.__module__ = cls.__doc__, cls.__module__
+        return command
 
-    Output to a file or a pipe has lines of a fixed width that is enough for tables.
-    """
-    from rich.console import Console  # only here: a fit is over before it is imported
+    @property
+    def given(self) -> dict[str, Any]:
+        """The fields of evidence that are given, by name."""
+        found = {}
+        for each in evidence_fields():
+            value = getattr(self, each.name, None)
+            if value is not None:
+                found[each.name] = value.resolve() if isinstance(value, Path) else value
+        return found
 
-    stream = sys.stderr if stderr else sys.stdout
-    width = None if stream.isatty() else _PIPE_WIDTH
-    return Console(stderr=stderr, highlight=False, soft_wrap=True, width=width)
+    def add_to(self, observation: Observation, **others: Any) -> Observation:
+        """An observation with the evidence of the options, which takes the place of its own.
 
+        ``others`` are further fields.
+        """
+        with named_as_flags(self):
+            evidence = others | self.given
+            return ObservationChanges(evidence=evidence, size=self.known_size).applied_to(
+                observation
+            )
 
-def make_folder(path: Path) -> None:
-    """Create an output folder; raises DataError on failure."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-        raise DataError(
-            f"the folder cannot be created ({getattr(error, 'strerror', None) or error})",
-            where=printable(path),
-            fix="choose another --out",
-        ) from None
+    @property
+    def known_size(self) -> Size | None:
+        """The known lengths."""
+        if self.size is None:
+            return None
+        return read_size(convert(self.size, SizeFields, where="--size"))

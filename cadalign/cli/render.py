@@ -8,7 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cadalign.cli.options import make_folder, named_as_flags, new_console
+from cadalign.cli.common import make_folder, new_console, say
+from cadalign.cli.options import named_as_flags
 
 
 @dataclass(frozen=True)
@@ -53,32 +54,20 @@ class Render:
         """Draw and write; returns the exit code."""
         from rich.progress import track
 
-        from cadalign.cli.render_job import RenderJob, draw_movie, draw_picture
+        from cadalign.cli.render_job import RenderJob
         from cadalign.io.images import write_image
         from cadalign.render import write_movie
         from cadalign.render.drawing.movie import MOVIES
 
-        console = new_console()
         with named_as_flags(self):
-            job = RenderJob.prepare(
-                model=self.model,
-                out=self.out,
-                views=self.view,
-                size=self.size,
-                style=self.style,
-                background=self.background,
-                keypoints=self.keypoints,
-                scale=self.scale,
-                fov=self.fov,
-                samples=self.samples,
-                renderer=self.renderer,
-            )
+            job = RenderJob.of(self)
         make_folder(self.out.absolute().parent)
         if self.out.suffix.lower() in MOVIES:
-            frames, count = draw_movie(job, seconds=self.seconds, fps=self.fps)
-            shown = track(frames, "drawing", total=count, console=console, transient=True)
+            frames, count = job.movie()
+            shown = track(frames, "drawing", total=count, console=new_console(), transient=True)
             write_movie(self.out, shown, fps=self.fps)
         else:
-            write_image(self.out, draw_picture(job))
-        console.print(f"Written: {self.out} (drawn by {job.drawn_by})", markup=False)
+            write_image(self.out, job.picture())
+        drawn_by = job.renderer.drawn_by(job.scene, samples=self.samples)
+        say(f"Written: {self.out} (drawn by {drawn_by})")
         return 0

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
@@ -25,6 +26,9 @@ from cadalign.render.probe import make_renderer
 from cadalign.render.scene import LIGHT_GREY, Renderer, Scene, check_image_size
 from cadalign.render.viewpoints import visible_keypoints
 
+if TYPE_CHECKING:
+    from cadalign.cli.render import Render
+
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}
 _MAX_FRAMES = 10_000
 STILLS = (".png", JPEG_ENDING)
@@ -35,81 +39,50 @@ LabelledView = tuple[str, Angles | tuple[Camera, Alignment]]
 
 @dataclass(frozen=True, eq=False)
 class RenderJob:
-    """Everything that a picture needs, checked."""
+    """Everything that a picture needs beside the command's options, checked."""
 
+    command: Render
     scene: Scene
     renderer: Renderer
-    style: str
-    samples: int
     views: tuple[LabelledView, ...]
     camera: Camera
     background: tuple[int, int, int] | None
     """None is transparent."""
     keypoints: FloatArray | None
-    scale: FloatArray
 
     @classmethod
-    def prepare(
-        cls,
-        *,
-        model: Path,
-        out: Path,
-        views: Sequence[str],
-        size: str,
-        style: str,
-        background: str,
-        keypoints: Path | None,
-        scale: Sequence[float],
-        fov: float,
-        samples: int,
-        renderer: str,
-    ) -> RenderJob:
+    def of(cls, command: Render) -> RenderJob:
         """Check the options of the command line and read the files that they name."""
-        width, height = parse_size(size)
-        camera = Camera.from_fov(width, height, fov_x=fov)
+        camera = Camera.from_fov(*parse_size(command.size), fov_x=command.fov)
         check_image_size(camera)
-        ending = out.suffix.lower()
+        ending = command.out.suffix.lower()
         if ending not in (*STILLS, *MOVIES):
             raise InputError(
-                f"{out.name} is neither a PNG nor an MP4 file, and no JPEG, WebM or GIF",
+                f"{command.out.name} is neither a PNG nor an MP4 file, and no JPEG, WebM or GIF",
                 where="--out",
                 fix=f"give a name that ends in {', '.join((*STILLS, *MOVIES))}",
             )
-        color = parse_background(background)
-        stretch = as_floats(scale, name="--scale", shape=(3,))
+        color = parse_background(command.background)
+        stretch = as_floats(command.scale, name="--scale", shape=(3,))
         if (stretch <= 0).any():
-            raise InputError(f"{tuple(scale)} is not positive", where="--scale")
-        labelled = tuple(view for word in views for view in _views(word, stretch))
-        if not labelled:
+            raise InputError(f"{command.scale} is not positive", where="--scale")
+        views = tuple(view for word in command.view for view in _views(word, stretch))
+        if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
-        if color is None and (ending != ".png" or len(labelled) > 1 or keypoints is not None):
-            raise InputError(
-                "only a PNG still without keypoints can be transparent", where="--background"
-            )
-        mesh = load_mesh(model)
-        return cls(
-            scene=Scene(mesh),
-            # Depth, normals, triangles and lines are cast in any case.
-            renderer=make_renderer(renderer if style == "color" else "raycast"),
-            style=style,
-            samples=samples,
-            views=labelled,
-            camera=camera,
-            background=color,
-            keypoints=None if keypoints is None else read_keypoints(keypoints, model, mesh),
-            scale=stretch,
-        )
+        path = command.keypoints
+        if color is None and (ending != ".png" or len(views) > 1 or path is not None):
+            what = "only a PNG still without keypoints can be transparent"
+            raise InputError(what, where="--background")
+        mesh = load_mesh(command.model)
+        # Depth, normals, triangles and lines are cast in any case.
+        renderer = make_renderer(command.renderer if command.style == "color" else "raycast")
+        keypoints = None if path is None else read_keypoints(path, command.model, mesh)
+        return cls(command, Scene(mesh), renderer, views, camera, color, keypoints)
 
-    @property
-    def drawn_by(self) -> str:
-        """Name of the renderer that really draws the model."""
-        return self.renderer.drawn_by(self.scene, samples=self.samples)
-
-    def draw(self, camera: Camera, pose: Alignment) -> ByteImage:
+    def _draw(self, camera: Camera, pose: Alignment) -> ByteImage:
         """One picture, (h, w, 3) uint8, or (h, w, 4) on a transparent background."""
-        color = draw_still(
-            self.renderer, self.scene, camera, pose, style=self.style, samples=self.samples
-        )
+        style, samples = self.command.style, self.command.samples
+        color = draw_still(self.renderer, self.scene, camera, pose, style=style, samples=samples)
         if self.background is None:
             return color
         image = composite(color, self.background)
@@ -118,37 +91,37 @@ class RenderJob:
         visible = visible_keypoints(self.scene, self.keypoints, camera, pose)
         return keypoint_picture(image, camera, self.keypoints, pose, visible=visible)
 
+    def picture(self) -> ByteImage:
+        """Draw a still, or a contact sheet if there are several views."""
+        images = []
+        for _, view in self.views:
+            if isinstance(view, Angles):
+                scale = self.command.scale
+                camera = self.camera
+                pose = pose_in_view(self.scene, camera, view, scale=scale)
+            else:
+                camera, pose = view
+            images.append(self._draw(camera, pose))
+        if len(images) == 1:
+            return images[0]
+        background = self.background or LIGHT_GREY
+        return contact_sheet(images, [label for label, _ in self.views], background=background)
 
-def draw_picture(job: RenderJob) -> ByteImage:
-    """Draw a still, or a contact sheet if there are several views."""
-    images = []
-    for _, view in job.views:
-        if isinstance(view, Angles):
-            camera = job.camera
-            pose = pose_in_view(job.scene, camera, view, scale=job.scale)
-        else:
-            camera, pose = view
-        images.append(job.draw(camera, pose))
-    if len(images) == 1:
-        return images[0]
-    background = job.background or LIGHT_GREY
-    return contact_sheet(images, [label for label, _ in job.views], background=background)
-
-
-def draw_movie(job: RenderJob, *, seconds: float, fps: int) -> tuple[Iterator[ByteImage], int]:
-    """Draw a turntable that starts in the first view: its frames, and their number."""
-    frames = seconds * fps
-    if not 1 <= frames <= _MAX_FRAMES:
-        raise InputError(
-            f"{seconds:g} s at {fps:g} frames a second are not 1 to {_MAX_FRAMES} frames",
-            where="--seconds",
-        )
-    view = job.views[0][1]
-    if not isinstance(view, Angles):
-        raise InputError("a turntable starts from angles, not a camera file", where="--view")
-    count = round(frames)
-    poses = turntable(job.scene, job.camera, view, count=count, scale=job.scale)
-    return (job.draw(job.camera, pose) for pose in poses), count
+    def movie(self) -> tuple[Iterator[ByteImage], int]:
+        """Draw a turntable that starts in the first view: its frames, and their number."""
+        seconds, fps = self.command.seconds, self.command.fps
+        frames = seconds * fps
+        if not 1 <= frames <= _MAX_FRAMES:
+            raise InputError(
+                f"{seconds:g} s at {fps:g} frames a second are not 1 to {_MAX_FRAMES} frames",
+                where="--seconds",
+            )
+        view = self.views[0][1]
+        if not isinstance(view, Angles):
+            raise InputError("a turntable starts from angles, not a camera file", where="--view")
+        count, scale = round(frames), self.command.scale
+        poses = turntable(self.scene, self.camera, view, count=count, scale=scale)
+        return (self._draw(self.camera, pose) for pose in poses), count
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cadalign.cli.common import say
 from cadalign.cli.evaluate import command_of
-from cadalign.cli.options import new_console
 from cadalign.cli.runs import conclude
 from cadalign.errors import InputError
 from cadalign.evaluation.experiments.estimates import EstimatesOptions
@@ -56,18 +56,15 @@ class ReportCommand:
             code = self._score()
             runs = (self.run_folder, *runs)
         if self.format == "html":
-            report = write_report(runs, self.out or _page(runs), assets=self.assets)
-            console = new_console()
-            console.print(f"Report: {report.path}", markup=False)
+            page = runs[0] / "report.html" if len(runs) == 1 else Path("report.html")
+            report = write_report(runs, self.out or page, assets=self.assets)
+            say(f"Report: {report.path}")
             if report.assets is not None:
-                console.print(f"Its pictures: {report.assets}, to be kept beside it", markup=False)
+                say(f"Its pictures: {report.assets}, to be kept beside it")
             return code
         if self.assets:
-            raise InputError(
-                f"a table has no pictures (--format {self.format})",
-                where="--assets",
-                fix="leave one of them out",
-            )
+            what = f"a table has no pictures (--format {self.format})"
+            raise InputError(what, where="--assets", fix="leave one of them out")
         text = headline_text(runs, format=self.format)
         if self.out is None:
             sys.stdout.write(text)
@@ -78,15 +75,10 @@ class ReportCommand:
     def _score(self) -> int:
         """Score the estimates and print the table; returns the exit code."""
         if self.data is None:
+            what = "the photos that they are of are not known"
             fix = "give --data, the folder of the data set"
-            raise InputError(
-                "the photos that they are of are not known", where="--estimates", fix=fix
-            )
+            raise InputError(what, where="--estimates", fix=fix)
         command = command_of(EstimatesOptions)
         given = {"root": self.data, "estimates": self.estimates}
         spec, run = command(**given, out=self.run_folder, workers=self.workers).do_run()
         return conclude(spec, run, json=False)
-
-
-def _page(runs: tuple[Path, ...]) -> Path:
-    return runs[0] / "report.html" if len(runs) == 1 else Path("report.html")

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.evidence import CameraOptions
-from cadalign.cli.options import ManyCommand, OptionError, make_folder, named_as_flags, new_console
-from cadalign.cli.runs import print_json, print_table
+from cadalign.cli.common import make_folder, print_json, print_table, say, waiting
+from cadalign.cli.options import CameraOptions, FlaggedOptions, ManyCommand, named_as_flags
 from cadalign.errors import InputError
 from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
@@ -25,17 +24,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class _RetrievalOptions(RetrievalOptions):
+class _RetrievalOptions(FlaggedOptions, RetrievalOptions):
     """Ranking of the models; the observation file supplies the standard deviation."""
 
     sigma: tyro.conf.Suppress[Sigma | None] = RetrievalOptions.sigma
     method: str = RetrievalOptions.method
     """Solver: optimal (maximum likelihood, searched globally) or epnp (OpenCV's, without
     stretch)."""
-
-    def __post_init__(self) -> None:
-        with named_as_flags(self, kind=OptionError):
-            super().__post_init__()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +71,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     def _retrieve_many(self) -> int:
         """Retrieve the models of all observations; returns the exit code."""
         from cadalign.batch.retrievals import RetrieveRunOptions
-        from cadalign.cli.many import inputs_of, run_command
+        from cadalign.cli.runs import inputs_of, run_command
 
         if self.mask is not None:
             fix = "give --silhouette, which takes each photo's opacity or cuts the object out"
@@ -101,21 +96,19 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         photo = None
         if self.out is not None and query.image is not None:
             photo = read_image(query.image, camera)
-        console = new_console()
-        status = console.status("retrieving (the first time after an installation takes a minute)")
-        with status:
+        with waiting("retrieving (the first time after an installation takes a minute)"):
             workers = -1 if self.workers is None else self.workers
             matches = self.retrieve(query, str(path), mask=mask, workers=workers)
         found = matches[0].camera if matches else None
         if not camera.focal_known and found is not None:
-            console.print(f"Focal length: estimated as {found.fx:.4g} px", markup=False)
+            say(f"Focal length: estimated as {found.fx:.4g} px")
         if self.json:
             print_json([match.to_dict() for match in matches])
         else:
             _print_table(matches)
             absent = none_text(matches)
             if absent is not None:
-                console.print(absent, markup=False, highlight=False)
+                say(absent)
         if self.out is not None:
             make_folder(self.out)
             page = write_retrieval(
@@ -127,7 +120,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 library=f"{self.library.name} ({len(library):,} models)",
                 image=photo,
             )
-            console.print(f"Page: {page}", markup=False)
+            say(f"Page: {page}")
         return 0
 
 

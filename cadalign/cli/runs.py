@@ -1,12 +1,11 @@
-"""Progress of runs, exit codes, and the summary at the end."""
+"""Runs of commands: experiments, and the fits or retrievals of many observations."""
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from rich.progress import (
     BarColumn,
@@ -20,23 +19,25 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from cadalign.cli.options import new_console
+from cadalign.cli.common import exit_code, new_console, print_json, print_table, say
+from cadalign.io.input_kinds import DetectorOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
+    from cadalign.batch.options import ManyOptions
+    from cadalign.cli.options import ManyCommand
     from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
     from cadalign.evaluation.runs.run import Progress as RunProgress
     from cadalign.evaluation.spec import Spec
-    from cadalign.evaluation.summary import ConsoleTable
+    from cadalign.io.observation import ObservationChanges
+    from cadalign.render import OverlayStyle
 
-
-SUCCESS: Final = 0
-NOTHING_WORKED: Final = 1
-"""Also what a refused input gives."""
-SOME_FAILED: Final = 3
-"""The run is finished and its tables are written, but some rows say ``failed``."""
+_MOST_REASONS = 10
+_ON_PAGE = 5000
+"""Observations beyond which the page is left to `cadalign report`."""
 
 
 def conclude(spec: Spec, run: Run, *, json: bool) -> int:
@@ -56,11 +57,8 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
     else:
         print_table(spec.console_table(run, summaries))
         note = f", {found.note}" if found.note else ""
-        text = f"Run: {run.folder.path} ({found.failed} of {found.rows} rows failed{note})"
-        new_console().print(text, markup=False)
-    if found.failed == found.rows:
-        return NOTHING_WORKED
-    return SOME_FAILED if found.failed else SUCCESS
+        say(f"Run: {run.folder.path} ({found.failed} of {found.rows} rows failed{note})")
+    return exit_code(found.failed, found.rows)
 
 
 def write_run_report(folder: RunFolder) -> None:
@@ -68,34 +66,7 @@ def write_run_report(folder: RunFolder) -> None:
     from cadalign.report import write_report
 
     report = write_report([folder.path], folder.report)
-    new_console().print(f"Report: {report.path}", markup=False)
-
-
-def print_table(table: ConsoleTable) -> None:
-    """Print a table on standard output."""
-    from rich import box
-    from rich.markup import escape
-    from rich.table import Table
-
-    style: dict[str, Any] = {}
-    if table.narrow:
-        style = {"box": box.SIMPLE_HEAD, "show_edge": False, "padding": (0, 1, 0, 0)}
-    shown = Table(title=table.title, **style)
-    for name in table.labels:
-        shown.add_column(escape(name), no_wrap=True)
-    for name in table.heads:
-        shown.add_column(escape(name), justify="right", no_wrap=not table.wraps)
-    previous = None
-    for first, *rest in table.rows:
-        if table.grouped and previous not in (None, first):
-            shown.add_section()
-        label = "" if table.grouped and first == previous else first
-        shown.add_row(*map(escape, (label, *rest)))
-        previous = first
-    console = new_console(stderr=False)
-    console.print(shown)
-    if table.note:
-        console.print(table.note)
+    say(f"Report: {report.path}")
 
 
 class _Rate(ProgressColumn):
@@ -125,14 +96,65 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
         yield lambda state: progress.update(bar, total=state.total, completed=state.done)
 
 
-def print_json(value: Any) -> None:
-    """Print a value as JSON on standard output; NaN becomes null."""
-    sys.stdout.write(json.dumps(_plain(value), indent=2) + "\n")
+def inputs_of(command: ManyCommand, changes: ObservationChanges) -> dict[str, Any]:
+    """The fields of `ManyOptions` that a command states."""
+    names = DetectorOptions.__dataclass_fields__
+    return {
+        "inputs": command.observations,
+        "changes": changes,
+        "detector": DetectorOptions(**{name: getattr(command, name) for name in names}),
+        "pictures": command.pictures if command.picture else 0,
+    }
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and value != value else value
+def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int:
+    """Do the run of a command; returns the exit code, 3 where some observations have failed.
+
+    ``done`` is what was done to those that have not. The reasons of failures are said.
+    """
+    from cadalign.batch.fits import run_many
+    from cadalign.batch.table import read_rows
+
+    folder = run_folder(command, options)
+    with run_progress(options.experiment) as on_progress:
+        tally = run_many(
+            options,
+            folder,
+            workers=command.workers,
+            dask=command.dask,
+            on_progress=on_progress,
+        )
+    if command.json:
+        print_json(read_rows(folder))
+    for reason, count in tally.reasons[:_MOST_REASONS]:
+        say(f"failed {count:,}: {reason}")
+    rest = tally.reasons[_MOST_REASONS:]
+    if rest:
+        say(f"failed {sum(count for _, count in rest):,}: {len(rest):,} other reasons")
+    made, table = tally.total - tally.failed, folder.path / "results.csv"
+    say(f"{made:,} of {tally.total:,} {done}, {tally.failed:,} failed: {table}")
+    if command.picture and tally.total <= _ON_PAGE:
+        write_run_report(folder)
+    return exit_code(tally.failed, tally.total)
+
+
+def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
+    """The run's folder, by default beside the first input."""
+    from cadalign.evaluation.runs.folder import RunFolder
+
+    kind, first = options.experiment, command.observations[0]
+    if command.out is not None:
+        return RunFolder(command.out)
+    if len(command.observations) > 1 or not first.exists():
+        return RunFolder(first.parent / kind)
+    name = first.resolve().name if first.is_dir() else first.stem
+    return RunFolder(first.with_name(f"{name}_{kind}"))
+
+
+def write_overlays(run: RunFolder, to: Path, style: OverlayStyle | None) -> None:
+    """Draw all aligned models of a run over their photos, in a folder."""
+    from cadalign.batch.exports import export_run
+
+    found = export_run(run.path, to, format="overlay", style=style)
+    left = f", {len(found.left_out):,} left out" if found.left_out else ""
+    say(f"Overlays: {found.objects:,} in {to}{left}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from cadalign.cli.options import JsonOption, make_folder, new_console
+from cadalign.cli.common import JsonOption, answer, group_of, make_folder, print_json, say
+from cadalign.cli.runs import run_progress
 from cadalign.datasets import KeypointNet
 from cadalign.render.drawing.shape_picture import draw_shape
 from cadalign.shapes.model import ShapeModel
@@ -39,25 +39,22 @@ class ShapeLearn:
 
     def run(self) -> int:
         """Learn the model; returns the exit code."""
-        from rich.progress import Progress
+        from cadalign.evaluation.runs.run import Progress
 
-        console = new_console()
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
-        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-            task = bar.add_task(f"learning {self.category}", total=None)
+        with run_progress(f"learning {self.category}") as on_progress:
             model = ShapeModel.from_dataset(
                 dataset,
                 self.category,
                 split=self.split,
                 components=self.components,
                 modes=self.modes,
-                on_progress=lambda done, total: bar.update(task, completed=done, total=total),
+                on_progress=lambda done, total: on_progress(Progress(done, total)),
             )
         out = Path(f"{model.category}.shape") if self.out is None else self.out
         make_folder(out.absolute().parent)
         model.save(out)
-        console.print(_text(model), markup=False)
-        console.print(f"Written: {out} ({out.stat().st_size / 1e6:.1f} MB)", markup=False)
+        say(f"{_text(model)}\nWritten: {out} ({out.stat().st_size / 1e6:.1f} MB)")
         return 0
 
 
@@ -76,28 +73,11 @@ class ShapeShow(JsonOption):
         out = self.shape.with_suffix(".png") if self.out is None else self.out
         make_folder(out.absolute().parent)
         draw_shape(out, model)
-        console = new_console(stderr=False)
         if self.json:
-            console.print_json(json.dumps({**_summary(model), "picture": str(out)}))
+            print_json({**_summary(model), "picture": str(out)})
         else:
-            console.print(_text(model), markup=False)
-            console.print(f"Written: {out}", markup=False)
+            answer(f"{_text(model)}\nWritten: {out}")
         return 0
-
-
-@dataclass(frozen=True)
-class ShapeCommand:
-    """Learn and inspect the shapes of categories."""
-
-    shape: Annotated[
-        Annotated[ShapeLearn, tyro.conf.subcommand("learn")]
-        | Annotated[ShapeShow, tyro.conf.subcommand("show")],
-        tyro.conf.arg(name=""),
-    ]
-
-    def run(self) -> int:
-        """Run the chosen command; returns its exit code."""
-        return self.shape.run()
 
 
 def _summary(model: ShapeModel) -> dict[str, Any]:
@@ -161,3 +141,8 @@ def _text(model: ShapeModel) -> str:
         ]
         lines.append(f"  rare keypoints (models that have it): {', '.join(rare) or 'none'}")
     return "\n".join(lines)
+
+
+ShapeCommand = group_of(
+    "Learn and inspect the shapes of categories.", {"learn": ShapeLearn, "show": ShapeShow}
+)

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.evidence import CameraOptions
-from cadalign.cli.options import make_folder, named_as_flags, new_console, say, waiting
-from cadalign.cli.runs import NOTHING_WORKED, SOME_FAILED, SUCCESS
+from cadalign.cli.common import answer, exit_code, make_folder, say, waiting
+from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import RansacOptions
 
@@ -98,9 +97,7 @@ class TrackCommand(CameraOptions):
         if found:
             self._write(folder, found, failures, video)
         say(f"Trajectories: {folder}")
-        if not found:
-            return NOTHING_WORKED
-        return SOME_FAILED if failures else SUCCESS
+        return exit_code(len(failures), len(tracks))
 
     def _rate(self, video: Video | None) -> float:
         """Frames in a second: as given, the video's, or what is usual for the detections."""
@@ -144,7 +141,7 @@ class TrackCommand(CameraOptions):
         from cadalign.estimation.align import align
         from cadalign.render.drawing.model_overlay import nearest_mesh
 
-        found, failures, console = [], dict[str, str](), new_console(stderr=False)
+        found, failures = [], dict[str, str]()
         ransac = RansacOptions() if self.robust else None
         for track in tracks:
             try:
@@ -152,14 +149,13 @@ class TrackCommand(CameraOptions):
                     result = align(shape, track.views, motion=motion, ransac=ransac)
             except CadalignError as error:
                 failures[track.name] = str(error)
-                console.print(f"track {track.name}: {error}", markup=False)
+                answer(f"track {track.name}: {error}")
                 continue
             found.append(FoundTrack(track, result, nearest_mesh(result)))
             inliers = int(result.inliers.sum())
-            console.print(
+            answer(
                 f"track {track.name}: {len(track.views)} frames, {inliers} of "
-                f"{len(result.inliers)} keypoints, rms {result.rms:.3g} px",
-                markup=False,
+                f"{len(result.inliers)} keypoints, rms {result.rms:.3g} px"
             )
         return found, failures
 

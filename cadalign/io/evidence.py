@@ -2,7 +2,7 @@
 
 `DeclaredEvidence` declares each field with its type in observation files and the help text of its
 command line option: `cadalign.View` takes the fields as arguments, `cadalign.io.observation` reads
-and writes them, `cadalign.cli.evidence` makes options of them. `register_fields` adds fields of
+and writes them, `cadalign.cli.options` makes options of them. `register_fields` adds fields of
 further kinds of evidence to all three.
 """
 

@@ -1,0 +1,165 @@
+"""Common parts of commands: what they say and return, output folders, groups of commands."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, make_dataclass
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import tyro
+
+from cadalign.errors import CadalignError, DataError
+from cadalign.io.files import printable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from cadalign.evaluation.summary import ConsoleTable
+
+SUCCESS: Final = 0
+NOTHING_WORKED: Final = 1
+"""Also what a refused input gives."""
+SOME_FAILED: Final = 3
+"""All is done and written, but some rows say ``failed``."""
+_PIPE_WIDTH = 120
+
+
+class OptionError(CadalignError):
+    """A command line option has an invalid value.
+
+    Other than InputError it is no ValueError, which the parser would report without the name.
+    """
+
+
+class UsageError(CadalignError):
+    """The command line lacks an argument, or has one too many; it exits with 2."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JsonOption:
+    """The option of the commands that print a table or JSON."""
+
+    json: bool = False
+    """Print the result as JSON."""
+
+
+def group_of(about: str, commands: dict[str, Any] | Callable[[], dict[str, Any]]) -> Any:
+    """The command that is one of some others, chosen by name; ``about`` is its help.
+
+    A function makes the others when the command is called.
+    """
+
+    def choice() -> Any:
+        found = commands() if callable(commands) else commands
+        return reduce(
+            or_, [Annotated[each, tyro.conf.subcommand(name)] for name, each in found.items()]
+        )
+
+    def run(group: Any) -> int:
+        code: int = group.what.run()
+        return code
+
+    what = Annotated[Any, tyro.conf.arg(name="", constructor_factory=choice)]
+    namespace = {"run": run, "__doc__": about}
+    return make_dataclass("Group", [("what", what)], namespace=namespace, frozen=True)
+
+
+def exit_code(failed: int, total: int) -> int:
+    """The exit code where so many of all have failed."""
+    if failed == total:
+        return NOTHING_WORKED
+    return SOME_FAILED if failed else SUCCESS
+
+
+def say(text: str) -> None:
+    """Write a message to standard error."""
+    sys.stderr.write(f"{text}\n")
+
+
+def answer(text: str) -> None:
+    """Write a result to standard output."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()  # who reads a pipe need not wait for the end
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON on standard output; NaN becomes null."""
+    answer(json.dumps(_plain(value), indent=2))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and value != value else value
+
+
+@contextmanager
+def waiting(text: str) -> Iterator[Callable[[str], object]]:
+    """Show on a terminal what is waited for, and that it goes on; elsewhere show nothing.
+
+    Gives a function that changes the text.
+    """
+    if not sys.stderr.isatty():
+        yield str
+        return
+    with new_console().status(text) as status:
+        yield status.update
+
+
+def new_console(*, stderr: bool = True) -> Console:
+    """Make a console: messages go to standard error, results to standard output.
+
+    Output to a file or a pipe has lines of a fixed width that is enough for tables.
+    """
+    from rich.console import Console  # only here: a fit is over before it is imported
+
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() else _PIPE_WIDTH
+    return Console(stderr=stderr, highlight=False, soft_wrap=True, width=width)
+
+
+def print_table(table: ConsoleTable) -> None:
+    """Print a table on standard output."""
+    from rich import box
+    from rich.markup import escape
+    from rich.table import Table
+
+    style: dict[str, Any] = {}
+    if table.narrow:
+        style = {"box": box.SIMPLE_HEAD, "show_edge": False, "padding": (0, 1, 0, 0)}
+    shown = Table(title=table.title, **style)
+    for name in table.labels:
+        shown.add_column(escape(name), no_wrap=True)
+    for name in table.heads:
+        shown.add_column(escape(name), justify="right", no_wrap=not table.wraps)
+    previous = None
+    for first, *rest in table.rows:
+        if table.grouped and previous not in (None, first):
+            shown.add_section()
+        label = "" if table.grouped and first == previous else first
+        shown.add_row(*map(escape, (label, *rest)))
+        previous = first
+    console = new_console(stderr=False)
+    console.print(shown)
+    if table.note:
+        console.print(table.note)
+
+
+def make_folder(path: Path) -> None:
+    """Create an output folder; raises DataError on failure."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise DataError(
+            f"the folder cannot be created ({getattr(error, 'strerror', None) or error})",
+            where=printable(path),
+            fix="choose another --out",
+        ) from None

@@ -11,7 +11,6 @@ from typing import Any, get_type_hints
 import msgspec
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
-from cadalign.annotate.evidence import nearest_corner
 from cadalign.annotate.models import SAME_PLACE
 from cadalign.annotate.object_actions import (
     EVIDENCE_ACTIONS,
@@ -20,9 +19,9 @@ from cadalign.annotate.object_actions import (
     bring_back,
 )
 from cadalign.annotate.objects import PhotoState
-from cadalign.annotate.photos import Mark
+from cadalign.annotate.photos import Mark, nearest_corner
+from cadalign.annotate.proposals import proposals_of
 from cadalign.annotate.session import Session
-from cadalign.annotate.track import proposals_of
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert

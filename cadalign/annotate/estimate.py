@@ -14,7 +14,7 @@ from typing import Any, cast
 import numpy as np
 
 from cadalign.annotate.lines import Wireframe
-from cadalign.annotate.object_shape import ObjectShape
+from cadalign.annotate.models import ObjectShape
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError, DegenerateError

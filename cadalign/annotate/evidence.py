@@ -25,22 +25,10 @@ Point2 = tuple[float, float]
 Point3 = tuple[float, float, float]
 Segment = tuple[Point2, Point2]
 
-_LABELS = {
-    "mask": "mask",
-    "depth": "depth",
-    "up": "gravity",
-    "camera_height": "camera height",
-    "cam_from_rig": "known camera poses",
-}
 _SHIFT = 4  # bits of parts of a pixel in OpenCV's drawing
 _LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
 _CUT_ROUNDS = 5
 _LEAST_BOX = 4.0  # [px]
-_MARGIN = 8  # around the reach, for the derivatives [px]
-_QUALITY = 0.3  # of a corner, over the best one within reach
-_CONTRAST = 3.0  # least standard deviation of grey values within reach
-_WINDOW = 3
-_DRIFT = 4.0  # that the refinement may move a corner [px]
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
 _MOST_UP_SIGMA = 20.0  # [degrees]
@@ -98,25 +86,6 @@ class FurtherEvidence:
         kept = {name: getattr(self, name) for name in ("symmetry", "size", "up_axis")}
         kept["others"] = tuple(views[1:])
         return Observation(**{**vars(views[0]), **kept, **of_the_object})
-
-
-def evidence_labels(observation: Observation) -> tuple[str, ...]:
-    """Name what an observation holds beyond one photo's keypoints, for the page."""
-    views = observation.views
-    given = set().union(*(view.evidence.given for view in views))
-    if any(view.depths is not None for view in views):
-        given.add("depth")
-    labels = [label for name, label in _LABELS.items() if name in given]
-    if observation.fit_options.get("image") and any(not view.evidence.mask for view in views):
-        labels.append("photo")
-    count = len(views) - 1
-    if count:
-        labels.append(f"{count} other view{'s' if count > 1 else ''}")
-    size = observation.size
-    if size is not None:
-        known = [name for name in LENGTHS if getattr(size, name) is not None]
-        labels.append(f"known {' and '.join(known)}")
-    return tuple(labels)
 
 
 def _place_of(photo: Path, views: Sequence[ObservedImage], *, where: Path) -> int:
@@ -406,39 +375,3 @@ def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> B
         )
     whole = cv2.resize(255 * found, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(whole >= 128)
-
-
-def nearest_corner(image: npt.NDArray[np.uint8], uv: Point2, *, reach: float) -> Point2 | None:
-    """The nearest corner of a photo (h, w, 3) within ``reach`` [px], to parts of a pixel.
-
-    Shi, Tomasi, "Good features to track" (1994), refined by the gradients about it. None without
-    one.
-
-    Examples
-    --------
-    >>> photo = np.zeros((40, 40, 3), dtype=np.uint8)
-    >>> photo[20:, 20:] = 255
-    >>> u, v = nearest_corner(photo, (22.0, 18.0), reach=6)
-    >>> abs(u - 19.5) < 0.6, abs(v - 19.5) < 0.6
-    (True, True)
-    """
-    height, width = image.shape[:2]
-    size = int(np.ceil(reach)) + _MARGIN
-    left, top = max(0, round(uv[0]) - size), max(0, round(uv[1]) - size)
-    right, bottom = min(width, round(uv[0]) + size + 1), min(height, round(uv[1]) + size + 1)
-    patch = cv2.cvtColor(np.ascontiguousarray(image[top:bottom, left:right]), cv2.COLOR_RGB2GRAY)
-    rows, columns = np.indices(patch.shape)
-    inside = np.hypot(columns + left - uv[0], rows + top - uv[1]) <= reach
-    if not inside.any() or np.std(patch[inside]) < _CONTRAST:
-        return None
-    mask = np.where(inside, 255, 0).astype(np.uint8)
-    found = cv2.goodFeaturesToTrack(patch, 16, _QUALITY, 3.0, mask=mask)
-    if found is None:
-        return None  # type: ignore[unreachable]
-    stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-    refined = cv2.cornerSubPix(patch, found.copy(), (_WINDOW, _WINDOW), (-1, -1), stop)
-    drift = np.linalg.norm(refined - found, axis=2)
-    places = np.where(drift[..., None] <= _DRIFT, refined, found)[:, 0] + (left, top)
-    gaps = np.linalg.norm(places - uv, axis=1)
-    u, v = places[int(np.argmin(gaps))].tolist()
-    return min(max(u, -0.5), width - 0.5), min(max(v, -0.5), height - 0.5)

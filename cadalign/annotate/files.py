@@ -21,9 +21,14 @@ import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Priors
 from cadalign.annotate.evidence import FurtherEvidence
-from cadalign.annotate.models import SAME_PLACE, KeypointRegistry, OpenedModel, refuse_other_model
+from cadalign.annotate.models import (
+    SAME_PLACE,
+    KeypointRegistry,
+    ObjectShape,
+    OpenedModel,
+    refuse_other_model,
+)
 from cadalign.annotate.names import earlier_unfinished_file
-from cadalign.annotate.object_shape import ObjectShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError

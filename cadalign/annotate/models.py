@@ -1,4 +1,4 @@
-"""The CAD models of a session and their keypoints: given, clicked on, proposed by a detector."""
+"""The CAD models of a session, the shape of its objects, and their keypoints."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.names import keypoints_file
-from cadalign.annotate.object_shape import ObjectShape
-from cadalign.annotate.photos import PhotoFile
+from cadalign.annotate.options import SessionOptions
 from cadalign.arrays import FloatArray
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints
-from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.model import Model
+from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.load import load_mesh
+from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.parts import KeypointId
 
 SAME_PLACE = 1e-6
 """Largest distance of two points that count as one [diagonals]."""
@@ -136,6 +137,107 @@ class KeypointRegistry:
         return free
 
 
+@dataclass(frozen=True, eq=False)
+class ObjectShape:
+    """A category's learned shape with its file, or else the ``sigma`` of a similar model.
+
+    ``sigma`` is the ``shape_sigma`` of `cadalign.Model`.
+    """
+
+    learned: ShapeModel | None = None
+    path: Path | None = None
+    sigma: float | None = None
+
+    @classmethod
+    def open(cls, options: SessionOptions) -> ObjectShape | None:
+        """Read the shape that the options name; None without one. Raises a CadalignError."""
+        path, sigma = options.shape, options.shape_sigma
+        if path is None and sigma is None:
+            return None
+        if path is not None and sigma is not None:
+            raise InputError(
+                "--shape has learned how far objects of the category differ",
+                where="--shape-sigma",
+                fix="give one of the two options",
+            )
+        if path is not None:
+            return cls(ShapeModel.open(path), path)
+        if not (sigma and 0 < sigma < np.inf):
+            raise InputError(
+                f"{sigma:g} is not a standard deviation",
+                where="--shape-sigma",
+                fix="give a positive number",
+            )
+        return cls(sigma=sigma)
+
+    @property
+    def ids(self) -> tuple[KeypointId, ...]:
+        """Ids or names of the learned keypoints; empty for a similar model."""
+        return () if self.learned is None else self.learned.ids
+
+    @property
+    def reserved(self) -> tuple[int, ...]:
+        """Semantic ids that points placed on the model must not get by chance."""
+        return tuple(label for label in self.ids if isinstance(label, int))
+
+    @property
+    def is_named(self) -> bool:
+        """True if the learned keypoints are known by their names."""
+        return bool(self.ids) and isinstance(self.ids[0], str)
+
+    @property
+    def average(self) -> str:
+        """The noun that the object is compared with in a sentence."""
+        return "the model" if self.learned is None else f"the average {self.learned.category}"
+
+    def id_of(self, point: ModelKeypoint) -> KeypointId | None:
+        """The id of a model's point in the estimate; None for one that was not learned."""
+        if self.learned is None:
+            return point.semantic_id
+        label: KeypointId | None = point.name if self.is_named else point.semantic_id
+        return label if label in self.ids else None
+
+    def knows(self, point: ModelKeypoint) -> bool:
+        """True if pairs of this point count."""
+        return self.id_of(point) is not None
+
+    def model_with(
+        self, points: Iterable[ModelKeypoint], mesh: Mesh, *, up_axis: str | None = "y"
+    ) -> Model | ShapeModel:
+        """The model to align, similar to these points.
+
+        Those that no pair shows do not change the estimate: it is that of `cadalign fit`.
+        """
+        if self.learned is not None:
+            return self.learned
+        known = list(points)
+        return Model(
+            points_3d=[point.xyz for point in known],
+            ids=[point.semantic_id for point in known],
+            mesh=mesh,
+            shape_sigma=self.sigma,
+            up_axis=up_axis,
+        )
+
+    def length_sigmas(self, model: Model | ShapeModel) -> FloatArray:
+        """Standard deviations (3,) of the logarithms of the box's lengths before any pair."""
+        if isinstance(model, ShapeModel):
+            lengths = np.ptp(model.mean[-2:], axis=0)
+            squares = np.zeros(3)
+            for part in model.components:
+                mode = part.modes[:, -1] - part.modes[:, -2]
+                own = (mode**2).sum(axis=0) + 2 * part.residual_sigma**2
+                squares += part.weight * (own + (np.ptp(part.mean[-2:], axis=0) - lengths) ** 2)
+        else:
+            lengths = np.ptp(np.asarray(model.bounds), axis=0)
+            options = model.fit_options(1.0)
+            free = np.isin(list("xyz"), list(options.stretched_axes))
+            prior = options.stretch_sigma or 0.0
+            squares = 2 * float(self.sigma or 0.0) ** 2 + np.where(free, prior * lengths, 0.0) ** 2
+        safe = np.where(lengths > 0, lengths, np.inf)
+        return np.asarray(np.sqrt(squares) / safe)
+
+
 @dataclass(frozen=True)
 class Proposal:
     """A keypoint of the model, where a detector or the other frames put it [px], and how sure."""
@@ -144,56 +246,6 @@ class Proposal:
     uv: tuple[float, float]
     score: float | None = None
     sigma: float | None = None  # standard deviation of a prediction [px]
-
-
-def read_proposals(
-    path: Path, photos: Sequence[PhotoFile], registry: KeypointRegistry
-) -> list[tuple[Proposal, ...]]:
-    """Read COCO's keypoints or a detector's for each photo, by its file name.
-
-    Where a photo has several objects, the surest counts. Keypoints are found by name, else by their
-    semantic id; in a file with neither by their order, if there are as many as the model has.
-
-    Raises DataError if no photo or no keypoint of the model is in the file.
-    """
-    found = read_image_keypoints(path)
-    by_photo = []
-    for photo in photos:
-        names = (photo.path.name, photo.path.stem)
-        own = [each for each in found if each.image and Path(each.image).name in names]
-        if not own and len(photos) == 1:
-            own = found
-        own.sort(key=lambda each: -(each.score or 0.0))
-        by_photo.append(_proposals(own[0], photo, registry) if own else ())
-    if not any(by_photo):
-        raise DataError(
-            "has no keypoint of the model in any of the photos",
-            where=str(path),
-            fix="its images and keypoints must be called as the photos and the model's keypoints",
-        )
-    return by_photo
-
-
-def _proposals(
-    found: ImageKeypoints, photo: PhotoFile, registry: KeypointRegistry
-) -> tuple[Proposal, ...]:
-    by_name = {point.name: number for number, point in registry}
-    count = len(found.points_2d)
-    wanted: list[int | None]
-    if found.names is not None:
-        wanted = [by_name.get(name) for name in found.names]
-    elif found.ids is not None:
-        wanted = [number if number in registry else None for number in found.ids]
-    else:
-        numbers = sorted(number for number, _ in registry)
-        wanted = list(numbers) if len(numbers) == count else [None] * count
-    scores = [None] * count if found.scores is None else found.scores.tolist()
-    proposals = []
-    for keypoint, (u, v), score in zip(wanted, found.points_2d.tolist(), scores, strict=True):
-        inside = -0.5 <= u <= photo.width - 0.5 and -0.5 <= v <= photo.height - 0.5
-        if keypoint is not None and inside and score != 0:
-            proposals.append(Proposal(keypoint, (u, v), score))
-    return tuple(proposals)
 
 
 @dataclass(eq=False)

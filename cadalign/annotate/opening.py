@@ -21,7 +21,7 @@ from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
 from cadalign.annotate.files import AnnotationFiles, StoredView
 from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.models import SAME_PLACE, Models, read_proposals
+from cadalign.annotate.models import SAME_PLACE, Models, ObjectShape
 from cadalign.annotate.names import (
     file_name,
     keypoints_file,
@@ -30,7 +30,6 @@ from cadalign.annotate.names import (
     observation_file,
     refuse_collisions,
 )
-from cadalign.annotate.object_shape import ObjectShape
 from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.photos import (
@@ -42,8 +41,8 @@ from cadalign.annotate.photos import (
     intrinsics_of,
     read_camera,
 )
+from cadalign.annotate.proposals import read_proposals, times_of
 from cadalign.annotate.session import Session
-from cadalign.annotate.track import times_of
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert

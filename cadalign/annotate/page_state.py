@@ -12,12 +12,12 @@ import numpy as np
 from cadalign.annotate.actions import MIRRORED
 from cadalign.annotate.estimate import LIKELY_STRETCH, LiveAlignment
 from cadalign.annotate.evidence import MarkedLengths, find_up
-from cadalign.annotate.live import box_of, candidates_of, drawing_of, flat
+from cadalign.annotate.live import box_of, candidates_of, drawing_of, facts_of, flat, notes_of
 from cadalign.annotate.object_actions import ActionOutcome
 from cadalign.annotate.objects import PhotoState, shown_objects
-from cadalign.annotate.result_text import facts_of, name_of, next_best_text, notes_of
+from cadalign.annotate.proposals import proposals_of
 from cadalign.annotate.session import Session
-from cadalign.annotate.track import proposals_of
+from cadalign.annotate.suggestion import name_of, next_best_text
 from cadalign.errors import CadalignError
 from cadalign.io.documents import read_json
 from cadalign.io.evidence import LENGTHS

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.objects import filled
-from cadalign.annotate.result_text import evidence_text, how_text, left_text, name_of
 from cadalign.annotate.session import Session
-from cadalign.annotate.suggestion import Marked, present, rank
+from cadalign.annotate.suggestion import evidence_text, how_text, left_text, name_of, present, rank
 from cadalign.errors import CadalignError
 from cadalign.retrieval.page import score_text
 
@@ -41,7 +40,7 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
     sigma = live.sigma * (np.ones(len(pairs)) if given is None else given)
     points_2d = np.array([pair.uv for pair in pairs], dtype=float)
     # Without the lock, for which the next click would wait.
-    ranked = rank(state.model.cad, Marked(points_3d, points_2d, sigma), result, suggestion)
+    ranked = rank(state.model.cad, (points_3d, points_2d, sigma), result, suggestion)
     name = "" if suggestion is None else name_of(suggestion)
     pieces = [
         {

@@ -17,8 +17,7 @@ from cadalign.annotate.estimate import Known, LiveAlignment, warm_up
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import known_points, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.models import KeypointRegistry, Models
-from cadalign.annotate.object_shape import ObjectShape
+from cadalign.annotate.models import KeypointRegistry, Models, ObjectShape
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice

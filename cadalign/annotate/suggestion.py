@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from cadalign.annotate.estimate import LiveAlignment
+from cadalign.annotate.live import short
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.models import KeypointRegistry
-from cadalign.annotate.object_shape import ObjectShape
+from cadalign.annotate.models import KeypointRegistry, ObjectShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+from cadalign.estimation.uncertainty.advice import LENGTH_SIGMA, TURN_DEG, Advice, rank_evidence
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -25,11 +26,21 @@ from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
+UNKNOWNS = (
+    *["the rotation"] * 3,
+    *("the position sideways", "the height", "the distance"),
+    *(f"the stretch along {axis}" for axis in "xyz"),
+    "the focal length",
+)
+"""Names of the unknowns of a covariance, for a sentence."""
+_ROTATIONS = 3
 _BENEATH = 0.02  # depth of visible keypoints beneath the warped surface [diagonals]
 _APART = 0.02  # least distance of a corner from marked points [diagonals]
 _SUGGESTED = "suggested"
 # Of the photo's longer side [px]: segmentation sees no more, and its errors grow with the photo.
 _MASKED_AT = 1280
+
+Observed = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -178,41 +189,34 @@ def updated_variances(
     return np.asarray(covariance.diagonal() - shrunk)
 
 
-@dataclass(frozen=True, eq=False)
-class Marked:
-    """The pairs of a photo as they are aligned: (n, 3) model units, (n, 2) and (n,) px."""
-
-    points_3d: FloatArray
-    points_2d: FloatArray
-    sigma: FloatArray
-
-
 def rank(
-    model: ClickableModel, marked: Marked, result: Result, suggestion: Suggestion | None
+    model: ClickableModel, marked: Observed, result: Result, suggestion: Suggestion | None
 ) -> tuple[Advice, ...]:
     """Rank the suggested keypoint, a mask, another photo and lengths; empty if nothing is known.
 
-    The pairs count as much as the standard deviations of the result say, which are calibrated for
-    few of them. Masks are predicted for a photo of at most 1280 px.
+    The pairs are (n, 3) model units, (n, 2) and (n,) px as they are aligned. They count as much as
+    the standard deviations of the result say, which are calibrated for few of them. Masks are
+    predicted for a photo of at most 1280 px.
     """
+    points_3d, points_2d, sigmas = marked
     scene, alignment = model.light_scene, result.alignment
     times = max(1.0, max(result.camera.width, result.camera.height) / _MASKED_AT)
     width, height = result.camera.width, result.camera.height
     camera = resized_camera(
         result.camera, max(1, round(width / times)), max(1, round(height / times))
     )
-    ids = tuple(range(len(marked.points_3d)))
+    ids = tuple(range(len(points_3d)))
     suggested = [] if suggestion is None else [suggestion.point.xyz]
     candidates = (_SUGGESTED,) * len(suggested)
     exact = Model(
-        points_3d=np.vstack([marked.points_3d, *suggested]),
+        points_3d=np.vstack([points_3d, *suggested]),
         ids=(*ids, *candidates),
         bounds=model.scene.bounds,
         mesh=scene.mesh,
         stretch_sigma=None if result.options is None else result.options.stretch_sigma,
     )
-    sigma = _widening(result) * marked.sigma / times
-    view = View(camera, rescaled_pixels(marked.points_2d, 1 / times), ids=ids, sigma=sigma)
+    sigma = _widening(result) * sigmas / times
+    view = View(camera, rescaled_pixels(points_2d, 1 / times), ids=ids, sigma=sigma)
     mask = cast_geometry(scene, camera, alignment).mask
     # No contour is seen of an object beyond the image's borders.
     for given in (mask, None):
@@ -246,3 +250,55 @@ def _widening(result: Result) -> float:
         return 1.0
     known = linear.diagonal() > 0
     return float(np.sqrt(np.mean(calibrated.diagonal()[known] / linear.diagonal()[known])))
+
+
+def next_best_text(next_best: NextBest | Unmarked, name: str) -> str:
+    """Name of the next-best keypoint, and what is gained by it."""
+    if isinstance(next_best, Unmarked):
+        sigma = short(next_best.sigma)
+        return f"{name}: so far known to ± {sigma} px; it would tell most about pose and shape"
+    factor, unit = (100, " %") if next_best.unknown >= _ROTATIONS else (math.degrees(1), "°")
+    before, after = (short(factor * std) + unit for std in (next_best.before, next_best.after))
+    unknown = UNKNOWNS[next_best.unknown]
+    return f"{name}: it would determine {unknown} to ± {after} instead of {before}"
+
+
+def name_of(suggestion: Suggestion) -> str:
+    """Name of a suggested point."""
+    return suggestion.point.name or "The marked corner"
+
+
+def evidence_text(advice: Advice, keypoint: str) -> str:
+    """One piece of evidence; a keypoint by its name."""
+    if advice.kind == "keypoint":
+        return keypoint
+    if advice.kind == "view":
+        return f"A second photo of these points, from {TURN_DEG:.0f}° aside"
+    if advice.kind == "mask":
+        return "A mask of the object"
+    return f"{str(advice.detail).capitalize()}, measured to {100 * LENGTH_SIGMA:.0f} %"
+
+
+def how_text(advice: Advice, observation: str) -> str:
+    """Advice on adding a piece of evidence to the observation file of the name; none for pairs."""
+    by = {
+        "mask": "Start with --mask mask.png, an image of the photo's size that is not 0 on the "
+        'object; or write "mask": "mask.png"',
+        "view": "Start with a folder of photos, or with --further-photos right.jpg, and add the "
+        "photo by 'Objects…' (T), which writes it",
+        "lengths": "Start with --size width 0.45 height 0.91 sigma 0.01, in model units; or write "
+        '"size": {"width": 0.45, "height": 0.91, "sigma": 0.01}',
+    }
+    return f"{by[advice.kind]} into {observation}." if advice.kind in by else ""
+
+
+def left_text(advice: Advice) -> str:
+    """The largest standard deviation that is left with a piece of evidence."""
+    if advice.worst > 1:  # a relative standard deviation of 100 %
+        return "something stays undetermined"
+    if advice.worst == math.radians(advice.rotation_deg):
+        return f"rotation to ± {short(advice.rotation_deg)}°"
+    percent = f"± {short(100 * advice.worst)} %"
+    if advice.worst == advice.position:
+        return f"position to {percent}"
+    return f"stretch along {'xyz'[advice.stretch.index(advice.worst)]} to {percent}"

@@ -90,7 +90,7 @@ class Annotate(FileOptions):
 
     def _frames(self, video: Path) -> Path:
         """The folder with the frames of a video, which are written if they are not there yet."""
-        from cadalign.annotate.track import write_frames
+        from cadalign.annotate.proposals import write_frames
 
         folder = (self.out or video.parent) / f"{video.stem}_frames"
         with waiting("reading the video"):

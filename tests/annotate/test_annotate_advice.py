@@ -18,9 +18,8 @@ from cadalign.annotate.estimate import LIKELY_STRETCH, LiveAlignment
 from cadalign.annotate.guard import TOKEN_HEADER
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.ranking import advice_state
-from cadalign.annotate.result_text import evidence_text, left_text
 from cadalign.annotate.session import Session
-from cadalign.annotate.suggestion import Marked, rank
+from cadalign.annotate.suggestion import evidence_text, left_text, rank
 from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
 from cadalign.render import cast_geometry
 
@@ -94,7 +93,7 @@ def test_photo_of_any_size_gives_the_same_ranking(case: Case) -> None:
             camera.cy * times + (times - 1) / 2,
         )
         points_2d = large.project(live.result.alignment.apply(points_3d))
-        marked = Marked(points_3d, points_2d, np.full(6, float(times)))
+        marked = (points_3d, points_2d, np.full(6, float(times)))
         (view,) = live.result.views
         result = replace(live.result, views=(replace(view, camera=large),))
         found.append(rank(session.model, marked, result, suggestion))

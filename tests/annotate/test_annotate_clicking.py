@@ -13,9 +13,9 @@ from support.annotating import IDLE, Case, opened_page, place, place_all, wait
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.document import history_path
-from cadalign.annotate.evidence import nearest_corner
 from cadalign.annotate.model import ClickableModel, MirrorPlanes
 from cadalign.annotate.page_state import page_state
+from cadalign.annotate.photos import nearest_corner
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
 from cadalign.geometry.mesh import Mesh

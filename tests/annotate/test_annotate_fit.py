@@ -14,11 +14,16 @@ from support.problems import problem_of
 from cadalign import Alignment, Camera, fit
 from cadalign.annotate.estimate import Known, LiveAlignment
 from cadalign.annotate.lines import Wireframe
-from cadalign.annotate.live import live_alignment, missing_text
+from cadalign.annotate.live import facts_of, live_alignment, missing_text, notes_of
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.photos import FocalChoice, Intrinsics
-from cadalign.annotate.result_text import UNKNOWNS, facts_of, next_best_text, notes_of
-from cadalign.annotate.suggestion import NextBest, find_next_best, updated_variances
+from cadalign.annotate.suggestion import (
+    UNKNOWNS,
+    NextBest,
+    find_next_best,
+    next_best_text,
+    updated_variances,
+)
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation.problems import Problem

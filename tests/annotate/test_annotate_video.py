@@ -11,7 +11,7 @@ from support.clips import CLOSE, FRAMES, Clip
 from cadalign.annotate.actions import perform
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.track import write_frames
+from cadalign.annotate.proposals import write_frames
 from cadalign.cli import main
 from cadalign.datasets import read_image_keypoints
 from cadalign.errors import DataError, InputError

@@ -33,51 +33,36 @@ def coco_of(session: Session) -> dict[str, Any]:
     with session.lock:
         photos = [shown_objects(states) for states in session.objects]
         kept = [objects for objects in photos if session.work_state(objects[0]) != "skipped"]
-        used = [model for model in session.models.opened if _marked(session, model)]
-        models = used or [session.models[0]]
+        marked: dict[OpenedModel, set[int]] = {}  # in any photo
+        for state in session.states:
+            pairs = state.document.complete_pairs
+            found = {pair.keypoint for pair in pairs if pair.keypoint is not None}
+            marked.setdefault(state.model, set()).update(found)
+        models = [model for model in session.models.opened if marked.get(model)]
+        models = models or [session.models[0]]
+        numbers = [sorted(marked.get(model, ())) for model in models]
+        annotations = []
+        for row, objects in enumerate(kept):
+            for slot, state in enumerate(objects):
+                places = {pair.keypoint: pair.uv for pair in state.document.complete_pairs}
+                if not places:
+                    continue
+                category = models.index(state.model)
+                own = numbers[category]
+                uv = np.array([places.get(number) or (0.0, 0.0) for number in own], dtype=float)
+                flags = np.array([_MARKED if number in places else 0 for number in own])
+                rectangle = np.concatenate([uv[flags > 0].min(axis=0), uv[flags > 0].max(axis=0)])
+                track = _FIRST_TRACK if session.times and not slot else None
+                annotations.append(CocoObject(row, category, uv, flags, rectangle, track=track))
+        files = [objects[0].photo for objects in kept]
         return coco_document(
+            [(photo.path.name, photo.width, photo.height) for photo in files],
             [
-                (objects[0].photo.path.name, objects[0].photo.width, objects[0].photo.height)
-                for objects in kept
+                (model.path.stem, [model.registry[number].name for number in own])
+                for model, own in zip(models, numbers, strict=True)
             ],
-            [
-                (model.path.stem, [model.registry[each].name for each in _marked(session, model)])
-                for model in models
-            ],
-            [
-                replace(
-                    _coco_object(
-                        row, state, models.index(state.model), _marked(session, state.model)
-                    ),
-                    track=_FIRST_TRACK if session.times and not slot else None,
-                )
-                for row, objects in enumerate(kept)
-                for slot, state in enumerate(objects)
-                if state.document.complete_pairs
-            ],
+            annotations,
         )
-
-
-def _marked(session: Session, model: OpenedModel) -> list[int]:
-    """The keypoints of a model that are marked in any photo."""
-    return sorted(
-        {
-            pair.keypoint
-            for state in session.states
-            if state.model is model
-            for pair in state.document.complete_pairs
-            if pair.keypoint is not None
-        }
-    )
-
-
-def _coco_object(image: int, state: PhotoState, category: int, numbers: list[int]) -> CocoObject:
-    places = {pair.keypoint: pair.uv for pair in state.document.complete_pairs}
-    uv = np.array([places.get(number) or (0.0, 0.0) for number in numbers], dtype=float)
-    flags = np.array([_MARKED if number in places else 0 for number in numbers])
-    marked = uv[flags > 0]
-    rectangle = np.concatenate([marked.min(axis=0), marked.max(axis=0)])
-    return CocoObject(image, category, uv, flags, rectangle)
 
 
 def glb_of(session: Session, number: int, *, slot: int | None = None) -> bytes:

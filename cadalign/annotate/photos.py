@@ -161,14 +161,10 @@ class Intrinsics:
         """The camera for an observation file: without a focal length where that is estimated."""
         if choice.known:
             return self.with_focal(choice)
-        return without_focal(self.camera)
-
-
-def without_focal(camera: Camera) -> Camera:
-    """The camera with an unknown focal length."""
-    return Camera.without_focal(
-        camera.width, camera.height, cx=camera.cx, cy=camera.cy, distortion=camera.distortion
-    )
+        own = self.camera
+        return Camera.without_focal(
+            own.width, own.height, cx=own.cx, cy=own.cy, distortion=own.distortion
+        )
 
 
 def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:

@@ -90,7 +90,13 @@ class TrackCommand(CameraOptions):
                 min_score=self.min_score,
             )
         if video is not None:
-            _require_video(video, tracks)
+            from cadalign.batch.track_video import require_size
+
+            folders = {str(Path(image).parent) for each in tracks for image in each.images if image}
+            if len(folders) > 1:
+                what = f"the detections are of {len(folders)} videos"
+                raise InputError(what, where="--video", fix="give the detections of one")
+            require_size(video, tracks[0].views[0].camera)
         folder = self.out or self.detections.with_name(f"{self.detections.stem}_tracks")
         make_folder(folder)
         found, failures = self._estimate(tracks, shape, motion)
@@ -187,30 +193,15 @@ class TrackCommand(CameraOptions):
             found,
             title=f"Tracks of {self.detections.stem}",
             summary=f"{count} of {self.detections.name}, {len(rows):,} frames in all.",
-            settings=self._settings(),
+            settings={
+                "detections": str(self.detections),
+                "shape": str(self.shape or "KITTI's cars"),
+                "noise where the file has none": f"{self.sigma:g} px",
+                "outliers expected": "yes" if self.robust else "no",
+            },
             failures=failures,
         )
         if video is not None:
             with waiting("drawing"):
                 drawn = draw_video(video, found, first=self.first_frame)
                 write_movie(folder / "overlay.mp4", drawn, fps=self._rate(video))
-
-    def _settings(self) -> dict[str, str]:
-        given = {
-            "detections": self.detections,
-            "shape": self.shape or "KITTI's cars",
-            "noise where the file has none": f"{self.sigma:g} px",
-            "outliers expected": "yes" if self.robust else "no",
-        }
-        return {name: str(value) for name, value in given.items()}
-
-
-def _require_video(video: Video, tracks: Sequence[VideoTrack]) -> None:
-    """Refuse a video of another size, or one for detections of several."""
-    from cadalign.batch.track_video import require_size
-
-    folders = {str(Path(image).parent) for each in tracks for image in each.images if image}
-    if len(folders) > 1:
-        what = f"the detections are of {len(folders)} videos"
-        raise InputError(what, where="--video", fix="give the detections of one")
-    require_size(video, tracks[0].views[0].camera)

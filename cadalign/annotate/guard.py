@@ -130,58 +130,36 @@ class Guard:
         """Serve one request."""
         if scope["type"] != "http":  # web sockets and lifespan events are not used
             return
-        refused = self._access.refusal(scope)
-        if refused is None:
-            try:
-                async with asyncio.timeout(PATIENCE):
-                    body = await _read_body(receive)
-            except TimeoutError:
-                refused = 408, f"the request takes more than {PATIENCE:.0f} s"
-            else:
-                if body is not None:
-                    await self._app(scope, _replay(body), _with_headers(send))
-                    return
-                refused = 413, f"more than {MAX_BODY} bytes"
-        status, reason = refused
-        # The rest of the body is unread, so the connection cannot be reused.
-        headers = HEADERS | {"Connection": "close"}
-        await PlainTextResponse(reason, status_code=status, headers=headers)(scope, receive, send)
+        refused, body = self._access.refusal(scope), b""
+        try:
+            async with asyncio.timeout(PATIENCE):
+                while refused is None:
+                    message = await receive()
+                    body += message.get("body", b"")
+                    if len(body) > MAX_BODY:
+                        refused = 413, f"more than {MAX_BODY} bytes"
+                    elif not message.get("more_body", False):
+                        break
+        except TimeoutError:
+            refused = 408, f"the request takes more than {PATIENCE:.0f} s"
+        if refused is not None:
+            status, reason = refused
+            # The rest of the body is unread, so the connection cannot be reused.
+            headers = HEADERS | {"Connection": "close"}
+            response = PlainTextResponse(reason, status_code=status, headers=headers)
+            await response(scope, receive, send)
+            return
+        messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 
+        async def replay() -> Message:
+            return messages.pop() if messages else {"type": "http.disconnect"}
 
-async def _read_body(receive: Receive) -> bytes | None:
-    """Read a request's body; None as soon as it exceeds `MAX_BODY`."""
-    body = b""
-    while True:
-        message = await receive()
-        if message["type"] == "http.disconnect":
-            return body
-        part: bytes = message.get("body", b"")
-        body += part
-        if len(body) > MAX_BODY:
-            return None
-        if not message.get("more_body", False):
-            return body
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
 
-
-def _replay(body: bytes) -> Receive:
-    """Make a receiver of a body that was read already."""
-    messages: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
-
-    async def receive() -> Message:
-        return messages.pop() if messages else {"type": "http.disconnect"}
-
-    return receive
-
-
-def _with_headers(send: Send) -> Send:
-    """Wrap a sender so that responses carry the security headers."""
-
-    async def add(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            MutableHeaders(scope=message).update(HEADERS)
-        await send(message)
-
-    return add
+        await self._app(scope, replay, send_with_headers)
 
 
 class BoundedProtocol(H11Protocol):

@@ -129,7 +129,13 @@ class Annotate(FileOptions):
                 )
             threading.Thread(target=session.warm_up, daemon=True).start()
             answer(access.url)
-            say(f"Open this address in a browser; end with Ctrl+C. {_reach(self.host)}")
+            reach = (
+                "It works on this machine only, and for this session."
+                if self.host == LOOPBACK
+                else "Whoever has it and reaches this machine can see and change everything, "
+                "unencrypted: give it to your team only."
+            )
+            say(f"Open this address in a browser; end with Ctrl+C. {reach}")
             if not self.no_open:
                 webbrowser.open(access.url)
             # Ends as Ctrl+C does, with everything saved and unlocked.
@@ -137,15 +143,6 @@ class Annotate(FileOptions):
             with suppress(KeyboardInterrupt):
                 serve(make_app(session, access), listener)
             return _save_and_say_where(session)
-
-
-def _reach(host: str) -> str:
-    if host == LOOPBACK:
-        return "It works on this machine only, and for this session."
-    return (
-        "Whoever has it and reaches this machine can see and change everything, unencrypted: "
-        "give it to your team only."
-    )
 
 
 def _export(options: SessionOptions, to: Path, form: str) -> int:

@@ -57,20 +57,13 @@ class NextBest:
 
 
 @dataclass(frozen=True)
-class Unmarked:
-    """The candidate of an own shape, and the standard deviation of its place in the photo [px]."""
-
-    row: int
-    sigma: float
-
-
-@dataclass(frozen=True)
 class Suggestion:
     """The next-best keypoint of the model, or a corner of the surface without a semantic id."""
 
     point: ModelKeypoint
     uv: tuple[float, float]  # its predicted place in the photo [px]
-    next_best: NextBest | Unmarked
+    next_best: NextBest | float
+    """What is gained; for an own shape the standard deviation of its place in the photo [px]."""
 
 
 def suggest(
@@ -132,13 +125,12 @@ def _suggest_of_shape(
     covariances = live.camera.projected_covariances(in_camera, of_points)
     gain = np.linalg.slogdet(np.eye(2) + covariances / live.sigma**2)[1]
     best = int(np.argmax(np.round(gain, 9)))
-    unmarked = Unmarked(best, float(np.sqrt(np.trace(covariances[best]))))
-    chosen = int(rows[best])
-    return _predicted(live, by_id[result.ids[chosen]], result.points_3d[chosen], unmarked)
+    chosen, sigma = int(rows[best]), float(np.sqrt(np.trace(covariances[best])))
+    return _predicted(live, by_id[result.ids[chosen]], result.points_3d[chosen], sigma)
 
 
 def _predicted(
-    live: LiveAlignment, point: ModelKeypoint, xyz: FloatArray, next_best: NextBest | Unmarked
+    live: LiveAlignment, point: ModelKeypoint, xyz: FloatArray, next_best: NextBest | float
 ) -> Suggestion:
     ((u, v),) = live.camera.project(live.alignment.apply(xyz[None])).tolist()
     return Suggestion(point, (u, v), next_best)
@@ -252,11 +244,11 @@ def _widening(result: Result) -> float:
     return float(np.sqrt(np.mean(calibrated.diagonal()[known] / linear.diagonal()[known])))
 
 
-def next_best_text(next_best: NextBest | Unmarked, name: str) -> str:
+def next_best_text(next_best: NextBest | float, name: str) -> str:
     """Name of the next-best keypoint, and what is gained by it."""
-    if isinstance(next_best, Unmarked):
-        sigma = short(next_best.sigma)
-        return f"{name}: so far known to ± {sigma} px; it would tell most about pose and shape"
+    if isinstance(next_best, float):
+        known = f"so far known to ± {short(next_best)} px"
+        return f"{name}: {known}; it would tell most about pose and shape"
     factor, unit = (100, " %") if next_best.unknown >= _ROTATIONS else (math.degrees(1), "°")
     before, after = (short(factor * std) + unit for std in (next_best.before, next_best.after))
     unknown = UNKNOWNS[next_best.unknown]

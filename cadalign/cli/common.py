@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -151,6 +152,11 @@ def print_table(table: ConsoleTable) -> None:
     console.print(shown)
     if table.note:
         console.print(table.note)
+
+
+def file_stem(name: str | None, fallback: str) -> str:
+    """A name as it can stand in the name of a file."""
+    return re.sub(r"[^\w.-]+", "_", name or "") or fallback
 
 
 def make_folder(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from cadalign.cli.common import (
     NOTHING_WORKED,
     answer,
     exit_code,
+    file_stem,
     make_folder,
     print_json,
     say,
@@ -289,7 +289,7 @@ def _write_scene(
             texts.append(f"{each.name}: {result}")
             entries.append({"name": each.name, "error": str(result)})
             continue
-        own = folder / (re.sub(r"[^\w.-]+", "_", each.name) or "object")
+        own = folder / file_stem(each.name, "object")
         make_folder(own)
         seen.save(own / "observation.json")
         command.fitted(own / "observation.json", seen, result, (each.view,)).write(own)

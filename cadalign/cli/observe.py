@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -12,7 +11,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.common import answer, exit_code, make_folder, new_console, say
+from cadalign.cli.common import answer, exit_code, file_stem, make_folder, new_console, say
 from cadalign.cli.options import CameraOptions, EvidenceOptions, named_as_flags
 from cadalign.datasets import (
     ImageKeypoints,
@@ -224,7 +223,7 @@ def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:
 
 def _slugs(texts: Sequence[str | None]) -> list[str]:
     """File names of texts, numbered where several are the same."""
-    stems = [re.sub(r"[^\w.-]+", "_", text or "track") for text in texts]
+    stems = [file_stem(text, "track") for text in texts]
     counts, seen = Counter(stems), Counter[str]()
     names = []
     for stem in stems:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.common import answer, exit_code, make_folder, say, waiting
+from cadalign.cli.common import answer, exit_code, file_stem, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import RansacOptions
@@ -181,7 +180,7 @@ class TrackCommand(CameraOptions):
         from cadalign.report.track_page import write_track_page
 
         for each in found:
-            stem = re.sub(r"[^\w.-]+", "_", each.track.name) or "track"
+            stem = file_stem(each.track.name, "track")
             write_tum(folder / f"{stem}.tum", each.path.times, each.path.poses)
             write_kitti(folder / f"{stem}.txt", each.path.poses)
         rows = [row for each in found for row in rows_of(each)]

@@ -285,14 +285,7 @@ def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray,
 
 
 def draw_mask(drawing: MaskDrawing, width: int, height: int) -> BoolArray:
-    """The pixels (h, w) of a mask.
-
-    Examples
-    --------
-    >>> square = Stroke(points=((1, 1), (3, 1), (3, 3), (1, 3)))
-    >>> draw_mask(MaskDrawing(strokes=(square,)), 6, 5).sum().item()
-    9
-    """
+    """The pixels (h, w) of a mask."""
     mask = np.zeros((height, width), dtype=np.uint8)
     if drawing.base is not None:
         mask[:] = read_grey(Path(drawing.base)) != 0
@@ -314,13 +307,7 @@ def draw_mask(drawing: MaskDrawing, width: int, height: int) -> BoolArray:
 
 
 def encode_runs(mask: BoolArray) -> tuple[int, ...]:
-    """The numbers of pixels outside and inside in turn, row by row.
-
-    Examples
-    --------
-    >>> encode_runs(np.array([[False, True], [True, False]]))
-    (1, 2, 1)
-    """
+    """The numbers of pixels outside and inside in turn, row by row."""
     flat = np.concatenate([[False], mask.ravel()])
     changes = np.flatnonzero(flat[1:] != flat[:-1])
     return tuple(np.diff(np.concatenate([[0], changes, [mask.size]])).tolist())

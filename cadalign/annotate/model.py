@@ -263,14 +263,7 @@ class SnapPoints:
 
     @classmethod
     def of_mesh(cls, mesh: Mesh, diagonal: float) -> SnapPoints:
-        """Find and sort the vertices; those of very large meshes all count as smooth.
-
-        Examples
-        --------
-        >>> square = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
-        >>> SnapPoints.of_mesh(square, 2**0.5).kind.tolist()
-        [0, 0, 0, 0]
-        """
+        """Find and sort the vertices; those of very large meshes all count as smooth."""
         used, first = np.unique(mesh.faces, return_index=True)
         grid = np.round((mesh.vertices[used] - mesh.vertices[used[0]]) / (_WELD * diagonal))
         _, kept, place = np.unique(grid, axis=0, return_index=True, return_inverse=True)

@@ -255,14 +255,6 @@ def nearest_corner(image: npt.NDArray[np.uint8], uv: Pixel, *, reach: float) -> 
 
     Shi, Tomasi, "Good features to track" (1994), refined by the gradients about it. None without
     one.
-
-    Examples
-    --------
-    >>> photo = np.zeros((40, 40, 3), dtype=np.uint8)
-    >>> photo[20:, 20:] = 255
-    >>> u, v = nearest_corner(photo, (22.0, 18.0), reach=6)
-    >>> abs(u - 19.5) < 0.6, abs(v - 19.5) < 0.6
-    (True, True)
     """
     height, width = image.shape[:2]
     size = int(np.ceil(reach)) + _MARGIN

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any
 
 import numpy as np
 
@@ -22,20 +23,21 @@ _CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
 def compile_ahead(*, progress: Callable[[str], object] | None = None) -> None:
     """Compile what fits, alignments, retrieval and evaluations call, unless it is on disk.
 
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with the name of each group of solvers that is ready.
+    ``progress`` is called with the name of each group of solvers that is ready.
     """
-    # The longest first.
-    groups = (_shapes_in_several_views, _fits, _shapes_in_one_view, _retrieval_and_boxes)
+    groups: dict[str, tuple[Any, ...]] = {  # the longest first
+        "shapes in several views": (_align_shape, 2),
+        "fits": (_fits,),
+        "shapes in one view": (_align_shape, 1),
+        "retrieval and boxes": (_retrieval_and_boxes,),
+    }
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context) as pool:
-        jobs = {pool.submit(group): group.__name__ for group in groups}
+        jobs = {pool.submit(*group): name for name, group in groups.items()}
         for job in as_completed(jobs):
             job.result()
             if progress:
-                progress(jobs[job].strip("_").replace("_", " "))
+                progress(jobs[job])
 
 
 def _points() -> tuple[np.ndarray, np.ndarray]:
@@ -53,15 +55,7 @@ def _fits() -> None:
     fit(points, pixels, _CAMERA, focal="estimate")
 
 
-def _shapes_in_one_view() -> None:
-    _align_shape(views=1)
-
-
-def _shapes_in_several_views() -> None:
-    _align_shape(views=2)
-
-
-def _align_shape(*, views: int) -> None:
+def _align_shape(views: int) -> None:
     from cadalign.estimation.align import align
 
     points, pixels = _points()

@@ -67,13 +67,7 @@ def _with_flags(fix: str | None, flags: Mapping[str, str]) -> str | None:
 
 
 def flag_of(name: str) -> str:
-    """The command line's option for a field.
-
-    Examples
-    --------
-    >>> flag_of("known_axis")
-    '--known-axis'
-    """
+    """The command line's option for a field."""
     return "--" + name.replace("_", "-")
 
 

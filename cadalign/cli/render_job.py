@@ -125,13 +125,7 @@ class RenderJob:
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Read an image size ``WIDTHxHEIGHT``.
-
-    Examples
-    --------
-    >>> parse_size("640x480")
-    (640, 480)
-    """
+    """Read an image size ``WIDTHxHEIGHT``."""
     match = re.fullmatch(r"(\d{1,9})[xX](\d{1,9})", text.strip())
     if match is None or not (int(match[1]) and int(match[2])):
         raise InputError(
@@ -141,13 +135,7 @@ def parse_size(text: str) -> tuple[int, int]:
 
 
 def parse_background(text: str) -> tuple[int, int, int] | None:
-    """Read a colour's name or ``#rrggbb``; None for ``transparent``.
-
-    Examples
-    --------
-    >>> parse_background("#ff8000")
-    (255, 128, 0)
-    """
+    """Read a colour's name or ``#rrggbb``; None for ``transparent``."""
     if text == "transparent":
         return None
     if text in _COLORS:

@@ -19,15 +19,17 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from benchmarks.accuracy import Coverage, Solvers, UnknownFocal, WideLenses
+from benchmarks.accuracy import Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
 from benchmarks.cameras import PhotoLenses, Scenes
+from benchmarks.cars import NoiseOfDetector, RealDetections
 from benchmarks.clicks import Clicks, OutlineMethods
-from benchmarks.gradients import GradientErrors, NoiseOfDetector, TorchLayer
+from benchmarks.coverage import Coverage
+from benchmarks.gradients import GradientErrors, TorchLayer
 from benchmarks.masks import MaskAlone, Masks
 from benchmarks.photo import Photos
 from benchmarks.retrieval import Retrieval, UnseenRetrieval
-from benchmarks.runs import Evaluation, Fits, Ransac, RealDetections
+from benchmarks.runs import Evaluation, Fits, Ransac
 from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Section
 from benchmarks.shapes import Align, FocalShapes, Similar
 from benchmarks.speed import Calls, Cold, Rendering

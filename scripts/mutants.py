@@ -35,14 +35,8 @@ import tyro
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("cadalign", "datasets", "render")
 COPIED = (
-    *FOLDERS,
-    "tests",
-    "docs",
-    "scripts",
-    "pyproject.toml",
-    "README.md",
-    "LICENSE",
-    "Makefile",
+    *(*FOLDERS, "tests", "docs", "scripts"),
+    *("pyproject.toml", "README.md", "LICENSE", "Makefile"),
 )
 _PAIRS: tuple[tuple[type[ast.AST], type[ast.AST]], ...] = (
     *((ast.Lt, ast.LtE), (ast.Gt, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot)),
@@ -105,12 +99,9 @@ def main(arguments: Arguments) -> int:
 def sources(rooms: tuple[str, ...]) -> list[Path]:
     """Modules of the chosen rooms, relative to the checkout."""
     found = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
-    inside = [path.relative_to(ROOT) for path in found if not path.is_symlink()]
-    inside = [
-        path
-        for path in inside
-        if path.parts[:2] not in (("cadalign", "datasets"), ("cadalign", "render"))
-    ]
+    links = ("cadalign", "datasets"), ("cadalign", "render")
+    inside = [path.relative_to(ROOT) for path in found]
+    inside = [path for path in inside if path.parts[:2] not in links]
     return [path for path in inside if not rooms or room_of(path) in rooms]
 
 
@@ -136,22 +127,23 @@ def unmutated(tree: ast.AST) -> Iterator[ast.AST]:
     top: thresholds chosen by judgement, which a test could only repeat.
     """
     for node in ast.walk(tree):
-        parts: list[ast.AST | None] = []
-        if isinstance(node, ast.JoinedStr):
-            parts = [node]
-        elif isinstance(node, ast.arg | ast.AnnAssign):
-            parts = [node.annotation]
-        elif isinstance(node, ast.FunctionDef):
-            parts = [node.returns, *node.decorator_list]
-        elif isinstance(node, ast.ClassDef):
-            parts = list(node.decorator_list)
-        elif isinstance(node, ast.keyword) and node.arg == "strict":
-            parts = [node.value]
-        elif isinstance(node, ast.Module):
-            named = [each for each in node.body if isinstance(each, ast.Assign | ast.AnnAssign)]
-            parts = [each.value for each in named]
-        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            parts = [node]
+        match node:
+            case ast.JoinedStr():
+                parts = [node]
+            case ast.arg(annotation=noted) | ast.AnnAssign(annotation=noted):
+                parts = [noted]
+            case ast.FunctionDef(returns=noted, decorator_list=decorators):
+                parts = [noted, *decorators]
+            case ast.ClassDef(decorator_list=decorators):
+                parts = list(decorators)
+            case ast.keyword(arg="strict", value=value):
+                parts = [value]
+            case ast.Module(body=body):
+                parts = [e.value for e in body if isinstance(e, ast.Assign | ast.AnnAssign)]
+            case ast.If(test=test) if "TYPE_CHECKING" in ast.unparse(test):
+                parts = [node]
+            case _:
+                continue
         for part in parts:
             if part is not None:
                 yield from ast.walk(part)

@@ -30,6 +30,7 @@ import cadalign
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import ImageKeypoints, sample_models
 from cadalign.geometry.metrics import box_iou_up_to_scale
+from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.io.files import write_json
 from cadalign.torch import PoseBatch, align, fit, posterior_loss, rotation_loss
 from cadalign.torch.detector import KeypointDetector, LossOfKeypoints, train
@@ -84,11 +85,15 @@ def pose_losses(
     )
     stretched = stretched_mean(truth.apply(points), truth.rotation, mean)
 
-    def through(estimate: Callable[[Any, Any], PoseBatch], own: Any) -> LossOfKeypoints:
+    def rows_of(poses: PoseBatch, rows: Any) -> PoseBatch:
+        return PoseBatch(poses.rotation[rows], poses.translation[rows], poses.scale[rows])
+
+    def through(estimate: Callable[..., PoseBatch], model: Any, **options: Any) -> LossOfKeypoints:
         def loss(pixels: Any, sigma: Any, rows: Any) -> Any:
-            found = estimate(pixels.double(), sigma.double())
-            true = PoseBatch(truth.rotation[rows], truth.translation[rows], truth.scale[rows])
-            shown = own if found.points_3d is None else found.points_3d
+            given = model, pixels.double(), views.camera
+            found = estimate(*given, sigma=sigma.double(), **options)
+            true = rows_of(truth, rows)
+            shown = mean if found.points_3d is None else found.points_3d
             apart = found.project(shown, views.camera) - true.project(points[rows], views.camera)
             error = rotation_loss(found, true) + _REPROJECTION * torch.where(
                 found.valid, apart.abs().mean(dim=(1, 2)), 0.0
@@ -100,21 +105,15 @@ def pose_losses(
     def posterior(pixels: Any, sigma: Any, rows: Any) -> Any:
         pixels, sigma = pixels.double(), sigma.double()
         found = fit(mean, pixels.detach(), views.camera, sigma=sigma.detach())
-        true = PoseBatch(
-            stretched.rotation[rows], stretched.translation[rows], stretched.scale[rows]
-        )
-        value = posterior_loss(
-            found, true, mean, pixels, views.camera, sigma=sigma, loss="huber", loss_scale=3.0
-        )
+        given = found, rows_of(stretched, rows), mean, pixels, views.camera
+        value = posterior_loss(*given, sigma=sigma, loss="huber", loss_scale=3.0)
         return torch.clamp(value, max=200.0).float()
 
     return {
         "heat maps": None,
-        "PnP, rigid mean": through(
-            lambda p, s: fit(mean, p, views.camera, sigma=s, stretch="none"), mean
-        ),
-        "PnP, stretched mean": through(lambda p, s: fit(mean, p, views.camera, sigma=s), mean),
-        "learned shape": through(lambda p, s: align(shape, p, views.camera, sigma=s), mean),
+        "PnP, rigid mean": through(fit, mean, stretch="none"),
+        "PnP, stretched mean": through(fit, mean),
+        "learned shape": through(align, shape),
         "Monte-Carlo": posterior,
     }
 
@@ -144,8 +143,8 @@ def judged(
     for b in range(len(views)):
         view = cadalign.View(views.camera, pixels[b], ids=views.ids, sigma=sigma[b])
         result = cadalign.align(shape, view)
-        cosine = (np.trace(result.alignment.rotation.T @ views.rotation[b]) - 1) / 2
-        turns.append(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+        turn = vector_from_rotation(result.alignment.rotation.T @ views.rotation[b])
+        turns.append(float(np.degrees(np.linalg.norm(turn))))
         ious.append(box_iou_up_to_scale(est=result.box, gt=views.box(b)))
     return {
         "keypoints, px": float(np.median(lengths)),
@@ -215,12 +214,11 @@ def main(options: TrainOptions) -> None:
     ids = tuple(sorted(common))
     known, unseen = models[: 3 * len(models) // 4], models[3 * len(models) // 4 :]
     shape = learned_shape(known, ids, options.category)
-    views = render_views(known, ids=ids, size=options.size, count=options.views, seed=options.seed)
-    held_out = render_views(
-        unseen, ids=ids, size=options.size, count=options.held_out, seed=options.seed + 1
-    )
-    spare = render_views(
-        known, ids=ids, size=options.size, count=options.held_out, seed=options.seed + 2
+    views, held_out, spare = (
+        render_views(some, ids=ids, size=options.size, count=count, seed=options.seed + number)
+        for number, (some, count) in enumerate(
+            [(known, options.views), (unseen, options.held_out), (known, options.held_out)]
+        )
     )
     print(f"{len(ids)} keypoints, views rendered: {time.perf_counter() - begun:.0f} s", flush=True)
     first = KeypointDetector.untrained(len(ids), seed=options.seed)

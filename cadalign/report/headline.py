@@ -1,25 +1,29 @@
-"""Headline tables: their rows, the best values, the failures by reason."""
+"""Headline tables: their rows, best values and failures, and as Markdown, CSV and LaTeX."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+from cadalign.errors import InputError
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import HIGH, Metric
 from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.photos.protocols import TRUTH
+from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
-from cadalign.evaluation.summary import ALL, Summary, group_name
-from cadalign.report.runs import by_spec
+from cadalign.evaluation.summary import ALL, Summary, csv_text, group_name
+from cadalign.report.runs import by_spec, read_runs
 
 _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
 """Methods that know what nobody does: the bound, the object's own model, the true pose."""
 OTHER_REASONS = "other reasons"
+_PARTS = ("rows", "failures", "skipped")
 
 
 @dataclass(frozen=True)
@@ -61,30 +65,30 @@ class Headline:
     group: str
     columns: tuple[Metric, ...]
     rows: list[HeadlineRow]
-    failures: list[Failure]
-    skipped: list[Failure]
-    paper: list[HeadlineRow]
-    note: str
+    failures: list[Failure] = field(default_factory=list)
+    skipped: list[Failure] = field(default_factory=list)
+    paper: list[HeadlineRow] = field(default_factory=list)
+    note: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """The table for the page."""
+        names = ("category", "method", "cells")
         return {
-            "group": self.group,
+            **{each: list(map(asdict, getattr(self, each))) for each in _PARTS},
             "columns": [column.column() for column in self.columns],
-            "rows": [asdict(row) for row in self.rows],
-            "failures": [asdict(failure) for failure in self.failures],
-            "skipped": [asdict(reason) for reason in self.skipped],
-            "paper": [
-                {"category": row.category, "method": row.method, "cells": row.cells}
-                for row in self.paper
-            ],
+            "group": self.group,
+            "paper": [{name: getattr(row, name) for name in names} for row in self.paper],
             "note": self.note,
         }
 
 
 def headline_of(runs: Sequence[Run]) -> Headline:
     """The headline table of runs of one kind."""
-    lines = [_all_first(spec_of(run).lines(spec_of(run).summarize(run))) for run in runs]
+    lines = []
+    for run in runs:
+        found = spec_of(run).lines(spec_of(run).summarize(run))
+        # Those of all groups together come first.
+        lines.append(sorted(found, key=lambda line: line.group.split(", ")[0] != ALL))
     columns, notes, stated = dict[str, Metric](), list[str](), list[Summary]()
     for spec, places in by_spec(runs):
         own = [runs[k] for k in places]
@@ -109,11 +113,6 @@ def headline_of(runs: Sequence[Run]) -> Headline:
         paper=[HeadlineRow.of(0, line, shown) for line in stated],
         note=" ".join(filter(None, dict.fromkeys(notes))),
     )
-
-
-def _all_first(lines: Sequence[Summary]) -> list[Summary]:
-    """The lines of all groups together before those of single ones, otherwise in their order."""
-    return sorted(lines, key=lambda line: line.group.split(", ")[0] != ALL)
 
 
 def _with_best(rows: Sequence[HeadlineRow], columns: Sequence[Metric]) -> list[HeadlineRow]:
@@ -155,3 +154,122 @@ def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
     for (category, method, _), count in counts.most_common()[_MOST_REASONS:]:
         rest[category, method, OTHER_REASONS] += count
     return [Failure(index, *names, count) for names, count in (*listed, *rest.items())]
+
+
+# As text ------------------------------------------------------------------------------------------
+
+FORMATS = ("md", "csv", "latex")
+_NOTHING = "-"
+_LATEX: dict[int, str] = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "µ": r"\textmu{}",
+        "\n": " ",
+        **{character: f"\\{character}" for character in "&%$#_{}"},
+    }
+)
+# A reader of Markdown takes these for marks, or for HTML.
+_MARKDOWN: dict[int, str] = str.maketrans(
+    {character: f"\\{character}" for character in "\\`*_{}[]()#+!|~$"}
+    | {"<": "&lt;", ">": "&gt;", "&": "&amp;", "\n": " ", "\r": " "}
+)
+
+
+def headline_text(runs: Sequence[str | os.PathLike[str]], *, format: str) -> str:
+    """The headline table of runs as text.
+
+    Parameters
+    ----------
+    runs : sequence of path-like
+        Folders of runs; see `cadalign.report.write_report`.
+    format : {"md", "csv", "latex"}
+        Best values are bold but in CSV, whose numbers are not rounded. LaTeX needs the packages
+        booktabs and textcomp.
+
+    Examples
+    --------
+    >>> print(headline_text(["runs/keypointnet"], format="latex"))  # doctest: +SKIP
+    """
+    if format not in FORMATS:
+        raise InputError(
+            f"unknown format {format!r}", where="format", fix=f"known are {', '.join(FORMATS)}"
+        )
+    found = read_runs(runs)
+    return table_text(headline_of(found), [run.name for run in found], format=format)
+
+
+def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
+    """The table as text; ``names`` are those of the runs. See `headline_text`."""
+    writers = {"md": _markdown, "csv": _csv, "latex": _latex}
+    return writers[format](headline, names)
+
+
+def _csv(headline: Headline, names: Sequence[str]) -> str:
+    runs = ["run"] if len(names) > 1 else []
+    head = [*runs, headline.group, "method", *(column.heading for column in headline.columns)]
+    lines: list[list[object]] = []
+    for row, name in _rows(headline, names):
+        labels = [*([name] if runs else []), row.category, row.method]
+        # A cell that is None is empty.
+        lines.append([*labels, *(row.cells[column.key] for column in headline.columns)])
+    return csv_text([head, *lines])
+
+
+def _markdown(headline: Headline, names: Sequence[str]) -> str:
+    head, rows = _table(headline, names, _MARKDOWN, "**{}**")
+    marks = ["---"] * (len(head) - len(headline.columns)) + ["---:"] * len(headline.columns)
+    table = "\n".join(f"| {' | '.join(line)} |" for line in [head, marks, *rows])
+    return f"{table}\n\n{headline.note.translate(_MARKDOWN)}\n"
+
+
+def _latex(headline: Headline, names: Sequence[str]) -> str:
+    head, rows = _table(headline, names, _LATEX, "\\textbf{{{}}}")
+    labels = len(head) - len(headline.columns)
+    lines = []
+    for number, cells in enumerate(rows):
+        if number and cells[: labels - 1] != rows[number - 1][: labels - 1]:
+            lines.append("\\addlinespace")
+        lines.append(f"{' & '.join(cells)} \\\\")
+    return "\n".join(
+        [
+            "% needs \\usepackage{booktabs,textcomp}",
+            f"\\begin{{tabular}}{{{'l' * labels}{'r' * len(headline.columns)}}}",
+            "\\toprule",
+            f"{' & '.join(head)} \\\\",
+            "\\midrule",
+            *lines,
+            "\\bottomrule",
+            "\\end{tabular}",
+            "",
+        ]
+    )
+
+
+def _table(
+    headline: Headline, names: Sequence[str], escapes: dict[int, str], best: str
+) -> tuple[list[str], list[list[str]]]:
+    """The head and the rows as text, numbers rounded, the best ones marked."""
+    runs = ["run"] if len(names) > 1 else []
+    head = [*runs, headline.group, "method", *(c.heading for c in headline.columns)]
+    rows = []
+    for row, name in _rows(headline, names):
+        labels = [*([name] if runs else []), row.category, look_of(row.method).label]
+        cells = [label.translate(escapes) for label in labels]
+        for column in headline.columns:
+            value = row.cells[column.key]
+            text = _NOTHING if value is None else f"{value:.{column.digits}f}"
+            text = text.translate(escapes)
+            cells.append(best.format(text) if column.key in row.best else text)
+        rows.append(cells)
+    return [text.translate(escapes) for text in head], rows
+
+
+def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, str]]:
+    """All rows with their run's name, the paper's behind those on the same category."""
+    rows = [(row, names[row.run]) for row in headline.rows]
+    for stated in headline.paper:
+        place = max(k for k, (row, _) in enumerate(rows) if row.category == stated.category)
+        rows.insert(place + 1, (stated, ""))
+    return rows

@@ -1,24 +1,42 @@
-"""The instances of runs and their errors as compact columns, joined by what names an instance."""
+"""The instances of runs: compact columns of their errors, pictures, mesh previews and records.
+
+Instances of several runs are joined by what names them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import hashlib
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote as url_quote
 
-import numpy as np
+import msgspec
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from cadalign.errors import DataError, quote
+from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_stem
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.outcome import LEFT_OUT, OK, SKIPPED
 from cadalign.evaluation.plots import compact
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
+from cadalign.io.files import dense_json, read_bytes, reading, write_text, write_whole, writing
 
 InstanceName = tuple[str, str, int]
 """Category, model id, view."""
-_TEXTS = ("category", "model", "visibility", "symmetry")
+INLINE_LIMIT = 60_000_000
+"""A page that would be larger has its pictures in files beside it [bytes]."""
+_OURS = ("picture_*.webp", "thumb_*.webp", "exhibits_*.js", "mesh_*.js")
+_PER_FILE = 64
+_COLUMNS = (
+    *("id", "run", "category", "model", "view", "keypoints", "true_y", "true_z", "noise"),
+    *("visibility", "symmetry", "exhibit", "thumb"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +61,12 @@ def instance_table(
     runs: Sequence[Run], methods: Sequence[str], metrics: Sequence[Metric]
 ) -> InstanceTable:
     """The table of runs over views of models, their methods and metrics of the rows."""
-    texts = _Texts()
-    columns = (
-        *("id", "run", "category", "model", "view", "keypoints", "true_y", "true_z", "noise"),
-        *("visibility", "symmetry", "exhibit", "thumb"),
-    )
-    instances: dict[str, list[Any]] = {name: [] for name in columns}
+    texts: dict[str, int] = {}
+
+    def place_of(text: str) -> int:
+        return texts.setdefault(text, len(texts))
+
+    instances: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
     rows: dict[str, list[Any]] = {name: [] for name in ("instance", "method", "status", "reason")}
     rows |= {metric.key: [] for metric in metrics}
     places: dict[tuple[int, InstanceName], int] = {}
@@ -62,67 +80,209 @@ def instance_table(
             key = (run_index, name)
             if key not in places:
                 places[key] = len(places)
-                _append(
-                    instances,
-                    id=ids.setdefault(name[1:] if joins else name, len(ids)),
-                    run=run_index,
-                    category=texts.place(name[0]),
-                    model=texts.place(name[1]),
-                    view=name[2],
-                    keypoints=cells["keypoints"][row],
-                    true_y=cells["stretch_y"][row],
-                    true_z=cells["stretch_z"][row],
-                    noise=run.noise_px,
-                    visibility=texts.place(cells["visibility"][row]),
-                    symmetry=texts.place(cells["symmetry"][row]),
-                    exhibit=-1,
-                    thumb=-1,
-                )
+                instance = {
+                    "id": ids.setdefault(name[1:] if joins else name, len(ids)),
+                    "run": run_index,
+                    "category": place_of(name[0]),
+                    "model": place_of(name[1]),
+                    "view": name[2],
+                    "keypoints": cells["keypoints"][row],
+                    "true_y": cells["stretch_y"][row],
+                    "true_z": cells["stretch_z"][row],
+                    "noise": run.noise_px,
+                    "visibility": place_of(cells["visibility"][row]),
+                    "symmetry": place_of(cells["symmetry"][row]),
+                    "exhibit": -1,
+                    "thumb": -1,
+                }
+                for column, cell in instance.items():
+                    instances[column].append(cell)
             reason = cells["reason"][row]
             rows["instance"].append(places[key])
-            rows["reason"].append(texts.place(reason) if reason else -1)
+            rows["reason"].append(place_of(reason) if reason else -1)
         rows["method"] += [number[name] for name in cells["method"]]
         rows["status"] += [int(status != OK) for status in cells["status"]]
         for metric in metrics:
             rows[metric.key] += cells[metric.key]
-    return InstanceTable(texts.found, instances, rows, places)
-
-
-@dataclass
-class _Texts:
-    """Texts, each once."""
-
-    found: list[str] = field(default_factory=list)
-    _places: dict[str, int] = field(default_factory=dict)
-
-    def place(self, text: str) -> int:
-        if text not in self._places:
-            self._places[text] = len(self.found)
-            self.found.append(text)
-        return self._places[text]
-
-
-def _append(columns: dict[str, list[Any]], **cells: Any) -> None:
-    for name, cell in cells.items():
-        columns[name].append(cell)
+    return InstanceTable(list(texts), instances, rows, places)
 
 
 def _cells(run: Run, metrics: Sequence[Metric]) -> dict[str, list[Any]]:
     """The columns of a run's results as lists, without what was left out or skipped."""
     without = pc.is_in(run.results["status"], value_set=pa.array([LEFT_OUT, SKIPPED]))
     table = run.results.filter(pc.invert(without))
-    wanted = ("category", "model_id", "view", "method", "status", "reason", "keypoints")
-    optional = ("visibility", "symmetry")
-    numbers = ("stretch_y", "stretch_z", *(metric.key for metric in metrics))
-    cells = {name: table[name].to_pylist() for name in wanted}
-    for name in optional:
+    cells: dict[str, list[Any]] = {}
+    for name in ("category", "model_id", "view", "method", "status", "reason", "keypoints"):
+        cells[name] = table[name].to_pylist()
+    for name in ("visibility", "symmetry"):
         known = name in table.column_names
         cells[name] = table[name].to_pylist() if known else [""] * len(table)
-    for name in numbers:
-        known = name in table.column_names
-        cells[name] = (
-            compact(np.asarray(table[name].to_numpy(zero_copy_only=False)))
-            if known
-            else [None] * len(table)
-        )
+    for name in ("stretch_y", "stretch_z", *(metric.key for metric in metrics)):
+        cells[name] = [None] * len(table)
+        if name in table.column_names:
+            cells[name] = compact(table[name].to_numpy(zero_copy_only=False))
     return cells
+
+
+# Media --------------------------------------------------------------------------------------------
+
+
+def inline_bytes(runs: Sequence[Run]) -> int:
+    """Rough size of a page with everything inside [bytes]."""
+    files = [
+        path
+        for run in runs
+        for folder in (run.folder.pictures, run.folder.thumbs, run.folder.previews)
+        if folder.is_dir()
+        for path in folder.iterdir()
+        if path.is_file()
+    ]
+    pictures = sum(path.stat().st_size for path in files)
+    return sum(run.record_bytes() for run in runs) + pictures * 4 // 3
+
+
+@dataclass
+class AssetStore:
+    """Pictures, mesh previews and instance records: inside the page, or in a folder ``assets``."""
+
+    page: Path
+    assets: Path | None
+    pictures: dict[str, str] = field(default_factory=dict)
+    thumbs: dict[str, str] = field(default_factory=dict)
+    meshes: dict[str, Any] = field(default_factory=dict)
+    records: dict[str, Any] = field(default_factory=dict)
+    _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
+    _calls: list[list[str]] = field(default_factory=list)
+    _exhibit_files: list[str] = field(default_factory=list)
+
+    def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
+        """Take in the pictures and records of runs, and enter their keys in the table."""
+        if self.assets is not None:
+            with writing(self.assets):
+                self.assets.mkdir(parents=True, exist_ok=True)
+                for pattern in _OURS:
+                    for old in self.assets.glob(pattern):
+                        old.unlink()
+        for index, run in enumerate(runs):
+            pictures, thumbs = _names_in(run.folder.pictures), _names_in(run.folder.thumbs)
+            previews = _names_in(run.folder.previews)
+            for row in run.records(RECORD_COLUMNS):
+                name = (row["category"], row["model_id"], row["view"])
+                place = table.places.get((index, name))
+                if place is None:
+                    continue
+                stem, model = f"{record_stem(*name)}.webp", f"{record_stem(*name[:2])}.json"
+                picture, thumb, mesh = (
+                    store(folder / file) if file in names else None
+                    for store, folder, file, names in (
+                        (self._picture, run.folder.pictures, stem, pictures),
+                        (self._thumb, run.folder.thumbs, stem, thumbs),
+                        (self._mesh, run.folder.previews, model, previews),
+                    )
+                )
+                table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
+                table.instances["exhibit"][place] = place
+                record = _object(row["exhibit"], run.folder.records)
+                self._keep(place, {"picture": picture, "mesh": mesh, **record})
+
+    def to_dict(self) -> dict[str, Any]:
+        """The page's part of it; writes the files that are beside the page."""
+        found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
+        if self.assets is None:
+            return {**found, "exhibits": self.records, "meshes": self.meshes}
+        for index, calls in enumerate(self._calls):
+            if calls or not self._exhibit_files[index]:
+                self._write_records(index)
+        return {
+            **found,
+            "exhibit_files": self._exhibit_files,
+            "exhibits_per_file": _PER_FILE,
+            "mesh_files": {
+                key: self._write_script(
+                    f"mesh_{key}.js", [f"cadalignMesh({dense_json(key)}, {dense_json(mesh)})"]
+                )
+                for key, mesh in self.meshes.items()
+            },
+        }
+
+    def _picture(self, path: Path) -> str:
+        return self._once(path, self.pictures, self._address_of)
+
+    def _thumb(self, path: Path) -> str:
+        return self._once(path, self.thumbs, self._address_of)
+
+    def _mesh(self, path: Path) -> str:
+        return self._once(path, self.meshes, lambda data, key: _object(data, path), "m")
+
+    def _once(
+        self,
+        path: Path,
+        store: dict[str, Any],
+        make: Callable[[bytes, str], Any],
+        prefix: str = "",
+    ) -> str:
+        """Store what is made of a file, once for all with its content; returns its key."""
+        data, kind = read_bytes(path), path.parent.name
+        digest = (kind, hashlib.sha256(data).digest())  # compared runs show the same ones
+        if digest not in self._known:
+            key = f"{prefix}{len(store)}"
+            store[key] = make(data, f"{kind[:-1]}_{len(store):06d}.webp")
+            self._known[digest] = key
+        return self._known[digest]
+
+    def _address_of(self, data: bytes, name: str) -> str:
+        """The address of a picture: its own data, or a file's."""
+        if self.assets is None:
+            return "data:image/webp;base64," + base64.b64encode(data).decode("ascii")
+        write_whole(self.assets / name, lambda path: path.write_bytes(data))
+        return self._address(name)
+
+    def _keep(self, place: int, record: dict[str, Any]) -> None:
+        """Keep an instance's record; beside a page as text, whose file is written once full."""
+        if self.assets is None:
+            self.records[str(place)] = record
+            return
+        index = place // _PER_FILE
+        while len(self._calls) <= index:
+            self._calls.append([])
+            self._exhibit_files.append("")
+        text = msgspec.json.encode(record).decode()
+        self._calls[index].append(f"cadalignExhibit({place}, {text})")
+        if len(self._calls[index]) == _PER_FILE:
+            self._write_records(index)
+
+    def _write_records(self, index: int) -> None:
+        """Write a file of records."""
+        calls, self._calls[index] = self._calls[index], []
+        self._exhibit_files[index] = self._write_script(f"exhibits_{index:04d}.js", calls)
+
+    def _write_script(self, name: str, calls: Sequence[str]) -> str:
+        assert self.assets is not None
+        write_text(self.assets / name, ";\n".join(calls) + ";\n")
+        return self._address(name)
+
+    def _address(self, name: str) -> str:
+        """A file's address, relative to the page."""
+        assert self.assets is not None
+        folder = os.path.relpath(self.assets, self.page.parent)
+        return url_quote(f"{Path(folder).as_posix()}/{name}")
+
+
+def _names_in(folder: Path) -> frozenset[str]:
+    """Names of a folder's files, read once: asking for thousands takes seconds."""
+    if not folder.is_dir():
+        return frozenset()
+    with reading(folder), os.scandir(folder) as entries:
+        return frozenset(entry.name for entry in entries if entry.is_file())
+
+
+def _object(text: str | bytes, path: Path) -> dict[str, Any]:
+    """The JSON object that a text of a file is."""
+    try:
+        found = msgspec.json.decode(text)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        what = f"{quote(text)} is not an object of JSON"
+        raise DataError(what, where=str(path), fix="remove it: the run is shown without it")
+    return found

@@ -57,12 +57,18 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.evaluation.methods.method import LIMIT
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import dense_json, write_text, writing
 from cadalign.report.headline import Headline, headline_of
-from cadalign.report.instances import InstanceTable, instance_table
-from cadalign.report.media import INLINE_LIMIT, AssetStore, inline_bytes
+from cadalign.report.instances import (
+    INLINE_LIMIT,
+    AssetStore,
+    InstanceTable,
+    inline_bytes,
+    instance_table,
+)
 from cadalign.report.runs import (
     all_methods,
     by_spec,
@@ -120,8 +126,7 @@ def write_report(
     found = read_runs(runs)
     with writing(page.parent):
         page.parent.mkdir(parents=True, exist_ok=True)
-    table, media = None, {}
-    folder = None
+    table, media, folder = None, {}, None
     metrics = shown_metrics(found)
     if metrics:
         table = instance_table(found, all_methods(found), metrics)
@@ -130,7 +135,17 @@ def write_report(
         store = AssetStore(page, folder)
         store.fill(found, table)
         media = store.to_dict()
-    payload = payload_of(found, headline_of(found), table, media, title=title or title_of(found))
+    payload = page_payload(
+        title=title or title_of(found),
+        summary=summary_of(found),
+        runs=[_run_dict(run) for run in found],
+        methods=[method_dict(name) for name in all_methods(found)],
+        headline=headline_of(found),
+        plots=_plots(found),
+        metrics=metrics,
+        table=table,
+        **media,
+    )
     write_text(page, render_page(payload))
     return Report(page, folder)
 
@@ -146,40 +161,41 @@ def render_page(payload: dict[str, Any]) -> str:
     )
 
 
-def payload_of(
-    runs: Sequence[Run],
-    headline: Headline,
-    table: InstanceTable | None,
-    media: dict[str, Any],
+def page_payload(
     *,
     title: str,
+    summary: str,
+    runs: Sequence[dict[str, Any]],
+    methods: Sequence[dict[str, Any]],
+    headline: Headline,
+    plots: Sequence[Plot],
+    metrics: Sequence[Metric] = (),
+    table: InstanceTable | None = None,
+    **media: Any,
 ) -> dict[str, Any]:
-    """Put the payload of a page on runs of one kind together.
-
-    ``table`` is None for runs without instances; ``media`` is from
-    `cadalign.report.media.AssetStore`.
-    """
+    """The payload of a page; one without instances has no ``table`` and no ``media``."""
     return {
         "format": _FORMAT,
         "title": title,
-        "summary": summary_of(runs),
-        "runs": [
-            {
-                "name": run.name,
-                "what": run.experiment,
-                "state": "finished" if run.is_finished else "unfinished",
-                "done": run.done,
-                "total": run.total,
-                "settings": [list(pair) for pair in settings_of(run)],
-            }
-            for run in runs
-        ],
-        "methods": [method_dict(name) for name in all_methods(runs)],
-        "metrics": [metric.page() for metric in shown_metrics(runs)],
+        "summary": summary,
+        "runs": runs,
+        "methods": methods,
+        "metrics": [metric.page() for metric in metrics],
         "headline": headline.to_dict(),
         "tables": None if table is None else table.to_dict(),
-        "plots": [plot.to_dict() for plot in _plots(runs)],
+        "plots": [plot.to_dict() for plot in plots],
         **media,
+    }
+
+
+def _run_dict(run: Run) -> dict[str, Any]:
+    return {
+        "name": run.name,
+        "what": run.experiment,
+        "state": "finished" if run.is_finished else "unfinished",
+        "done": run.done,
+        "total": run.total,
+        "settings": [list(pair) for pair in settings_of(run)],
     }
 
 

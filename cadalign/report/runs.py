@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -129,7 +129,22 @@ def title_of(runs: Sequence[Run]) -> str:
 
 def summary_of(runs: Sequence[Run]) -> str:
     """One paragraph on methods, data, day and progress of runs."""
-    return " ".join(_sentences(runs))
+    sentences = []
+    for run in runs:
+        before = f"{run.name}: " if len(runs) > 1 else ""
+        version = run.config.get("versions", {}).get("cadalign", "of an unknown version")
+        names = [name for name in run.methods if name != LIMIT]
+        methods = "One method" if len(names) == 1 else f"{len(names)} methods"
+        methods += " and the Cramer-Rao bound" if LIMIT in run.methods else ""
+        what = spec_of(run).describe(run)
+        sentences.append(f"{before}{methods} {what}, with cadalign {version} on {run.day}.")
+        if not run.is_finished:
+            sentences.append(
+                f"The run is unfinished, {run.done:,} of {run.total:,} tasks are done: the numbers "
+                "are those of the finished ones."
+            )
+    about = dict.fromkeys(spec.about for spec, _ in by_spec(runs))
+    return " ".join([*sentences, *filter(None, about)])
 
 
 def settings_of(run: Run) -> list[tuple[str, str]]:
@@ -146,28 +161,6 @@ def settings_of(run: Run) -> list[tuple[str, str]]:
     ]
     version = run.config.get("versions", {}).get("cadalign")
     return [*found, ("cadalign", str(version))] if version else found
-
-
-def _sentences(runs: Sequence[Run]) -> Iterator[str]:
-    for run in runs:
-        before = f"{run.name}: " if len(runs) > 1 else ""
-        version = run.config.get("versions", {}).get("cadalign", "of an unknown version")
-        text = (
-            f"{_methods(run)} {spec_of(run).describe(run)}, with cadalign {version} on {run.day}."
-        )
-        yield f"{before}{text}"
-        if not run.is_finished:
-            yield (
-                f"The run is unfinished, {run.done:,} of {run.total:,} tasks are done: the numbers "
-                "are those of the finished ones."
-            )
-    yield from filter(None, dict.fromkeys(spec.about for spec, _ in by_spec(runs)))
-
-
-def _methods(run: Run) -> str:
-    names = [name for name in run.methods if name != LIMIT]
-    count = "One method" if len(names) == 1 else f"{len(names)} methods"
-    return f"{count} and the Cramer-Rao bound" if LIMIT in run.methods else count
 
 
 def _text(value: Any) -> str:

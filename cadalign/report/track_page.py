@@ -17,7 +17,7 @@ from cadalign.evaluation.plots import COLORS, Plot, Trace, compact
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.files import write_text
 from cadalign.report.headline import Failure, Headline, HeadlineRow
-from cadalign.report.page import line_dict, render_page
+from cadalign.report.page import line_dict, page_payload, render_page
 
 _TIME = Metric("time", "time", "s", log=False, better=None)
 _BAND = "band: two standard deviations"
@@ -68,16 +68,6 @@ def write_track_page(
         Why tracks could not be estimated, by their name.
     """
     names = [*(each.track.name for each in found), *failures]
-    colors = [COLORS[k % len(COLORS)] for k in range(len(names))]
-    headline = Headline(
-        group="shape",
-        columns=_COLUMNS,
-        rows=[_row(each) for each in found],
-        failures=[Failure(0, "", name, reason, 1) for name, reason in failures.items()],
-        skipped=[],
-        paper=[],
-        note=_NOTE,
-    )
     run = {
         "name": title,
         "what": "track",
@@ -86,28 +76,27 @@ def write_track_page(
         "total": len(names),
         "settings": [*map(list, settings.items()), ["cadalign", version("cadalign")]],
     }
-    page = {
-        "format": 1,
-        "title": title,
-        "summary": summary,
-        "runs": [run],
-        "methods": [
-            line_dict(name, f"track {name}", color)
-            for name, color in zip(names, colors, strict=True)
+    payload = page_payload(
+        title=title,
+        summary=summary,
+        runs=[run],
+        methods=[
+            line_dict(name, f"track {name}", COLORS[k % len(COLORS)])
+            for k, name in enumerate(names)
         ],
-        "metrics": [],
-        "headline": headline.to_dict(),
-        "tables": None,
-        "plots": [plot.to_dict() for plot in track_plots(found)],
-        "pictures": {},
-        "thumbs": {},
-        "exhibits": {},
-        "meshes": {},
-    }
-    write_text(path, render_page(page))
+        headline=Headline(
+            group="shape",
+            columns=_COLUMNS,
+            rows=[_row(each) for each in found],
+            failures=[Failure(0, "", name, reason, 1) for name, reason in failures.items()],
+            note=_NOTE,
+        ),
+        plots=_track_plots(found),
+    )
+    write_text(path, render_page(payload))
 
 
-def track_plots(found: Sequence[FoundTrack]) -> list[Plot]:
+def _track_plots(found: Sequence[FoundTrack]) -> list[Plot]:
     """Plots of pose, speeds and residuals over time, a line for each track."""
     plots = [
         _plot(f"place_{name}", _length(name, f"place {name}"), found, _part(_places, k), _BAND)

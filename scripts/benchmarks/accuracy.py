@@ -1,4 +1,4 @@
-"""Accuracy of the solvers against the Cramer-Rao bound, their speed, and what they state."""
+"""Accuracy of the solvers against the Cramer-Rao bound, and their speed."""
 
 from __future__ import annotations
 
@@ -10,27 +10,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 import cadalign
-from benchmarks.section import (
-    BenchmarkData,
-    RatioTable,
-    Row,
-    figure,
-    ideal_errors,
-    medians_in_turns,
-    seconds,
-)
-from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
+from benchmarks import section
+from benchmarks.section import BenchmarkData, RatioTable, Row
+from cadalign import Alignment, Camera, RansacOptions
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.errors import CadalignError
 from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
+from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation.problems import (
     SIMULATION_CAMERA,
@@ -38,7 +29,6 @@ from cadalign.evaluation.simulation.problems import (
     random_rotation,
     simulate_problem,
 )
-from cadalign.shapes.tails import probability_within
 from cadalign.solvers.alignment import evaluate_cost, keypoint_objective
 from cadalign.solvers.linear import aepnp
 from cadalign.solvers.minimal import ap4p
@@ -54,14 +44,12 @@ _ERRORS = {
     "scale_y_error": "s_y",
     "scale_z_error": "s_z",
 }
+_FAILED = {**dict.fromkeys(_ERRORS, np.inf), "rotation_error_deg": 180.0}
 _FOCAL_ERRORS = {**_ERRORS, "focal_error": "f"}
 _UNKNOWN = Camera.without_focal(SIMULATION_CAMERA.width, SIMULATION_CAMERA.height)
 _ROBUST_POINTS = 100
-_LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25
-_COVERED = 0.95
 _FIELDS = (120, 180, 200)  # of view [degrees]
 _WIDE_SIDE = 1000  # of their images [px]
-_CALIBRATED_SIZES = (5, 6, 7, 8, 10, 20, 50, 100)
 
 Draw = Callable[[np.random.Generator], Problem]
 
@@ -83,12 +71,15 @@ class Solvers:
     """Timed calls per figure; the median counts."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure accuracy, the minimal solver and speed."""
-        title = "Errors over the Cramer-Rao limit's: median (90th percentile)"
-        yield RatioTable(title, list(self._accuracy(given)))
-        yield RatioTable(
-            "4 points: the truth among the minimal solver's solutions", [self._minimal(given)]
-        )
+        sources: list[tuple[str, float, Draw]] = [
+            (f"{n} points, {px:g} px", px, partial(simulate_problem, points=n, noise_px=px))
+            for n, px in _ROWS
+        ]
+        if given.keypointnet is not None:
+            sources += _keypointnet_sources(given.keypointnet)
+        yield _accuracy_table(sources, self.problems, given.seed)
+        title = "4 points: the truth among the minimal solver's solutions"
+        yield RatioTable(title, [self._minimal(given.seed)])
         rng = np.random.default_rng(given.seed)
         rows = []
         for points in _SPEED_SIZES:
@@ -96,22 +87,9 @@ class Solvers:
             rows += _speed(problem, points, self.repetitions)
         yield RatioTable("Time over OpenCV's, which does not stretch", rows)
 
-    def _accuracy(self, given: BenchmarkData) -> Iterator[Row]:
-        sources: list[tuple[str, float, Draw]] = [
-            (
-                f"{n} points, {noise:g} px",
-                noise,
-                partial(simulate_problem, points=n, noise_px=noise),
-            )
-            for n, noise in _ROWS
-        ]
-        if given.keypointnet is not None:
-            sources += _keypointnet_sources(given.keypointnet)
-        return _accuracy_rows(sources, self.problems, given.seed)
-
-    def _minimal(self, given: BenchmarkData) -> Row:
+    def _minimal(self, seed: int) -> Row:
         """Rate of the truth among the solutions, and their number."""
-        rng = np.random.default_rng(given.seed)
+        rng = np.random.default_rng(seed)
         found = solutions = 0
         for _ in range(self.problems):
             problem = simulate_problem(rng, points=4, noise_px=0.0)
@@ -137,35 +115,70 @@ class WideLenses:
     """Keypoints of an object."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure accuracy at several fields of view."""
-        half = (_WIDE_SIDE - 1) / 2
+        half, omega = (_WIDE_SIDE - 1) / 2, 0.9
         sources: list[tuple[str, float, Draw]] = []
         for field in _FIELDS:
             reach = np.radians(field / 2)
-            omega = 0.9
             bend = np.arctan2(2 * np.tan(omega / 2) * np.sin(reach), np.cos(reach)) / omega
-            for lens, focal, coefficients in (
-                ("fisheye", half / reach, ()),
-                ("fov", half / bend, (omega,)),
-            ):
-                size = (_WIDE_SIDE, _WIDE_SIDE)
+            for lens, slope, coefficients in (("fisheye", reach, ()), ("fov", bend, (omega,))):
+                size, focal = (_WIDE_SIDE, _WIDE_SIDE), half / slope
                 camera = Camera(*size, focal, focal, half, half, coefficients, lens=lens)
                 draw = partial(_wide_problem, camera, reach, self.points)
                 sources.append((f"{lens}, {field} degrees", 1.0, draw))
-        title = "Errors over the Cramer-Rao limit's: median (90th percentile)"
-        yield RatioTable(title, list(_accuracy_rows(sources, self.problems, given.seed)))
+        yield _accuracy_table(sources, self.problems, given.seed)
 
 
-def _accuracy_rows(
+def _accuracy_table(
     sources: Iterable[tuple[str, float, Draw]], count: int, seed: int
-) -> Iterator[Row]:
-    """Errors of every method on so many problems of each source."""
+) -> RatioTable:
+    """Errors of every method over the limit's, and the global minima that it missed."""
+    rows = []
     for name, noise, draw in sources:
         rng = np.random.default_rng(seed)
         problems = [draw(rng) for _ in range(count)]
-        limit = ideal_errors(problems, rng, sigma=noise, focal="known")
+        limit = _levels(_ideal_errors(problems, rng, sigma=noise, focal="known"))
         for method in _METHODS:
-            yield {"problems": name, **_accuracy_row(problems, noise, method, limit)}
+            is_best = method == "optimal"
+            errors, failed, missed = [], 0, 0
+            for problem in problems:
+                result = section.fitted(problem, method=method, sigma=noise if is_best else 1.0)
+                if result is None:
+                    failed += 1
+                    errors.append(_FAILED)
+                    continue
+                errors.append(alignment_errors(est=result.alignment, gt=problem.alignment))
+                missed += is_best and _is_missed(problem, noise, result.alignment)
+            found = _levels({key: [each[key] for each in errors] for key in _ERRORS})
+            ratios = {s: tuple((found[k] / limit[k]).tolist()) for k, s in _ERRORS.items()}
+            rows.append(
+                {
+                    "problems": name,
+                    "limit R deg": tuple(limit["rotation_error_deg"].tolist()),
+                    "method": method,
+                    "median R deg": float(found["rotation_error_deg"][0]),
+                    **ratios,
+                    "failed %": 100 * failed / count,
+                    "missed %": 100 * missed / count if is_best else None,
+                }
+            )
+    return RatioTable("Errors over the Cramer-Rao limit's: median (90th percentile)", rows)
+
+
+def _levels(errors: dict[str, Any]) -> dict[str, FloatArray]:
+    return {name: np.percentile(values, (50, 90)) for name, values in errors.items()}
+
+
+def _ideal_errors(
+    problems: Iterable[Problem], rng: np.random.Generator, *, sigma: float, focal: str
+) -> dict[str, FloatArray]:
+    """Errors of an ideal estimator on all problems, by name; see `cramer_rao_bound`."""
+    draws = []
+    for each in problems:
+        given = each.points_3d, each.camera, each.alignment
+        bound = section.attempt(cramer_rao_bound, *given, sigma=sigma, focal=focal)
+        if bound is not None:
+            draws.append(sample_limit(bound, rng=rng, draws=section.LIMIT_DRAWS))
+    return {error: np.concatenate([draw[error] for draw in draws]) for error in draws[0]}
 
 
 def _wide_problem(camera: Camera, reach: float, points: int, rng: np.random.Generator) -> Problem:
@@ -188,7 +201,7 @@ def _keypointnet_sources(root: Path) -> Iterator[tuple[str, float, Draw]]:
             yield f"{category}, 7 keypoints", 1.0, partial(_keypointnet_problem, models)
 
 
-def _keypointnet_problem(models: list[np.ndarray], rng: np.random.Generator) -> Problem:
+def _keypointnet_problem(models: list[FloatArray], rng: np.random.Generator) -> Problem:
     points = models[rng.integers(len(models))]
     chosen = points[rng.choice(len(points), 7, replace=False)]
     scale = np.array([1.0, *(1 / rng.uniform(*STRETCH_RANGE, 2))])
@@ -198,48 +211,11 @@ def _keypointnet_problem(models: list[np.ndarray], rng: np.random.Generator) -> 
     return Problem(chosen / scale, pixels, KEYPOINT_CAMERA, alignment, None)
 
 
-def _spans_volume(points: np.ndarray) -> bool:
+def _spans_volume(points: FloatArray) -> bool:
     if len(points) < 7:
         return False
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spread[2] > 0.05 * spread[0])
-
-
-def _accuracy_row(
-    problems: list[Problem], noise: float, method: str, limit: dict[str, np.ndarray]
-) -> Row:
-    """Errors of a method over those of the limit, and the global minima that it missed."""
-    errors = []
-    failed = missed = 0
-    for problem in problems:
-        try:
-            sigma = noise if method == "optimal" else 1.0
-            est = cadalign.fit(
-                problem.points_3d, problem.points_2d, problem.camera, method=method, sigma=sigma
-            ).alignment
-        except CadalignError:
-            failed += 1
-            errors.append([180.0, np.inf, np.inf, np.inf])
-            continue
-        found = alignment_errors(est=est, gt=problem.alignment)
-        errors.append([found[error] for error in _ERRORS])
-        missed += method == "optimal" and _is_missed(problem, noise, est)
-
-    def levels(values: np.ndarray) -> np.ndarray:
-        return np.percentile(values, (50, 90))
-
-    ratios = {
-        short: tuple((levels(values) / levels(limit[error])).tolist())
-        for (error, short), values in zip(_ERRORS.items(), np.array(errors).T, strict=True)
-    }
-    return {
-        "limit R deg": tuple(levels(limit["rotation_error_deg"]).tolist()),
-        "method": method,
-        "median R deg": float(np.median(np.array(errors)[:, 0])),
-        **ratios,
-        "failed %": 100 * failed / len(problems),
-        "missed %": 100 * missed / len(problems) if method == "optimal" else None,
-    }
+    sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(sizes[2] > 0.05 * sizes[0])
 
 
 def _is_missed(problem: Problem, noise: float, est: Alignment) -> bool:
@@ -260,7 +236,7 @@ def _is_missed(problem: Problem, noise: float, est: Alignment) -> bool:
 def _speed(problem: Problem, points: int, repetitions: int) -> Iterator[Row]:
     x, uv, camera = problem.points_3d, problem.points_2d, problem.camera
     rays, matrix = camera.normalize(uv), camera.matrix
-    timed: dict[str, Callable[[], object]] = {
+    calls: dict[str, Callable[[], object]] = {
         "cv2 EPNP": lambda: cv2.solvePnP(x, uv, matrix, None, flags=cv2.SOLVEPNP_EPNP),
         "cv2 SQPNP": lambda: cv2.solvePnP(x, uv, matrix, None, flags=cv2.SOLVEPNP_SQPNP),
         "cv2 ITERATIVE": lambda: cv2.solvePnP(x, uv, matrix, None),
@@ -269,18 +245,20 @@ def _speed(problem: Problem, points: int, repetitions: int) -> Iterator[Row]:
         "fit optimal": lambda: cadalign.fit(x, uv, camera),
         "fit aepnp-paper": lambda: cadalign.fit(x, uv, camera, method="aepnp-paper"),
     }
-    clocked = {name: partial(seconds, call) for name, call in timed.items()}
-    medians = medians_in_turns(clocked, repetitions, per_turn=10)
+    timed = {name: partial(section.seconds, call) for name, call in calls.items()}
+    medians = section.medians_in_turns(timed, repetitions, per_turn=10)
     if points == 10:
         xs, uvs = np.tile(x, (_BATCH, 1, 1)), np.tile(uv, (_BATCH, 1, 1))
         for name, workers in {"1 thread": 1, "all cores": -1}.items():
             run = partial(cadalign.fit_batch, xs, uvs, camera, method="aepnp", workers=workers)
-            median = medians_in_turns({"": partial(seconds, run)}, 10, per_turn=10)[""]
+            median = section.medians_in_turns({"": partial(section.seconds, run)}, 10, per_turn=10)[
+                ""
+            ]
             medians[f"fit_batch aepnp, {name}"] = median / _BATCH
     for name in (*(each for each in medians if not each.startswith("cv2")), "cv2 SQPNP"):
         peer = "cv2 ITERATIVE" if name == "fit optimal" else "cv2 EPNP"
         ratio, label = medians[name] / medians[peer], f"{name}, {points} keypoints"
-        yield figure(label, 1e6 * medians[name], "us", ratio, peer)
+        yield section.figure(label, 1e6 * medians[name], "us", ratio, peer)
 
 
 # Unknown focal length -----------------------------------------------------------------------------
@@ -296,15 +274,15 @@ class UnknownFocal:
     """Random problems per share of outliers."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure accuracy and the robust search."""
         title = "1 px: median errors over the Cramer-Rao limit's of 9 unknowns"
-        yield RatioTable(title, [self._accuracy(given, points) for points in (10, 20, 50, 200)])
+        yield RatioTable(title, [self._accuracy(given.seed, n) for n in (10, 20, 50, 200)])
         title = f"{_ROBUST_POINTS} points: none of the wrong kept, and over 90 % of the others"
-        yield RatioTable(title, [self._robust(given, share) for share in (0.0, 0.3, 0.5, 0.7, 0.8)])
+        shares = (0.0, 0.3, 0.5, 0.7, 0.8)
+        yield RatioTable(title, [self._robust(given.seed, share) for share in shares])
 
-    def _accuracy(self, given: BenchmarkData, points: int) -> Row:
+    def _accuracy(self, seed: int, points: int) -> Row:
         """Median errors over those of an ideal estimator."""
-        rng = np.random.default_rng(given.seed)
+        rng = np.random.default_rng(seed)
         problems = [
             simulate_problem(rng, points=points, noise_px=1.0) for _ in range(self.problems)
         ]
@@ -323,247 +301,30 @@ class UnknownFocal:
                 row = alignment_errors(est=batch.alignment(b), gt=problem.alignment)
                 row["focal_error"] = abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1)
             errors.append(row)
-        ideal = ideal_errors(problems, rng, sigma=1.0, focal="estimate")
+        ideal = _ideal_errors(problems, rng, sigma=1.0, focal="estimate")
         limit = {error: float(np.median(ideal[error])) for error in _FOCAL_ERRORS}
         ratios = {
             short: float(np.median([row[error] for row in errors])) / limit[error]
             for error, short in _FOCAL_ERRORS.items()
         }
-        failed = 100 * float(1 - batch.solved.mean())
         row = {"points": points, "limit f %": 100 * limit["focal_error"]}
-        return {**row, **ratios, "failed %": failed}
+        return {**row, **ratios, "failed %": section.percent(~batch.solved)}
 
-    def _robust(self, given: BenchmarkData, share: float) -> Row:
+    def _robust(self, seed: int, share: float) -> Row:
         """Rate at which outliers are told from inliers."""
-        rng = np.random.default_rng(given.seed)
+        rng = np.random.default_rng(seed)
         found = 0
         for _ in range(self.robust_problems):
             problem = simulate_problem(rng, points=_ROBUST_POINTS, noise_px=1.0)
-            points_2d = problem.points_2d.copy()
-            places = rng.uniform(points_2d.min(axis=0), points_2d.max(axis=0), points_2d.shape)
+            true = problem.points_2d.copy()
+            places = rng.uniform(true.min(axis=0), true.max(axis=0), true.shape)
             wrong = rng.permutation(_ROBUST_POINTS) < round(share * _ROBUST_POINTS)
-            points_2d[wrong] = places[wrong]
-            # One that landed where it belongs is not wrong.
-            wrong &= np.linalg.norm(points_2d - problem.points_2d, axis=1) > 15
-            try:
-                inliers = cadalign.fit(
-                    problem.points_3d, points_2d, _UNKNOWN, focal="estimate", ransac=RansacOptions()
-                ).inliers
-            except CadalignError:
-                continue
-            clean = np.linalg.norm(points_2d - problem.points_2d, axis=1) == 0
-            found += not inliers[wrong].any() and inliers[clean].mean() > 0.9
+            problem.points_2d[wrong] = places[wrong]
+            moved = np.linalg.norm(problem.points_2d - true, axis=1)
+            given = problem.points_3d, problem.points_2d, _UNKNOWN
+            result = section.attempt(cadalign.fit, *given, focal="estimate", ransac=RansacOptions())
+            if result is not None:
+                # One that landed where it belongs is not wrong.
+                is_kept = result.inliers[wrong & (moved > 15)].any()
+                found += not is_kept and result.inliers[moved == 0].mean() > 0.9
         return {"wrong %": 100 * share, "found %": 100 * found / self.robust_problems}
-
-
-# Stated uncertainty -------------------------------------------------------------------------------
-
-
-@dataclass
-class Coverage:
-    """Coverage of stated uncertainties, and how often large errors come without a warning.
-
-    Problems are the simulation's (f = 150 px). An error is large from 15 deg or 25 % of a scale,
-    and silent without warning and alternative.
-    """
-
-    problems: int = 1000
-    """Random problems per row."""
-    noise_px: float = 1.0
-    """Standard deviation of the noise [px], which sigma states."""
-    region_problems: int = 150
-    """Random objects in a unit cube per row of the regions."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure coverage and warnings."""
-        yield RatioTable("Truths within nominal 68, 95 %", list(self._regions(given)))
-        yield RatioTable("Errors within the 95 % ellipsoid", list(self._coverage(given)))
-        title = "Large errors without a warning, and misfits found"
-        yield RatioTable(title, list(self._warnings(given)))
-
-    def _regions(self, given: BenchmarkData) -> Iterator[Row]:
-        """Regions of rotation, translation and lengths, by what is estimated from how much."""
-        for kind in _KINDS:
-            for points in _REGION_SIZES:
-                reached: list[FloatArray] = []
-                for number in range(self.region_problems):
-                    rng = np.random.default_rng([given.seed, points, number])
-                    try:
-                        result, truth = _estimated(rng, kind, points, self.noise_px)
-                    except CadalignError:
-                        continue
-                    reached.append(_regions_reached(result, truth))
-                row: Row = {"estimate": kind, "keypoints": points, "results": len(reached)}
-                if not reached:  # all were refused
-                    yield row
-                    continue
-                within = np.array(reached)
-                for column, name in enumerate(("R", "t", "lengths")):
-                    shares = [
-                        100 * float((within[:, column] <= share).mean()) for share in (0.68, 0.95)
-                    ]
-                    row[name] = f"{shares[0]:.0f}, {shares[1]:.0f}"
-                yield row
-
-    def _coverage(self, given: BenchmarkData) -> Iterator[Row]:
-        for sigma, loss in ((self.noise_px, "linear"), (None, "linear"), (None, "cauchy")):
-            for points in _CALIBRATED_SIZES[1:]:
-                draw = partial(simulate_problem, points=points, noise_px=self.noise_px)
-                held = [
-                    [
-                        _holds(result, problem.alignment, result.fisher_covariance),
-                        _holds(result, problem.alignment, result.covariance),
-                        not result.alternatives,
-                    ]
-                    for problem, result in self._fits(given, draw, sigma=sigma, loss=loss)
-                ]
-                names = ("inverse Fisher %", "stated %", "no alternative %")
-                shares = (100 * np.mean(held, axis=0)).tolist()
-                row = {"sigma": str(sigma), "loss": loss, "keypoints": points}
-                yield row | dict(zip(names, shares, strict=True))
-
-    def _warnings(self, given: BenchmarkData) -> Iterator[Row]:
-        for name, draw, options in _cases(self.noise_px):
-            fits = list(self._fits(given, draw, **options))
-            large = [result for problem, result in fits if _is_large(result, problem.alignment)]
-            silent = sum(not result.warnings and not result.alternatives for result in large)
-            misfits = sum(result.misfit is not None for _, result in fits)
-            yield {
-                "data": name,
-                "fits": len(fits),
-                "large errors": len(large),
-                "silent": silent,
-                "silent %": 100 * silent / max(len(large), 1),
-                "misfits %": 100 * misfits / max(len(fits), 1),
-            }
-
-    def _fits(
-        self, given: BenchmarkData, draw: Draw, **options: Any
-    ) -> Iterator[tuple[Problem, Result]]:
-        """Problems with their fits; those that are refused are left out."""
-        for number in range(self.problems):
-            problem = draw(np.random.default_rng([given.seed, number]))
-            try:
-                result = cadalign.fit(
-                    problem.points_3d, problem.points_2d, problem.camera, **options
-                )
-            except CadalignError:
-                continue
-            yield problem, result
-
-
-_KINDS = ("fit", "sigma=None", "20 % outliers", "focal", "shape_sigma=.05", "two views")
-_REGION_SIZES = (5, 6, 8, 12, 30, 100, 200)
-_REGION_CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
-_SHAPE_SIGMA = 0.05
-
-
-def _estimated(
-    rng: np.random.Generator, kind: str, points: int, noise_px: float
-) -> tuple[Result, Alignment]:
-    """An estimate of a random object from its first view, and the truth."""
-    model = rng.uniform(-0.5, 0.5, (points, 3))
-    scale = np.array([1.0, *np.exp(rng.normal(0, 0.2, 2))])
-    differs = _SHAPE_SIGMA if kind.startswith("shape_sigma") else 0.0
-    object_points = model * scale + rng.normal(0, 1, model.shape) * differs
-    poses = []
-    for _ in range(2):
-        turn = Rotation.random(random_state=rng).as_matrix()
-        place = rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0))
-        poses.append(Alignment(turn, place, np.ones(3)))
-    seen = [
-        _REGION_CAMERA.project(pose.apply(object_points)) + rng.normal(0, noise_px, (points, 2))
-        for pose in poses
-    ]
-    truth = Alignment(poses[0].rotation, poses[0].translation, scale)
-    if kind == "two views":
-        views = [View(_REGION_CAMERA, each, sigma=noise_px) for each in seen]
-        return cadalign.align(Model(points_3d=model), views), truth
-    if differs:
-        similar = Model(points_3d=model, shape_sigma=differs)
-        return cadalign.align(similar, View(_REGION_CAMERA, seen[0], sigma=noise_px)), truth
-    camera, options = _REGION_CAMERA, dict[str, Any](sigma=noise_px)
-    if kind == "sigma=None":
-        options = {"sigma": None}
-    elif kind == "20 % outliers":
-        wrong = rng.choice(points, points // 5, replace=False)
-        seen[0][wrong] = rng.uniform(0, (640, 480), (len(wrong), 2))
-        options["ransac"] = RansacOptions()
-    elif kind == "focal":
-        camera, options["focal"] = Camera.without_focal(640, 480), "estimate"
-    return cadalign.fit(model, seen[0], camera, **options), truth
-
-
-def _regions_reached(result: Result, truth: Alignment) -> FloatArray:
-    """Nominal probabilities (3,) of the regions of R, t and lengths that reach the truth."""
-    covariance = result.covariance
-    assert covariance is not None
-    errors, found = _errors_of(result.alignment, truth), []
-    for first in (0, 3, 6):
-        rows = [row for row in range(first, first + 3) if covariance[row, row] > 0]
-        square = _square(errors, covariance, rows)
-        found.append(probability_within(square, len(rows), result.degrees_of_freedom))
-    return np.array(found)
-
-
-def _cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:
-    """Names, problems and options of `fit`; first data with outliers, then inliers alone."""
-
-    def draw(points: int, change: Callable[..., None] | None = None) -> Draw:
-        def problem_of(rng: np.random.Generator) -> Problem:
-            problem = simulate_problem(rng, points=points, noise_px=noise_px)
-            if change is not None:
-                change(rng, problem.points_2d)
-            return problem
-
-        return problem_of
-
-    def misplace(rng: np.random.Generator, points_2d: np.ndarray) -> None:
-        points_2d[rng.integers(len(points_2d))] = rng.uniform(0, (640, 480))
-
-    def swap(rng: np.random.Generator, points_2d: np.ndarray) -> None:
-        pair = rng.choice(len(points_2d), 2, replace=False)
-        points_2d[pair] = points_2d[pair[::-1]]
-
-    given = {"sigma": noise_px}
-    return [
-        ("1 wrong of 8", draw(8, misplace), given),
-        ("2 swapped of 12", draw(12, swap), given),
-        ("20 shuffled", draw(20, np.random.Generator.shuffle), given),
-        ("10, stretch none", draw(10), given | {"stretch": "none"}),
-        ("1 wrong of 8, cauchy", draw(8, misplace), given | {"loss": "cauchy"}),
-        *((f"{points} right", draw(points), given) for points in _CALIBRATED_SIZES),
-        ("8 right, cauchy", draw(8), given | {"loss": "cauchy"}),
-        ("8 right, prior", draw(8), given | {"stretch_sigma": 0.5}),
-        ("8 right, covariances", draw(8), {"sigma": np.tile(noise_px**2 * np.eye(2), (8, 1, 1))}),
-        ("8 right, focal unknown", draw(8), given | {"focal": "estimate"}),
-        ("20 right, RANSAC", draw(20), given | {"ransac": RansacOptions(max_iterations=300)}),
-    ]
-
-
-def _is_large(result: Result, gt: Alignment) -> bool:
-    est = result.alignment
-    angle = np.degrees(Rotation.from_matrix(gt.rotation @ est.rotation.T).magnitude())
-    return bool(
-        angle > _LARGE_ROTATION_DEG or np.abs(est.scale / gt.scale - 1).max() > _LARGE_SCALE
-    )
-
-
-def _holds(result: Result, gt: Alignment, covariance: np.ndarray | None) -> bool:
-    """True if the truth lies within the 95 % ellipsoid."""
-    assert covariance is not None
-    free = np.flatnonzero(covariance.diagonal()).tolist()
-    square = _square(_errors_of(result.alignment, gt), covariance, free)
-    return bool(square < chdtri(len(free), 1 - _COVERED))
-
-
-def _errors_of(est: Alignment, gt: Alignment) -> FloatArray:
-    """Errors (9,) of an alignment, in the order of a result's covariance."""
-    vector = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
-    return np.concatenate([vector, gt.translation - est.translation, np.log(gt.scale / est.scale)])
-
-
-def _square(errors: FloatArray, covariance: FloatArray, rows: list[int]) -> float:
-    """Squared Mahalanobis distance of some of the errors."""
-    kept = errors[rows]
-    return float(kept @ np.linalg.solve(covariance[np.ix_(rows, rows)], kept))

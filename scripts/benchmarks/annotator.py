@@ -6,8 +6,10 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -115,7 +117,6 @@ class Annotator:
     """Annotators to kill."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure the parts."""
         measures: dict[str, Callable[[BenchmarkData, Browser, Path], Iterator[Row]]] = {
             "times": self._times,
             "list": self._list,
@@ -145,11 +146,9 @@ class Annotator:
                 perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
             last = session.photos[0].document.pairs[-1]
             perform(session, 0, {"do": "delete", "pair": last.number})
-            with served(session) as access:
-                page = _page(browser, access.url, WATCH_PAINT)
+            with _page(browser, session, WATCH_PAINT) as page:
                 page.evaluate("window.watchPaint()")
                 milliseconds = _timed_clicks(page, session, last.uv, self.clicks)
-                page.context.close()
             median, late = np.percentile(milliseconds, [50, 95]).tolist()
             yield {"with": kind, "clicks": self.clicks, "median ms": median, "p95 ms": late}
 
@@ -169,8 +168,7 @@ class Annotator:
                 scale = 2000 / case.instance.camera.width
                 place(session, keypoint, [u * scale, v * scale], image=number)
         listed, pictured, switched = [], [], []
-        with served(session) as access:
-            page = _page(browser, access.url)
+        with _page(browser, session) as page:
             wait = Keyboard(page).wait
             for _ in range(5):
                 listed.append(page.evaluate(_LIST))
@@ -188,7 +186,6 @@ class Annotator:
                     " && annotator.photo.wanted === annotator.photo.picture"
                 )
                 switched.append(1000 * (time.perf_counter() - start))
-            page.context.close()
         yield {
             "photos": self.photos,
             "opened s": opened,
@@ -200,11 +197,10 @@ class Annotator:
 
     def _kills(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
         """Annotators killed at random moments."""
-        rounds = []
-        for each in kill_at_random(_case(given, folder), rounds=self.kills, seed=given.seed):
-            rounds.append(each)
+        rounds = list(kill_at_random(_case(given, folder), rounds=self.kills, seed=given.seed))
+        for each in rounds:
             if each.lost:
-                print("lost", each.action, each.differences, flush=True)
+                print("lost", each.action, each.differences)
         yield {
             "kills": len(rounds),
             "during an action": sum(each.was_busy for each in rounds),
@@ -215,11 +211,10 @@ class Annotator:
 
 def _case(given: BenchmarkData, folder: Path) -> Case:
     """A photo of a chair: ShapeNet's if it is here, else the sample's."""
-    root = given.keypointnet
-    if root is None:
-        root = write_sample_dataset(folder / "sample", per_category=1)
-        return make_case(root, _new(folder / "case"))
-    return make_case(root, _new(folder / "case"), model_id="88382b877be91b2a572f8e1c1caad99e")
+    case = _new(folder / "case")
+    if given.keypointnet is None:
+        return make_case(write_sample_dataset(folder / "sample", per_category=1), case)
+    return make_case(given.keypointnet, case, model_id="88382b877be91b2a572f8e1c1caad99e")
 
 
 def _new(folder: Path) -> Path:
@@ -227,11 +222,21 @@ def _new(folder: Path) -> Path:
     return folder
 
 
+@contextmanager
 def _page(
-    browser: Browser, url: str, *scripts: str, screen: str = "laptop", scheme: str = "light"
-) -> Page:
+    browser: Browser,
+    session: Session,
+    *scripts: str,
+    screen: str = "laptop",
+    scheme: str = "light",
+) -> Iterator[Page]:
+    """The page of a session that is served."""
     width, height = SCREENS[screen]
-    return open_page(browser, url, width=width, height=height, scheme=scheme, scripts=scripts)
+    size: dict[str, Any] = {"width": width, "height": height, "scheme": scheme}
+    with served(session) as access:
+        page = open_page(browser, access.url, scripts=scripts, **size)
+        yield page
+        page.context.close()
 
 
 def _clips(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
@@ -296,8 +301,8 @@ def _panels(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Ro
             shift, panels, serious = 0.0, 0, set[str]()
             for with_axe in (False, True):
                 own = original.copied_to(folder / f"{screen} {scheme} {with_axe}")
-                with served(prepare(own, root)) as access:
-                    page = _page(browser, access.url, WATCH_SHIFTS, screen=screen, scheme=scheme)
+                session, how = prepare(own, root), {"screen": screen, "scheme": scheme}
+                with _page(browser, session, WATCH_SHIFTS, **how) as page:
                     keyboard = Keyboard(page)
                     if with_axe:
                         page.evaluate(axe)
@@ -306,7 +311,6 @@ def _panels(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Ro
                     if not with_axe:
                         shift = sum(each["value"] for each in shifts(page, also_after_input=False))
                     panels = len(keyboard.visited)
-                    page.context.close()
             yield {
                 "screen": f"{screen} {scheme}",
                 "cumulative layout shift": shift,
@@ -337,12 +341,10 @@ def _pictures(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[
             shots = []
             for name, session in sessions.items():
                 path = folder / f"{screen} {scheme} {name}.png"
-                with served(session) as access:
-                    page = _page(browser, access.url, screen=screen, scheme=scheme)
+                with _page(browser, session, screen=screen, scheme=scheme) as page:
                     page.evaluate("annotator.photo.setOverlay({ mode: 'edges' })")
                     page.wait_for_timeout(300)
                     page.screenshot(path=path)
-                    page.context.close()
                 shots.append(np.asarray(Image.fromarray(read_photo(path)).resize(size)))
             columns = 5 if width < 600 else 2
             sheet = sheets / f"{screen}_{scheme}.png"

@@ -11,13 +11,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.section import LIMIT_DRAWS, BenchmarkData, RatioTable, Row, clocked
-from cadalign import Camera, Model, View, align
+from benchmarks.section import (
+    LIMIT_DRAWS,
+    BenchmarkData,
+    RatioTable,
+    Row,
+    attempt,
+    clocked,
+    summary,
+)
+from cadalign import Alignment, Camera, Model, View, align
+from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
-from cadalign.errors import CadalignError, RenderError
 from cadalign.estimation.contours.view_contour import contour_bound
 from cadalign.evaluation.instances.scene import DAMAGES, damaged_mask
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, rotation_error
@@ -48,7 +55,6 @@ class Masks:
     """Masks of neighbouring objects."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure all kinds of masks, and those of neighbours."""
         cases = _cases_of(given, self.views)
         rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
         yield RatioTable(f"masks, {len(cases)} views: medians", rows)
@@ -57,42 +63,32 @@ class Masks:
 
     def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
         """Medians over all views for one kind of mask."""
-        alone, joint, bounds, times, sigmas, left_out, bottles = [], [], [], [], [], 0, []
-        for number, each in enumerate(cases):
-            rng = np.random.default_rng([seed, 1, number])
-            case, mask = _damaged(each, kind, rng)
+        alone, joint, bounds, bottles, further = [], [], [], [], []
+        for case, mask, rng in _damaged(cases, kind, seed):
+            without = attempt(align, case.model, case.view(None))
             view = case.view(mask)
-            try:
-                without = align(case.model, case.view(None))
-                wall, _, result = clocked(partial(align, case.model, view))
-            except CadalignError as error:
-                print(kind, case.annotated.model_id, error)
+            wall, _, result = clocked(partial(attempt, align, case.model, view))
+            if without is None or result is None:
+                print(kind, case.annotated.model_id, "is refused")
                 continue
-            times.append(wall)
             alone.append(case.errors(without.alignment))
             joint.append(case.errors(result.alignment))
-            bottles.append(case.annotated.category.endswith("bottle"))
+            bounds += case.ideal_errors(contour_bound(case.model, view, case.truth), rng)
             (residuals,) = result.mask_residuals
-            assert residuals is not None
-            left_out += not residuals.is_used
-            sigmas.append(residuals.sigma)
-            bounds.append(case.ideal(contour_bound(case.model, view, case.truth), rng))
-        compared = (
-            np.median(alone, axis=0),
-            np.median(joint, axis=0),
-            np.median(np.concatenate(bounds, axis=1), axis=1),
-        )
+            further.append((residuals.sigma, not residuals.is_used, wall))
+            bottles.append(case.annotated.category.endswith("bottle"))
         row: Row = {"mask": kind}
-        for suffix, medians in zip(("keypoints", "mask", "bound"), compared, strict=True):
-            names = (f"{name} {suffix}" for name in _ERRORS)
-            row |= dict(zip(names, medians.tolist(), strict=True))
+        for suffix, errors in {"keypoints": alone, "mask": joint, "bound": bounds}.items():
+            for name, median in zip(_ERRORS, np.median(errors, axis=0).tolist(), strict=True):
+                row[f"{name} {suffix}"] = median
         of_bottles = np.array(joint)[bottles, 2]
+        sigmas, left_out, walls = np.transpose(further)
         return row | {
             "R ratio": row["R mask"] / row["R keypoints"],
             "IoU bottles": float(np.median(of_bottles)) if len(of_bottles) else None,
             "sigma": float(np.nanmedian(sigmas)),
-            "left out": left_out,
-            "seconds": float(np.median(times)),
+            "left out": int(left_out.sum()),
+            "seconds": float(np.median(walls)),
         }
 
     def _neighbours(self, cases: list[_Case], seed: int) -> Row:
@@ -130,35 +126,24 @@ class MaskAlone:
     """Kinds of masks."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure all kinds of masks."""
         cases = _cases_of(given, self.views)
         rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
         yield RatioTable(f"a mask alone, {len(cases)} views", rows)
 
     def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
-        first, among, times = [], [], []
-        for number, each in enumerate(cases):
-            rng = np.random.default_rng([seed, 1, number])
-            case, mask = _damaged(each, kind, rng)
+        found = []
+        for case, mask, _ in _damaged(cases, kind, seed):
             model = Model(mesh=case.scene.mesh, symmetry=case.annotated.symmetry)
-            try:
-                wall, _, result = clocked(partial(align, model, View(case.camera, mask=mask)))
-            except CadalignError as error:
-                print(kind, case.annotated.model_id, error)
-                first.append(False)
-                among.append(False)
+            view = View(case.camera, mask=mask)
+            wall, _, result = clocked(partial(attempt, align, model, view))
+            if result is None:
+                print(kind, case.annotated.model_id, "is refused")
+                found.append({"first": False, "among five": False, "seconds": np.nan})
                 continue
-            times.append(wall)
             poses = [result.alignment, *(each.alignment for each in result.alternatives[:4])]
             right = [case.is_right(pose) for pose in poses]
-            first.append(right[0])
-            among.append(any(right))
-        return {
-            "mask": kind,
-            "first": float(np.mean(first)),
-            "among five": float(np.mean(among)),
-            "seconds": float(np.median(times)),
-        }
+            found.append({"first": right[0], "among five": any(right), "seconds": wall})
+        return {"mask": kind, **summary(found)}
 
 
 @dataclass(frozen=True)
@@ -170,8 +155,24 @@ class _Case:
     camera: Camera
     truth: Alignment
     ids: list[int]
-    points_2d: np.ndarray
+    points_2d: FloatArray
     mask: np.ndarray
+
+    @classmethod
+    def drawn(
+        cls,
+        annotated: AnnotatedModel,
+        scene: Scene,
+        camera: Camera,
+        truth: Alignment,
+        ids: list[int],
+        rng: np.random.Generator,
+    ) -> _Case:
+        """Draw the noise of the keypoints, and cast the exact mask."""
+        pixels = camera.project(truth.apply(annotated.keypoints.xyz[ids]))
+        noisy = pixels + rng.normal(0, _NOISE_PX, pixels.shape)
+        mask = cast_geometry(scene, camera, truth).mask
+        return cls(annotated, scene, camera, truth, ids, noisy, mask)
 
     @property
     def model(self) -> Model:
@@ -196,80 +197,58 @@ class _Case:
         logs = np.log(est.scale / gt.scale)
         if symmetry.axes:
             logs -= logs.mean()
-        return rotation_error(est=est, gt=gt) < _RIGHT_DEG and np.abs(logs).max() < _RIGHT_STRETCH
+        is_turned = rotation_error(est=est, gt=gt) >= _RIGHT_DEG
+        return not is_turned and bool(np.abs(logs).max() < _RIGHT_STRETCH)
 
-    def ideal(self, bound: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """`errors` of an ideal estimator, (3, draws)."""
+    def ideal_errors(self, bound: FloatArray, rng: np.random.Generator) -> list[list[float]]:
+        """`errors` of an ideal estimator, of every draw."""
         drawn = rng.multivariate_normal(np.zeros(9), bound, size=LIMIT_DRAWS, method="eigh")
-        found = []
+        truth, found = self.truth, []
         for turn, shift, logs in zip(drawn[:, :3], drawn[:, 3:6], drawn[:, 6:], strict=True):
-            rotation = rotation_from_vector(turn) @ self.truth.rotation
-            scale = self.truth.scale * np.exp(logs)
-            found.append(self.errors(Alignment(rotation, self.truth.translation + shift, scale)))
-        return np.array(found).T
-
-
-def _has_obj(model: AnnotatedModel) -> bool:
-    return model.mesh_path is not None and model.mesh_path.suffix == ".obj"
+            rotation = rotation_from_vector(turn) @ truth.rotation
+            est = Alignment(rotation, truth.translation + shift, truth.scale * np.exp(logs))
+            found.append(self.errors(est))
+        return found
 
 
 def _cases_of(given: BenchmarkData, views: int) -> list[_Case]:
-    """Views of the models of the sample dataset and, where it is given, of KeypointNet."""
+    """Random views of the models of the sample dataset and, where it is given, of KeypointNet."""
     with tempfile.TemporaryDirectory() as folder:
         sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
         models = [model for model in sample if model.mesh_path is not None]
         if given.keypointnet is not None:
-            models.extend(m for m in KeypointNet(given.keypointnet) if _has_obj(m))
-        return list(_draw_cases(models, views, given.seed))
+            real = (m for m in KeypointNet(given.keypointnet) if m.mesh_path is not None)
+            models += [model for model in real if model.mesh_path.suffix == ".obj"]
+        seeds = ([given.seed, number] for number in range(len(models)))
+        return [
+            c for m, seed in zip(models, seeds, strict=True) for c in _draw_cases(m, views, seed)
+        ]
 
 
-def _damaged(case: _Case, kind: str, rng: np.random.Generator) -> tuple[_Case, np.ndarray]:
-    """The case with its mask of one kind; moved, where the border cuts it."""
-    if kind == "border":
-        cut = _cut_by_border(case, rng)
-        return cut, cut.mask
-    return case, damaged_mask(case.mask, kind, rng)
+def _draw_cases(model: AnnotatedModel, views: int, seed: list[int]) -> Iterator[_Case]:
+    scene, rng = Scene(model.load_mesh()), np.random.default_rng(seed)
+    for _ in range(views):
+        scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
+        how = {"rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
+        seen = scene, model.keypoints.xyz, _CAMERA
+        view = attempt(sample_view, *seen, min_visible=7, **how)
+        view = view or attempt(sample_view, *seen, min_visible=_LEAST_KEYPOINTS, **how)
+        if view is not None:
+            ids = np.flatnonzero(view.visible).tolist()
+            yield _Case.drawn(model, scene, _CAMERA, view.cam_from_model, ids, rng)
 
 
-def _draw_cases(models: list[AnnotatedModel], views: int, seed: int) -> Iterator[_Case]:
-    """Random views of all models."""
-    for number, model in enumerate(models):
-        scene = Scene(model.load_mesh())
-        rng = np.random.default_rng([seed, number])
-        for _ in range(views):
-            scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
-            for least in (7, _LEAST_KEYPOINTS):
-                try:
-                    view = sample_view(
-                        scene,
-                        model.keypoints.xyz,
-                        _CAMERA,
-                        rng=rng,
-                        min_visible=least,
-                        scale=scale,
-                        fill=(0.6, 0.9),
-                        roll=10.0,
-                    )
-                except RenderError:
-                    continue
-                yield _case_of(model, scene, _CAMERA, view.cam_from_model, view.visible, rng)
-                break
-
-
-def _case_of(
-    model: AnnotatedModel,
-    scene: Scene,
-    camera: Camera,
-    truth: Alignment,
-    visible: np.ndarray,
-    rng: np.random.Generator,
-) -> _Case:
-    """A view with noisy keypoints and the exact mask."""
-    ids = np.flatnonzero(visible).tolist()
-    pixels = camera.project(truth.apply(model.keypoints.xyz[ids]))
-    noisy = pixels + rng.normal(0, _NOISE_PX, pixels.shape)
-    mask = cast_geometry(scene, camera, truth).mask
-    return _Case(model, scene, camera, truth, ids, noisy, mask)
+def _damaged(
+    cases: list[_Case], kind: str, seed: int
+) -> Iterator[tuple[_Case, np.ndarray, np.random.Generator]]:
+    """The cases with their masks of one kind; moved, where the border cuts them."""
+    for number, case in enumerate(cases):
+        rng = np.random.default_rng([seed, 1, number])
+        if kind == "border":
+            cut = _cut_by_border(case, rng)
+            yield cut, cut.mask, rng
+        else:
+            yield case, damaged_mask(case.mask, kind, rng), rng
 
 
 def _cut_by_border(case: _Case, rng: np.random.Generator) -> _Case:
@@ -280,18 +259,16 @@ def _cut_by_border(case: _Case, rng: np.random.Generator) -> _Case:
     inside = camera.contains(case.points_2d - [shift, 0.0])
     if inside.sum() < _LEAST_KEYPOINTS:
         inside[:] = True
-    visible = np.zeros(len(case.annotated.keypoints.xyz), dtype=bool)
-    visible[np.array(case.ids)[inside]] = True
-    return _case_of(case.annotated, case.scene, camera, case.truth, visible, rng)
+    ids = np.array(case.ids)[inside].tolist()
+    return _Case.drawn(case.annotated, case.scene, camera, case.truth, ids, rng)
 
 
 def _beside(other: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
     """Another object's mask moved beside the own one; None where too little of it is seen."""
     angle = rng.uniform(0, 2 * np.pi)
     rows, columns = np.nonzero(own)
-    width, height = np.ptp(columns), np.ptp(rows)
-    step = rng.uniform(0.5, 1.0) * np.array([np.cos(angle) * width, np.sin(angle) * height])
-    moved = cv2.warpAffine(
-        other.astype(np.uint8), np.array([[1, 0, step[0]], [0, 1, step[1]]]), own.shape[::-1]
-    )
+    size = np.array([np.ptp(columns), np.ptp(rows)])
+    x, y = rng.uniform(0.5, 1.0) * np.array([np.cos(angle), np.sin(angle)]) * size
+    shift = np.array([[1, 0, x], [0, 1, y]])
+    moved = cv2.warpAffine(other.astype(np.uint8), shift, own.shape[::-1])
     return moved > 0 if moved.sum() > 0.2 * other.sum() else None

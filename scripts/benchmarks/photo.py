@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -12,11 +13,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+from scipy.stats import chi2
 
-from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, clocked
+from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, clocked, summary
 from cadalign import Camera, Mesh, Model, Result, View, align
+from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
-from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import vector_from_rotation
@@ -49,52 +51,34 @@ class Photos:
     """Draws of the clicks on every real photo."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure with the stretch held, and with an unknown one."""
-        if given.keypointnet is None:
-            raise NotGivenError("give --keypointnet, or CADALIGN_DATA")
-        root = given.keypointnet.parent
-        cases = [(case, 1) for case in composite_cases(root, self.composites, given.seed)]
-        cases += [(case, self.draws) for case in bop_cases(root)]
-        cases += [(case, max(self.draws // 5, 1)) for case in occluded_cases(root)]
+        cases = [(case, 1) for case in _composites(given, self.composites)]
+        cases += [(case, self.draws) for case in bop_cases(given)]
+        cases += [(case, max(self.draws // 5, 1)) for case in _occluded_cases(given)]
         for stretched in (False, True):
-            rows: dict[str, list[PhotoOutcome]] = {}
+            rows: dict[str, list[Row]] = defaultdict(list)
             for number, (case, draws) in enumerate(cases):
                 for draw in range(draws):
                     rng = np.random.default_rng([given.seed, 3, number, draw])
                     clicks = case.clicked(rng, stretched=stretched)
-                    rows.setdefault(f"{case.group} {case.kind}", []).append(clicks.outcome())
+                    rows[f"{case.group} {case.kind}"].append(_compared(clicks))
             title = "an unknown stretch" if stretched else "a rigid model"
-            table = [_summary(name, outcomes) for name, outcomes in rows.items()]
+            table = [{"photos": name, **summary(found)} for name, found in rows.items()]
             yield RatioTable(f"photos beside rough clicks, {title}: medians", table)
 
 
-@dataclass(frozen=True)
-class PhotoOutcome:
-    """Errors of clicks alone and with the photo, and what was said about the latter."""
-
-    alone: tuple[float, float, float]
-    joint: tuple[float, float, float]
-    is_warned: bool
-    covered: tuple[bool, bool]
-    seconds: float
-
-
-def _summary(name: str, outcomes: Sequence[PhotoOutcome]) -> Row:
-    alone, joint = (
-        np.array([getattr(each, field) for each in outcomes]) for field in ("alone", "joint")
-    )
-    warned = np.array([each.is_warned for each in outcomes])
-    worse = ~warned & (joint[:, 0] > alone[:, 0] + _WORSE_DEG)
-    row: Row = {"photos": name, "count": len(outcomes)}
-    for number, error in enumerate(("R", "t", "stretch")):
-        row |= {f"{error} clicks": float(np.median(alone[:, number]))}
-        row |= {f"{error} photo": float(np.median(joint[:, number]))}
-    row["better"] = float((joint[:, 0] < alone[:, 0]).mean())
-    row["silently worse"] = float(worse.mean())
-    row["warned"] = float(warned.mean())
-    covered = np.array([each.covered for each in outcomes]).mean(axis=0)
-    row |= {"covered R": float(covered[0]), "covered t": float(covered[1])}
-    return row | {"seconds": float(np.median([each.seconds for each in outcomes]))}
+def _compared(clicks: PhotoClicks) -> Row:
+    """Errors of the clicks alone and with the photo, and what was stated of the latter."""
+    first, _, alone = clocked(clicks.aligned)
+    second, _, joint = clocked(partial(clicks.aligned, image=clicks.case.pixels))
+    before, after = clicks.errors(alone), clicks.errors(joint)
+    row: Row = {}
+    for error, *values in zip(("R", "t", "stretch"), before, after, strict=True):
+        row |= dict(zip((f"{error} clicks", f"{error} photo"), values, strict=True))
+    row["better"] = after[0] < before[0]
+    row["warned"] = any("image" in text for text in joint.warnings)
+    row["silently worse"] = not row["warned"] and after[0] > before[0] + _WORSE_DEG
+    row["covered R"], row["covered t"] = clicks.covered_by(joint)
+    return row | {"seconds": second - first}
 
 
 @dataclass(frozen=True)
@@ -102,7 +86,6 @@ class PhotoCase:
     """An object in a photo: its model, the true alignment, and clicks on visible points."""
 
     group: str
-    name: str
     camera: Camera
     pixels: np.ndarray
     mesh: Mesh
@@ -115,24 +98,21 @@ class PhotoCase:
     ) -> PhotoClicks:
         """Rough clicks on points spread over the visible surface."""
         scale = np.exp(rng.normal(0, _STRETCH_SIGMA, 3) * [0, 1, 1]) if stretched else np.ones(3)
-        truth = Alignment(self.truth.rotation, self.truth.translation, scale)
+        truth = replace(self.truth, scale=scale)
         mesh = Mesh(self.mesh.vertices / scale, self.mesh.faces)
-        scene = Scene(mesh)
-        geometry = cast_geometry(scene, self.camera, truth)
-        places = _spread(geometry.mask, rng, count)
+        geometry = cast_geometry(Scene(mesh), self.camera, truth)
+        places = _spread_places(geometry.mask, rng, count)
         rays = self.camera.normalize(places.astype(float))
         depths = geometry.depth[places[:, 1], places[:, 0]]
         seen = np.column_stack([rays, np.ones(len(rays))]) * depths[:, None]
-        points = (seen - truth.translation) @ truth.rotation / scale
         sigma = _CLICK_SHARE * self.camera.width
-        pixels = places + rng.normal(0, sigma, places.shape)
         model = Model(
-            points_3d=points,
+            points_3d=(seen - truth.translation) @ truth.rotation / scale,
             mesh=mesh,
             stretch="yz" if stretched else "none",
             stretch_sigma=_STRETCH_SIGMA if stretched else None,
         )
-        return PhotoClicks(self, model, truth, pixels, sigma)
+        return PhotoClicks(self, model, truth, places + rng.normal(0, sigma, places.shape), sigma)
 
 
 @dataclass(frozen=True)
@@ -142,34 +122,17 @@ class PhotoClicks:
     case: PhotoCase
     model: Model
     truth: Alignment
-    pixels: np.ndarray
+    pixels: FloatArray
     sigma: float
 
-    def aligned(self, *, with_photo: bool) -> Result:
-        """The estimate by the clicks alone, or with the photo."""
-        return self.aligned_with(image=self.case.pixels if with_photo else None)
-
-    def aligned_with(self, **evidence: Any) -> Result:
+    def aligned(self, **evidence: Any) -> Result:
         """The estimate by the clicks, and further evidence of the view."""
         return align(self.model, View(self.case.camera, self.pixels, sigma=self.sigma, **evidence))
 
     def first(self, count: int) -> PhotoClicks:
         """The first clicks."""
-        assert self.model.points_3d is not None
         model = replace(self.model, points_3d=np.asarray(self.model.points_3d)[:count])
         return replace(self, model=model, pixels=self.pixels[:count])
-
-    def outcome(self) -> PhotoOutcome:
-        """Both estimates compared with the truth."""
-        first, _, alone = clocked(partial(self.aligned, with_photo=False))
-        second, _, joint = clocked(partial(self.aligned, with_photo=True))
-        return PhotoOutcome(
-            self.errors(alone),
-            self.errors(joint),
-            any("image" in text for text in joint.warnings),
-            self.covered_by(joint),
-            second - first,
-        )
 
     def true_for(self, est: Alignment) -> Alignment:
         """The true alignment, of those that are equal under the symmetry the nearest."""
@@ -185,23 +148,19 @@ class PhotoClicks:
         stretch = float(np.abs(est.scale / gt.scale - 1).max())
         return rotation_error(est=est, gt=gt), shift, stretch
 
-    def covered_by(self, result: Result) -> tuple[bool, bool]:
+    def covered_by(self, result: Result) -> list[bool]:
         """True where the truth lies in the regions of rotation and of translation."""
-        from scipy.stats import chi2
-
         est, gt = result.alignment, self.true_for(result.alignment)
         turn = vector_from_rotation(gt.rotation @ est.rotation.T)
         shift = gt.translation - est.translation
-        limit = chi2.ppf(_INNER, 3)
         blocks = result.covariance[:3, :3], result.covariance[3:6, 3:6]
-        first, second = (
-            bool(step @ np.linalg.solve(block, step) < limit)
+        return [
+            bool(step @ np.linalg.solve(block, step) < chi2.ppf(_INNER, 3))
             for step, block in zip((turn, shift), blocks, strict=True)
-        )
-        return first, second
+        ]
 
 
-def _spread(mask: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
+def _spread_places(mask: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
     """Pixels (count, 2) inside a mask, each far from those before it."""
     inside = cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8))
     rows, columns = np.nonzero(inside if inside.sum() > 10 * count else mask)
@@ -219,46 +178,37 @@ def _spread(mask: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarra
 # Real photos --------------------------------------------------------------------------------------
 
 
-@cache
-def _mesh(path: Path) -> Mesh:
-    return load_mesh(path)
+_mesh = cache(load_mesh)
 
 
-def bop_cases(root: Path) -> Iterator[PhotoCase]:
+def bop_cases(given: BenchmarkData) -> Iterator[PhotoCase]:
     """The photos of HANDAL and LINEMOD."""
-    folder = root / "real" / "bop_samples"
+    folder = given.real("bop_samples")
     for name, entry in json.loads((folder / "poses.json").read_text()).items():
         pose = np.array(entry["cam_from_model"])
-        given = {key: entry["camera"][key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
-        yield PhotoCase(
-            name.split("/")[0],
-            name,
-            Camera(**given),
-            read_photo(folder / name),
-            _mesh(folder / entry["model"]),
-            _rigid(pose[:3, :3], pose[:3, 3]),
-        )
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        camera = Camera(**{key: entry["camera"][key] for key in names})
+        truth = _rigid(pose[:3, :3], pose[:3, 3])
+        mesh, photo = _mesh(folder / entry["model"]), read_photo(folder / name)
+        yield PhotoCase(name.split("/")[0], camera, photo, mesh, truth)
 
 
-def occluded_cases(root: Path) -> Iterator[PhotoCase]:
+def _occluded_cases(given: BenchmarkData) -> Iterator[PhotoCase]:
     """The objects of Linemod-Occluded, some of which hide others."""
-    folder = root / "real" / "lmo_multiview"
-    given = json.loads((folder / "camera.json").read_text())
-    given.pop("depth_scale")
-    camera = Camera(**given)
+    folder = given.real("lmo_multiview")
+    entries = json.loads((folder / "camera.json").read_text())
+    camera = Camera(**{key: value for key, value in entries.items() if key != "depth_scale"})
     for number, entries in json.loads((folder / "scene_gt.json").read_text()).items():
         pixels = read_photo(folder / "rgb" / f"{int(number):06d}.png")
         for entry in entries:
             path = folder / "models" / f"obj_{entry['obj_id']:06d}.ply"
-            if not path.exists():
-                continue
-            rotation = np.array(entry["cam_R_m2c"]).reshape(3, 3)
-            truth = _rigid(rotation, np.array(entry["cam_t_m2c"]))
-            name = f"{number}/{entry['obj_id']}"
-            yield PhotoCase("lmo", name, camera, pixels, _mesh(path), truth)
+            if path.exists():
+                rotation = np.array(entry["cam_R_m2c"]).reshape(3, 3)
+                truth = _rigid(rotation, np.array(entry["cam_t_m2c"]))
+                yield PhotoCase("lmo", camera, pixels, _mesh(path), truth)
 
 
-def _rigid(rotation: np.ndarray, translation: np.ndarray) -> Alignment:
+def _rigid(rotation: FloatArray, translation: FloatArray) -> Alignment:
     left, _, right = np.linalg.svd(rotation)
     return Alignment(left @ right, translation, np.ones(3))
 
@@ -266,8 +216,9 @@ def _rigid(rotation: np.ndarray, translation: np.ndarray) -> Alignment:
 # Composites ---------------------------------------------------------------------------------------
 
 
-def composite_cases(root: Path, count: int, seed: int) -> Iterator[PhotoCase]:
+def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
     """Models of ShapeNet and of the sample, rendered before real photos; some partly hidden."""
+    root = given.needed().parent
     with tempfile.TemporaryDirectory() as folder:
         sample = list(KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=2)))
         real = [m for m in KeypointNet(root / "keypointnet") if m.mesh_path is not None]
@@ -276,43 +227,28 @@ def composite_cases(root: Path, count: int, seed: int) -> Iterator[PhotoCase]:
     photos = sorted((root / "sfm").rglob("*.jpg")) + sorted((root / "real").rglob("rgb/*.png"))
     behind = [cv2.resize(read_photo(p), (640, 480), interpolation=cv2.INTER_AREA) for p in photos]
     for number in range(count):
-        rng = np.random.default_rng([seed, number])
+        rng = np.random.default_rng([given.seed, number])
         model, scene = scenes[number % len(scenes)]
-        try:
-            view = sample_view(
-                scene,
-                model.keypoints.xyz,
-                _CAMERA,
-                rng=rng,
-                min_visible=0,
-                fill=(0.4, 0.8),
-                roll=15.0,
-            )
-        except RenderError:
+        how: dict[str, Any] = {"min_visible": 0, "fill": (0.4, 0.8), "roll": 15.0}
+        view = attempt(sample_view, scene, model.keypoints.xyz, _CAMERA, rng=rng, **how)
+        if view is None:
             continue
-        truth = view.cam_from_model
         pixels = behind[rng.integers(len(behind))]
         if rng.random() < 0.5:
             pixels = pixels[:, ::-1]
         light = rng.normal(size=3) * [1, 0.6, 0.3] + [0, -0.6, -0.7]
         studio = Studio(key=tuple(light / np.linalg.norm(light)), key_power=rng.uniform(0.3, 0.8))
-        frame = RaycastRenderer(studio=studio).render(scene, _CAMERA, truth, samples=8)
+        renderer, truth = RaycastRenderer(studio=studio), view.cam_from_model
+        frame = renderer.render(scene, _CAMERA, truth, samples=8)
         drawn = frame.composite(np.ascontiguousarray(pixels))
         is_hidden = number % 4 == 3
         if is_hidden:
             drawn = _hidden(drawn, frame.mask, behind[rng.integers(len(behind))], rng)
         drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
         noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
-        yield PhotoCase(
-            "composite",
-            f"{number} {model.category}",
-            _CAMERA,
-            np.clip(np.rint(noisy), 0, 255).astype(np.uint8),
-            scene.mesh,
-            truth,
-            "hidden" if is_hidden else "clear",
-            model.symmetry,
-        )
+        photo = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        kind = "hidden" if is_hidden else "clear"
+        yield PhotoCase("composite", _CAMERA, photo, scene.mesh, truth, kind, model.symmetry)
 
 
 def _hidden(

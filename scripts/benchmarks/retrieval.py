@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, islice
@@ -13,23 +14,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from benchmarks.section import (
-    BenchmarkData,
-    RatioTable,
-    Row,
-    clocked,
-    figure,
-    reference_seconds,
-    used_by_command,
-)
+from benchmarks import section
+from benchmarks.section import BenchmarkData, RatioTable, Row
 from cadalign import Box, Library, Observation, ShapeModel
 from cadalign.datasets import KeypointNet
-from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import RetrievalQuery, RetrievalTask, observe_model
-from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
-from cadalign.evaluation.methods.unseen import UnseenObject
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel, Match
 from cadalign.retrieval.absence import SAME_SHAPE, shape_distance
@@ -38,6 +28,7 @@ from cadalign.retrieval.models import ModelKey
 _KEYPOINTS = 8
 _CALLS = 3
 _LEAST_SHARED = 4
+_FLAT = 1e-9
 
 
 @dataclass
@@ -58,8 +49,7 @@ class Retrieval:
     """Queries of a run of `cadalign retrieve` by two processes, for each of these sizes."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure all libraries."""
-        real = list(Library.from_dataset(KeypointNet(given.needed("keypointnet"))))
+        real = list(Library.from_dataset(KeypointNet(given.needed())))
         mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
         for size in (len(real), *self.sizes):
             with tempfile.TemporaryDirectory() as folder:
@@ -71,10 +61,10 @@ class Retrieval:
 
     def _measure(self, path: Path, models: Sequence[LibraryModel]) -> RatioTable:
         """Opening, and queries of three levels of noise."""
-        reference = reference_seconds()
-        wall, busy, library = clocked(partial(Library.open, path))
+        reference = section.reference_seconds()
+        wall, busy, library = section.clocked(partial(Library.open, path))
         size = f"{len(library):,}"
-        rows = [figure(f"opening {size} models", 1e3 * wall, "ms", busy / reference)]
+        rows = [section.figure(f"opening {size} models", 1e3 * wall, "ms", busy / reference)]
         shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
         warm_up = next(_observed(shown, 1.0, seed=1), None)
         if warm_up is None:
@@ -94,13 +84,12 @@ class Retrieval:
                 points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.ids)
                 query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
                 queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
-        out = path.with_name("run")
-        command = ["retrieve", str(file), f"--library={path}", f"--out={out}", "--no-picture"]
-        reference = reference_seconds()
-        used = used_by_command([*command, "--workers=2"])
-        reference = min(reference, reference_seconds())
+        command = ["retrieve", str(file), f"--library={path}", f"--out={path.with_name('run')}"]
+        reference = section.reference_seconds()
+        used = section.used_by_command([*command, "--no-picture", "--workers=2"])
+        reference = min(reference, section.reference_seconds())
         name = f"run of {self.run_queries:,} queries, two processes"
-        row = figure(name, self.run_queries / used.wall, "1/s", used.processor / reference)
+        row = section.figure(name, self.run_queries / used.wall, "1/s", used.processor / reference)
         return row | {"MB": used.megabytes}
 
     def _queries(
@@ -108,19 +97,22 @@ class Retrieval:
     ) -> list[Row]:
         """Median and longest time of queries for some of the models."""
         wall, busy, found = [], [], 0
-        reference = reference_seconds()
+        reference = section.reference_seconds()
         for model, seen in islice(_observed(models, noise_px, seed=0), self.queries):
             call = partial(_retrieve, library, seen, noise_px)
-            walls, busies, matches = zip(*(clocked(call) for _ in range(_CALLS)), strict=True)
+            walls, busies, matches = zip(
+                *(section.clocked(call) for _ in range(_CALLS)), strict=True
+            )
             wall.append(1e3 * min(walls))
             busy.append(1e3 * min(busies))
-            reference = min(reference, reference_seconds())
+            reference = min(reference, section.reference_seconds())
             first = matches[0][0]
             found += (first.category, first.model_id) == model.key
         name = f"query among {len(library):,}, {noise_px:g} px"
         own = {"found first": f"{found} of {len(wall)}"}
         return [
-            figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference)) | own
+            section.figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference))
+            | own
             for which, take in (("median", np.median), ("longest", max))
         ]
 
@@ -143,11 +135,10 @@ def _observed(
 ) -> Iterator[tuple[LibraryModel, RetrievalQuery]]:
     """The models that show enough keypoints, each with an observation of it."""
     for model in models:
-        try:
-            seen = observe_model(model, RetrievalTask(*model.key, noise_px, _KEYPOINTS), seed=seed)
-        except DegenerateError:
-            continue
-        yield model, seen
+        task = RetrievalTask(*model.key, noise_px, _KEYPOINTS)
+        seen = section.attempt(observe_model, model, task, seed=seed)
+        if seen is not None:
+            yield model, seen
 
 
 def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
@@ -174,10 +165,9 @@ class UnseenRetrieval:
     """Standard deviation of the keypoints, in pixels."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure all categories and numbers of keypoints."""
-        dataset = KeypointNet(given.needed("keypointnet"))
+        dataset = KeypointNet(given.needed())
         for category in self.categories:
-            shape = ShapeModel.from_dataset(dataset, category, split="train", meshes=False)
+            shape = section.learned_shape(dataset, category)
             for count in self.keypoints:
                 rows = list(self._rankings(dataset, category, count, shape))
                 yield RatioTable(f"{category}, {count or 'all'} keypoints", rows)
@@ -190,12 +180,12 @@ class UnseenRetrieval:
         library = Library.from_models(
             [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
         )
-        ious: dict[str, list[float]] = {name: [] for name in _ranking_options(shape)}
-        times: dict[str, list[float]] = {name: [] for name in ious}
-        for model_id, seen in self._sightings(dataset, category, count):
+        found: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        how = {"keypoints": count or None, "noise_px": self.noise_px}
+        for _, seen in section.unseen_objects(dataset, category, self.objects, **how):
             known = np.isin(seen.ids, shape.ids)
             gt = Box.from_model(seen.task.hull.bounds, seen.gt)
-            if known.sum() < _LEAST_SHARED or gt.volume < 1e-9:
+            if known.sum() < _LEAST_SHARED or gt.volume < _FLAT:
                 continue
             call = partial(
                 library.retrieve,
@@ -205,39 +195,21 @@ class UnseenRetrieval:
                 top=1,
                 category=category,
                 sigma=self.noise_px,
-                exclude=_alike(library, (category, model_id)),
+                exclude=_alike(library, (category, seen.task.model_id)),
                 workers=1,
             )
             for name, options in _ranking_options(shape).items():
-                wall, _, iou = clocked(partial(_iou, partial(call, **options), gt))
-                times[name].append(1e3 * wall)
-                ious[name].append(iou)
-        for name, values in ious.items():
+                wall, _, matches = section.clocked(partial(section.attempt, call, **options))
+                found[name].append((_first_iou(matches, gt), 1e3 * wall))
+        for name, values in found.items():
+            ious, milliseconds = np.transpose(values)
             yield {
                 "ranking": name,
                 "objects": len(values),
-                "median IoU": float(np.median(values)),
-                "mean IoU": float(np.mean(values)),
-                "ms": float(np.median(times[name])),
+                "median IoU": float(np.median(ious)),
+                "mean IoU": float(np.mean(ious)),
+                "ms": float(np.median(milliseconds)),
             }
-
-    def _sightings(
-        self, dataset: KeypointNet, category: str, count: int
-    ) -> Iterator[tuple[str, UnseenObject]]:
-        """Ids and views of a category's objects."""
-        options = UnseenOptions(
-            root=dataset.root,
-            categories=(category,),
-            keypoints=count or None,
-            noise_px=self.noise_px,
-        )
-        tasks = UnseenTasks(dataset, options)
-        for place in range(0, len(tasks), -(-len(tasks) // self.objects)):
-            task = tasks[place]
-            try:
-                yield task.model_id, observe_object(task, options)
-            except CadalignError as error:
-                print(f"left out: {task.model_id}: {error}")
 
 
 def _ranking_options(shape: ShapeModel) -> dict[str, dict[str, Any]]:
@@ -253,22 +225,17 @@ def _ranking_options(shape: ShapeModel) -> dict[str, dict[str, Any]]:
 def _alike(library: Library, key: ModelKey) -> list[ModelKey]:
     """A model and those that are the same after a stretch."""
     own = library[key]
-    return [
-        key,
-        *(
-            model.key
-            for model in library
-            if np.array_equal(np.sort(model.ids), np.sort(own.ids))
-            and shape_distance(model, own) <= SAME_SHAPE
-        ),
-    ]
+    ids = np.sort(own.ids)
+    same = (
+        model.key
+        for model in library
+        if np.array_equal(np.sort(model.ids), ids) and shape_distance(model, own) <= SAME_SHAPE
+    )
+    return [key, *same]
 
 
-def _iou(call: Callable[[], list[Match]], gt: Box) -> float:
+def _first_iou(matches: list[Match] | None, gt: Box) -> float:
     """IoU of the first match of a query; 0 where there is none, or a flat one."""
-    try:
-        first = call()[0]
-        flat = first.box.volume < 1e-9
-        return 0.0 if flat else box_iou_up_to_scale(est=first.box, gt=gt)
-    except CadalignError:
+    if not matches or matches[0].box.volume < _FLAT:
         return 0.0
+    return section.attempt(box_iou_up_to_scale, est=matches[0].box, gt=gt) or 0.0

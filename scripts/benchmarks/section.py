@@ -1,24 +1,30 @@
-"""Sections of `bench.py`: the data they are given, their tables, clocks and limits."""
+"""What sections of `bench.py` share: data that they are given, tables, cases, clocks."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, getrusage
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from common import COMMAND
 
+import cadalign
+from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
-from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
+from cadalign.evaluation.experiments.unseen import UnseenOptions
+from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
+from cadalign.evaluation.methods.unseen import UnseenObject
 from cadalign.evaluation.simulation.problems import Problem
 
 LIMIT_DRAWS = 20
+"""Draws of an ideal estimator's errors for each problem."""
+WITHIN_95 = 1.96
 _DATA = Path(os.environ["CADALIGN_DATA"]) if os.environ.get("CADALIGN_DATA") else None
 
 Row = dict[str, Any]
@@ -44,12 +50,16 @@ class BenchmarkData:
     out: Path = Path("bench")
     """Folder for what is measured: <section>.json, and pictures of the annotator."""
 
-    def needed(self, name: str) -> Path:
+    def needed(self, name: str = "keypointnet") -> Path:
         """A folder that a section cannot do without; NotGivenError where there is none."""
         found: Path | None = getattr(self, name)
         if found is None:
             raise NotGivenError(f"give --{name}, or CADALIGN_DATA")
         return found
+
+    def real(self, name: str) -> Path:
+        """A folder of real photos beside KeypointNet's."""
+        return self.needed().parent / "real" / name
 
 
 @dataclass(frozen=True)
@@ -73,6 +83,64 @@ def figure(name: str, value: float, unit: str, ratio: float, to: str = "") -> Ro
     The ratio depends little on the machine, and less is better: `bench.py` compares it.
     """
     return {"name": name, "value": value, "unit": unit, "ratio": ratio, "to": to}
+
+
+def spread(values: Any) -> tuple[float, float]:
+    """Median and 90th percentile."""
+    return float(np.median(values)), float(np.percentile(values, 90))
+
+
+def percent(flags: Any) -> float:
+    """Share of what is true [%]."""
+    return 100 * float(np.mean(flags))
+
+
+def summary(cases: Sequence[Row]) -> Row:
+    """Number of cases, medians of their numbers, shares of their flags."""
+    found: Row = {"count": len(cases)}
+    for name in cases[0]:
+        values = [case[name] for case in cases]
+        take = np.mean if isinstance(values[0], bool | np.bool_) else np.nanmedian
+        found[name] = float(take(values))
+    return found
+
+
+# Cases --------------------------------------------------------------------------------------------
+
+
+def attempt(call: Callable[..., T], *given: Any, **options: Any) -> T | None:
+    """What a call returns; None where it raises a CadalignError."""
+    try:
+        return call(*given, **options)
+    except CadalignError:
+        return None
+
+
+def fitted(problem: Problem, **options: Any) -> cadalign.Result | None:
+    """The fit of a simulated problem; None where it is refused."""
+    given = problem.points_3d, problem.points_2d, problem.camera
+    return attempt(cadalign.fit, *given, **options)
+
+
+def learned_shape(dataset: KeypointNet, category: str) -> cadalign.ShapeModel:
+    """The shape of a category, learned from the split train."""
+    return cadalign.ShapeModel.from_dataset(dataset, category, split="train", meshes=False)
+
+
+def unseen_objects(
+    dataset: KeypointNet, category: str, count: int, **options: Any
+) -> Iterator[tuple[int, UnseenObject]]:
+    """So many objects of the split val, spread over all, each with its place among them.
+
+    ``options`` are those of `cadalign evaluate unseen`.
+    """
+    chosen = UnseenOptions(root=dataset.root, categories=(category,), **options)
+    tasks = UnseenTasks(dataset, chosen)
+    for place in range(0, len(tasks), -(-len(tasks) // count)):
+        try:
+            yield place, observe_object(tasks[place], chosen)
+        except CadalignError as error:
+            print(f"left out: {tasks[place].model_id}: {error}")
 
 
 # Clocks -------------------------------------------------------------------------------------------
@@ -114,8 +182,7 @@ def seconds_of_process(
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-@dataclass(frozen=True)
-class Used:
+class Used(NamedTuple):
     """Wall clock and processor time of a command [s], and its largest process [MB]."""
 
     wall: float
@@ -125,42 +192,14 @@ class Used:
 
 def used_by_command(call: list[str]) -> Used:
     """Run a command of cadalign, and measure it with its workers; some of its rows may fail."""
-
-    def wait() -> tuple[int, Any]:
-        process = subprocess.Popen([*COMMAND, *call], stdout=subprocess.DEVNULL)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        return process.returncode, usage
-
-    wall, _, (code, usage) = clocked(wait)
-    if code not in (0, 3):  # 3: some rows failed
-        raise subprocess.CalledProcessError(code, call)
+    begun = time.perf_counter()
+    process = subprocess.Popen([*COMMAND, *call], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    wall = time.perf_counter() - begun
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode not in (0, 3):  # 3: some rows failed
+        raise subprocess.CalledProcessError(process.returncode, call)
     return Used(wall, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
-
-
-def rate_and_memory(
-    rate: str, memory: str, count: int, run: Callable[[int], Used]
-) -> Iterator[Row]:
-    """Rate of what a longer run does more than a shorter one, ``count`` items, and its memory.
-
-    ``run`` does the shorter run for 0, the longer one for 1. The rate's ratio is that of processor
-    time to `reference_seconds`, the memory's the longer run's over the shorter one's.
-    """
-    reference = reference_seconds()
-    short, long = run(0), run(1)
-    reference = min(reference, reference_seconds())
-    busy = (long.processor - short.processor) / count
-    yield figure(rate, count / (long.wall - short.wall), "1/s", 1e3 * busy / reference)
-    yield figure(memory, long.megabytes, "MB", long.megabytes / short.megabytes)
-
-
-def dask_over_processes(name: str, run: Callable[[str], Used]) -> Row:
-    """Time of a run by two Dask workers over two processes; ``run`` is given the option of each."""
-    from distributed import LocalCluster
-
-    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        on_dask = run(f"--dask={cluster.scheduler_address}")
-    return figure(name, on_dask.wall, "s", on_dask.wall / run("--workers=2").wall)
 
 
 def medians_in_turns(
@@ -177,22 +216,3 @@ def medians_in_turns(
         for name, measure in measures.items():
             times[name] += [measure() for _ in range(per_turn)]
     return {name: float(np.median(values)) for name, values in times.items()}
-
-
-# Limits -------------------------------------------------------------------------------------------
-
-
-def ideal_errors(
-    problems: Iterable[Problem], rng: np.random.Generator, *, sigma: float, focal: str
-) -> dict[str, np.ndarray]:
-    """Errors of an ideal estimator on all problems, by name; see `cramer_rao_bound`."""
-    draws = []
-    for problem in problems:
-        try:
-            bound = cramer_rao_bound(
-                problem.points_3d, problem.camera, problem.alignment, sigma=sigma, focal=focal
-            )
-        except CadalignError:
-            continue
-        draws.append(sample_limit(bound, rng=rng, draws=LIMIT_DRAWS))
-    return {error: np.concatenate([draw[error] for draw in draws]) for error in draws[0]}

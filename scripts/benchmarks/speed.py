@@ -15,16 +15,9 @@ import numpy as np
 from common import COMMAND
 
 import cadalign
-from benchmarks.section import (
-    BenchmarkData,
-    RatioTable,
-    Row,
-    figure,
-    medians_in_turns,
-    seconds,
-    seconds_of_process,
-)
-from cadalign import Alignment, Camera
+from benchmarks import section
+from benchmarks.section import BenchmarkData, RatioTable, Row
+from cadalign import Camera
 from cadalign.datasets import sample_models
 from cadalign.errors import RenderError
 from cadalign.evaluation.simulation.problems import simulate_problem
@@ -32,7 +25,6 @@ from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import (
     RaycastRenderer,
-    Renderer,
     Scene,
     Studio,
     cast_geometry,
@@ -88,19 +80,22 @@ class Cold:
     """
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure the first calls."""
         with tempfile.TemporaryDirectory() as folder:
-            _, reference = self._called(_SMALL_FUNCTION, folder, "small")
+
+            def called(code: str, place: str) -> tuple[float, float]:
+                environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder, place))}
+                return section.seconds_of_process(
+                    [sys.executable, "-c", code], environment=environment
+                )
+
+            _, reference = called(_SMALL_FUNCTION, "small")
             rows = []
             for name, code in _FIRST_CALLS.items():
-                place = "all" if "doctor" in name else "fit"
-                wall, processor = self._called(code, folder, place)
-                rows.append(figure(name, wall, "s", processor / reference, "a first small call"))
+                wall, processor = called(code, "all" if "doctor" in name else "fit")
+                rows.append(
+                    section.figure(name, wall, "s", processor / reference, "a first small call")
+                )
         yield RatioTable("First calls", rows)
-
-    def _called(self, code: str, folder: str, place: str) -> tuple[float, float]:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder, place))}
-        return seconds_of_process([sys.executable, "-c", code], environment=environment)
 
 
 @dataclass
@@ -113,7 +108,6 @@ class Calls:
     """Calls of each fit."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure commands and fits."""
         with tempfile.TemporaryDirectory() as folder:
             yield RatioTable("Commands, processor time", list(self._commands(Path(folder))))
         yield RatioTable("Fits", list(self._fits()))
@@ -128,15 +122,19 @@ class Calls:
             "cadalign demo": ["demo", "--out", str(folder / "demo"), "--workers", "0"],
         }.items():
             command = [*COMMAND, *given]
-            seconds_of_process(command)  # compiles what is not yet on disk
-            medians = medians_in_turns(
+            section.seconds_of_process(command)  # compiles what is not yet on disk
+            medians = section.medians_in_turns(
                 {
-                    "own": lambda command=command: seconds_of_process(command)[1],
-                    "other": lambda: seconds_of_process([sys.executable, "-c", libraries])[1],
+                    "own": lambda command=command: section.seconds_of_process(command)[1],
+                    "other": lambda: section.seconds_of_process([sys.executable, "-c", libraries])[
+                        1
+                    ],
                 },
                 1 if name == "cadalign demo" else self.runs,
             )
-            yield figure(name, medians["own"], "s", medians["own"] / medians["other"], libraries)
+            yield section.figure(
+                name, medians["own"], "s", medians["own"] / medians["other"], libraries
+            )
 
     def _fits(self) -> Iterator[Row]:
         ten, seven = (
@@ -159,10 +157,13 @@ class Calls:
                 "OpenCV's ITERATIVE, 10 points",
             ),
         ):
-            both = {"own": partial(seconds, ours), "other": partial(seconds, theirs)}
-            medians = medians_in_turns(both, self.calls)
+            both = {
+                "own": partial(section.seconds, ours),
+                "other": partial(section.seconds, theirs),
+            }
+            medians = section.medians_in_turns(both, self.calls)
             ratio = medians["own"] / medians["other"]
-            yield figure(name, 1e6 * medians["own"], "us", ratio, to)
+            yield section.figure(name, 1e6 * medians["own"], "us", ratio, to)
 
 
 def _observation(folder: Path) -> Path:
@@ -192,48 +193,39 @@ class Rendering:
     """Timed frames per figure; the median counts."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure every renderer that is there."""
         camera = Camera.from_fov(640, 480, fov_x=50.0)
         scene = Scene(ball(5))
         rotation = look_at(azimuth=35, elevation=20, distance=3).rotation
         pose = frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
+        vertices = scene.mesh.vertices
+        keypoints = vertices[np.random.default_rng(0).choice(len(vertices), 20)]
+        shown = scene, camera, pose
+        plain = RaycastRenderer(studio=Studio(occlusion=0))
+        tasks: dict[str, Callable[[], object]] = {
+            "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
+            "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
+            "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
+            "raycast: geometry": lambda: cast_geometry(*shown),
+            "raycast: colour": partial(RaycastRenderer().render, *shown),
+            "raycast: colour, no ambient occlusion": partial(plain.render, *shown),
+        }
+        for name in ("open3d", "pyrender"):
+            try:
+                tasks[f"{name}: colour"] = partial(make_renderer(name).render, *shown)
+            except RenderError as error:
+                print(error, file=sys.stderr)
+                continue
+            if name == "open3d":
+                tasks["open3d: geometry"] = lambda: cast_geometry(
+                    *shown, caster=scene.open3d_caster
+                )
         rows = []
-        for name, task in _render_tasks(scene, camera, pose).items():
+        for name, task in tasks.items():
             task()  # prepares what is prepared once
-            times = [1e3 * seconds(task) for _ in range(self.repetitions)]
+            times = [1e3 * section.seconds(task) for _ in range(self.repetitions)]
             median, limit = float(np.median(times)), _LIMITS.get(name)
             rows.append({"task": name, "median ms": median, "smallest": min(times), "limit": limit})
-        share = 100 * float(cast_geometry(scene, camera, pose).mask.mean())
+        share = 100 * float(cast_geometry(*shown).mask.mean())
         yield RatioTable(
             f"20,480 triangles on {share:.0f} % of the image, {os.cpu_count()} cores", rows
         )
-
-
-def _render_tasks(scene: Scene, camera: Camera, pose: Alignment) -> dict[str, Callable[[], object]]:
-    """Everything that is timed, by name."""
-
-    def drawing(renderer: Renderer) -> Callable[[], object]:
-        return lambda: renderer.render(scene, camera, pose)
-
-    rng = np.random.default_rng(0)
-    keypoints = scene.mesh.vertices[rng.choice(len(scene.mesh.vertices), 20)]
-    plain = RaycastRenderer(studio=Studio(occlusion=0))
-    found: dict[str, Callable[[], object]] = {
-        "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
-        "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
-        "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
-        "raycast: geometry": lambda: cast_geometry(scene, camera, pose),
-        "raycast: colour": drawing(RaycastRenderer()),
-        "raycast: colour, no ambient occlusion": drawing(plain),
-    }
-    for name in ("open3d", "pyrender"):
-        try:
-            found[f"{name}: colour"] = drawing(make_renderer(name))
-        except RenderError as error:
-            print(error, file=sys.stderr)
-            continue
-        if name == "open3d":
-            found["open3d: geometry"] = lambda: cast_geometry(
-                scene, camera, pose, caster=scene.open3d_caster
-            )
-    return found

@@ -5,40 +5,20 @@ from __future__ import annotations
 import tracemalloc
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-import msgspec
 import numpy as np
 
-from benchmarks.section import (
-    LIMIT_DRAWS,
-    BenchmarkData,
-    RatioTable,
-    Row,
-    clocked,
-    figure,
-    reference_seconds,
-)
-from cadalign import (
-    Camera,
-    Motion,
-    RansacOptions,
-    Result,
-    ShapeModel,
-    Tracker,
-    View,
-    align,
-)
+from benchmarks import section
+from benchmarks.cars import car_tracks
+from benchmarks.section import BenchmarkData, RatioTable, Row
+from cadalign import Motion, RansacOptions, Result, ShapeModel, Tracker, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.datasets.photos.kitti_keypoints import HIDDEN, car_box, car_shape, yaw_of_car
 from cadalign.evaluation.metrics.trajectories import rotation_jitter_deg
 from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
 from cadalign.geometry.rotations import vector_from_rotation
 
 _RADIUS_95 = 7.815  # squared, of three degrees of freedom
-_CAR_SIGMA = 3.0  # [px] of the network's keypoints
-_CAR_RATE = 10.0  # frames in a second
 _KEYPOINTS = 10
 
 
@@ -60,20 +40,16 @@ class Tracks:
     """Frames of the timed videos."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure all tables."""
-        dataset = KeypointNet(given.needed("keypointnet"))
-        learned = {name: _learned(dataset, name) for name in self.categories}
-        yield RatioTable(
-            "objects drawn from the learned shape, unknown motion, then smooth",
-            [
-                row
-                for name, shape in learned.items()
-                if shape is not None
-                for row in self._accuracy(name, shape, given.seed)
-            ],
-        )
-        yield RatioTable("10 % of frames flipped, 20 % of keypoints anywhere", self._mistakes())
-        yield RatioTable("KITTI's tracks, every frame", list(_cars(given)))
+        dataset, rows = KeypointNet(given.needed()), []
+        for name in self.categories:
+            if name in dataset.categories:
+                shape = ShapeModel.from_dataset(dataset, name, meshes=False)
+                # Objects are drawn from it: nothing calibrates it for those that it did not learn.
+                plain = {"inflation": 1.0, "degrees_of_freedom": None, "few_keypoints": None}
+                rows += self._accuracy(name, replace(shape, **plain), given.seed)
+        yield RatioTable("objects drawn from the learned shape, unknown motion, then smooth", rows)
+        yield RatioTable("10 % of frames flipped, 20 % of keypoints anywhere", [self._mistakes()])
+        yield RatioTable("KITTI's tracks, every frame", list(car_tracks(given.real("kitti_cars"))))
         yield RatioTable("times of smooth tracks, 10 keypoints", list(self._times()))
         yield RatioTable("online", [_online()])
 
@@ -82,7 +58,7 @@ class Tracks:
         found: dict[str, list[FloatArray]] = {way: [] for way in ways}
         for number in range(self.objects):
             rng = np.random.default_rng([seed, number])
-            video = simulate_track(rng, drawn(shape, rng), shape.ids, frames=self.frames)
+            video = _video(rng, shape, frames=self.frames)
             for way, motion in ways.items():
                 result = align(shape, video.views, motion=motion)
                 found[way].append(_compared(result, video, rng))
@@ -91,46 +67,40 @@ class Tracks:
             yield {
                 "category": name,
                 "way": way,
-                "R, deg": (float(np.median(errors)), float(np.percentile(errors, 90))),
+                "R, deg": section.spread(errors),
                 "over bound": float(np.median(errors) / np.median(limits)),
                 "rms over bound": float(np.sqrt((errors**2).mean() / (limits**2).mean())),
-                "95 % holds R, %": 100 * float(covered.mean()),
-                "points, %": 100 * float(points.mean()),
+                "95 % holds R, %": section.percent(covered),
+                "points, %": section.percent(points),
             }
 
-    def _mistakes(self) -> list[Row]:
-        shape, rows = synthetic_category(), []
+    def _mistakes(self) -> Row:
+        shape, rows = _synthetic_category(), []
         for number in range(self.objects):
             rng = np.random.default_rng(number)
-            video = simulate_track(rng, drawn(shape, rng), shape.ids, frames=60)
+            video = _video(rng, shape, frames=60)
             wrong = with_mistakes(video, rng, flipped=0.1, outliers=0.2)
             clean = align(shape, video.views, motion="smooth")
             robust = align(shape, wrong.views, motion="smooth", ransac=RansacOptions())
             rows.append([np.median(_errors(each, video)) for each in (clean, robust)])
-        clean_deg, robust_deg = np.array(rows).T
-        return [
-            {
-                "clean, deg": float(np.median(clean_deg)),
-                "with mistakes, deg": float(np.median(robust_deg)),
-                "over clean": float(np.median(robust_deg) / np.median(clean_deg)),
-            }
-        ]
+        clean_deg, robust_deg = np.median(rows, axis=0).tolist()
+        names = ("clean, deg", "with mistakes, deg", "over clean")
+        return dict(zip(names, (clean_deg, robust_deg, robust_deg / clean_deg), strict=True))
 
     def _times(self) -> Iterator[Row]:
-        shape = synthetic_category()
-        rng = np.random.default_rng(0)
-        points = drawn(shape, rng)
+        shape, rng = _synthetic_category(), np.random.default_rng(0)
+        points = _drawn(shape, rng)
         align(shape, simulate_track(rng, points, shape.ids, frames=5).views, motion="smooth")
         for frames in self.lengths:
             views = simulate_track(rng, points, shape.ids, frames=frames, visible=1.0).views
-            _, joint, _ = clocked(lambda v=views: align(shape, v))
-            reference = reference_seconds()
-            wall, busy, result = clocked(lambda v=views: align(shape, v, motion="smooth"))
+            _, joint, _ = section.clocked(lambda v=views: align(shape, v))
+            reference = section.reference_seconds()
+            wall, busy, result = section.clocked(lambda v=views: align(shape, v, motion="smooth"))
             tracemalloc.start()
             align(shape, views, motion="smooth")
             _, peak = tracemalloc.get_traced_memory()
             tracemalloc.stop()
-            yield figure(f"track of {frames} frames", wall, "s", busy / reference) | {
+            yield section.figure(f"track of {frames} frames", wall, "s", busy / reference) | {
                 "processor, s": busy,
                 "without motion, processor s": joint,
                 "jitter, deg": rotation_jitter_deg(result.trajectory.poses),
@@ -138,15 +108,15 @@ class Tracks:
             }
 
 
-def synthetic_category(seed: int = 0) -> ShapeModel:
+def _synthetic_category() -> ShapeModel:
     """A category of ten keypoints and five modes."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     mean = rng.uniform(-0.4, 0.4, (_KEYPOINTS, 3))
     modes = 0.05 * rng.normal(size=(5, _KEYPOINTS, 3))
     return ShapeModel.from_basis(mean, modes, np.ones(5), ids=range(_KEYPOINTS))
 
 
-def drawn(shape: ShapeModel, rng: np.random.Generator) -> FloatArray:
+def _drawn(shape: ShapeModel, rng: np.random.Generator) -> FloatArray:
     """Keypoints (m, 3) of an object of a learned shape."""
     weights = [component.weight for component in shape.components]
     component = shape.components[int(rng.choice(len(weights), p=np.array(weights) / sum(weights)))]
@@ -156,17 +126,8 @@ def drawn(shape: ShapeModel, rng: np.random.Generator) -> FloatArray:
     return np.asarray(points + rest[:, None] * rng.normal(size=points.shape))[: len(shape.ids)]
 
 
-def _learned(dataset: KeypointNet, category: str) -> ShapeModel | None:
-    """The category's shape without what calibrates it for objects that it was not learned from."""
-    if category not in dataset.categories:
-        return None
-    shape = ShapeModel.from_dataset(dataset, category, meshes=False)
-    return replace(shape, inflation=1.0, degrees_of_freedom=None, few_keypoints=None)
-
-
-def _errors(result: Result, video: SimulatedTrack) -> FloatArray:
-    """Rotation vectors' lengths (P,) of all frames' errors [deg]."""
-    return np.degrees(np.linalg.norm(_turns(result, video), axis=1))
+def _video(rng: np.random.Generator, shape: ShapeModel, *, frames: int) -> SimulatedTrack:
+    return simulate_track(rng, _drawn(shape, rng), shape.ids, frames=frames)
 
 
 def _turns(result: Result, video: SimulatedTrack) -> FloatArray:
@@ -174,118 +135,43 @@ def _turns(result: Result, video: SimulatedTrack) -> FloatArray:
     return np.array([vector_from_rotation(v.alignment.rotation @ p.rotation.T) for v, p in pairs])
 
 
+def _errors(result: Result, video: SimulatedTrack) -> FloatArray:
+    """Rotation errors (P,) of all frames [deg]."""
+    return np.degrees(np.linalg.norm(_turns(result, video), axis=1))
+
+
 def _compared(result: Result, video: SimulatedTrack, rng: np.random.Generator) -> FloatArray:
     """Error and bound [deg], and whether regions hold rotation and points (P, 4)."""
     rows = []
-    known = result.points_covariance
-    assert known is not None
     gaps = result.points_3d * result.alignment.scale - video.points_3d
-    held = np.einsum("ni,nij,nj->n", gaps, np.linalg.pinv(known), gaps) < _RADIUS_95
+    inverse = np.linalg.pinv(result.points_covariance)
+    held = np.einsum("ni,nij,nj->n", gaps, inverse, gaps) < _RADIUS_95
     for turn, view in zip(_turns(result, video), result.views, strict=True):
-        assert view.covariance is not None
         own = view.covariance[:3, :3]
-        draws = rng.multivariate_normal(np.zeros(3), own, LIMIT_DRAWS)
+        draws = rng.multivariate_normal(np.zeros(3), own, section.LIMIT_DRAWS)
         limit = np.sqrt((draws**2).sum(axis=1).mean())
         inside = turn @ np.linalg.solve(own, turn) < _RADIUS_95
-        rows.append([np.linalg.norm(turn), limit, inside, held.mean()])
-    return np.array(rows) * [*np.degrees([1.0, 1.0]), 1.0, 1.0]
-
-
-# Real cars ----------------------------------------------------------------------------------------
-
-
-def _cars(given: BenchmarkData) -> Iterator[Row]:
-    """Yaw, depth and jitter of KITTI's tracks by four ways."""
-    folder = given.needed("keypointnet").parent / "real" / "kitti_cars"
-    shape = car_shape(folder)
-    assert shape is not None
-    table = msgspec.json.decode(Path(folder, "car_tracks.json").read_bytes())
-    for way in ("frame by frame", "shape shared", "smooth", "smooth, robust", "online"):
-        errors: list[FloatArray] = []
-        jitters = []
-        for track in table["tracks"]:
-            views = [_car_view(frame, table["names"], track["K"]) for frame in track["frames"]]
-            boxes = [
-                car_box(
-                    np.array(track["dims_hwl"]),
-                    np.array(frame["location_bottom_centre"]),
-                    frame["rotation_y"],
-                )
-                for frame in track["frames"]
-            ]
-            poses = _car_poses(shape, views, way)
-            yaws = np.unwrap([yaw_of_car(pose[0]) for pose in poses])
-            truth = np.array([yaw_of_car(box.rotation) for box in boxes])[-len(poses) :]
-            depths = [pose[1][2] for pose in poses]
-            real = np.array([box.center[2] for box in boxes])[-len(poses) :]
-            turn = np.degrees((yaws - truth + np.pi) % (2 * np.pi) - np.pi)
-            errors.append(np.column_stack([np.abs(turn), 100 * np.abs(depths / real - 1)]))
-            jitters.append(np.degrees(np.diff(yaws, 2)))
-        yaw, depth = np.concatenate(errors).T
-        yield {
-            "way": way,
-            "frames": len(yaw),
-            "yaw, deg": (float(np.median(yaw)), float(np.percentile(yaw, 90))),
-            "depth, %": float(np.median(depth)),
-            "jitter, deg": float(np.concatenate(jitters).std()),
-        }
-
-
-def _car_view(frame: dict[str, object], names: list[str], matrix: list[list[float]]) -> View:
-    (fx, _, cx), (_, fy, cy), _ = matrix
-    shown = np.flatnonzero(np.array(frame["score"]) >= HIDDEN)
-    camera = Camera(1242, 375, fx, fy, cx + 0.5, cy + 0.5)
-    pixels, ids = np.array(frame["uv"])[shown], [names[row] for row in shown]
-    time = float(str(frame["frame"])) / _CAR_RATE
-    return View(camera, pixels, ids=ids, sigma=_CAR_SIGMA, time=time)
-
-
-def _car_poses(
-    shape: ShapeModel, views: list[View], way: str
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Rotation and the box's centre in the camera of every frame."""
-    if way == "frame by frame":
-        results = [align(shape, view) for view in views]
-        return [(r.alignment.rotation, r.alignment.apply(_middle(r))[0]) for r in results]
-    if way == "online":
-        tracker = Tracker(shape)
-        found = [tracker.update(view).pose for view in views]
-        middle = _middle(tracker.smooth())
-        known = [each.alignment for each in found if each is not None]
-        return [(each.rotation, each.apply(middle)[0]) for each in known]
-    ransac = RansacOptions() if "robust" in way else None
-    motion = None if way == "shape shared" else Motion()
-    result = align(shape, views, motion=motion, ransac=ransac)
-    middle = _middle(result)
-    return [(v.alignment.rotation, v.alignment.apply(middle)[0]) for v in result.views]
-
-
-def _middle(result: Result) -> FloatArray:
-    return result.bounds.mean(axis=0)[None]
-
-
-# Online -------------------------------------------------------------------------------------------
+        rows.append([*np.degrees([np.linalg.norm(turn), limit]), inside, held.mean()])
+    return np.array(rows)
 
 
 def _online() -> Row:
     """Time of updates, and errors of the newest frame over those of the whole smooth track."""
-    shape, rng = synthetic_category(), np.random.default_rng(0)
-    video = simulate_track(rng, drawn(shape, rng), shape.ids, frames=300)
-    seconds, busy, errors = [], [], []
+    shape, rng = _synthetic_category(), np.random.default_rng(0)
+    video = _video(rng, shape, frames=300)
+    walls, busy, errors = [], [], []
     tracker = Tracker(shape)
     for view, pose in zip(video.views, video.poses, strict=True):
-        wall, own, update = clocked(lambda v=view: tracker.update(v))
-        busy.append(own)
-        seconds.append(wall)
+        wall, own, update = section.clocked(lambda v=view: tracker.update(v))
+        busy.append(1e3 * own)
+        walls.append(1e3 * wall)
         if update.pose is not None:
             turn = update.pose.alignment.rotation @ pose.rotation.T
             errors.append(np.degrees(np.linalg.norm(vector_from_rotation(turn))))
-    whole = np.median(_errors(tracker.smooth(), video))
-    warm = 1e3 * np.array(seconds[20:])
     return {
-        "processor, median, ms": 1e3 * float(np.median(busy[20:])),
-        "median, ms": float(np.median(warm)),
-        "99 %, ms": float(np.percentile(warm, 99)),
+        "processor, median, ms": float(np.median(busy[20:])),
+        "median, ms": float(np.median(walls[20:])),
+        "99 %, ms": float(np.percentile(walls[20:], 99)),
         "R, deg": float(np.median(errors)),
-        "R of the whole track, deg": float(whole),
+        "R of the whole track, deg": float(np.median(_errors(tracker.smooth(), video))),
     }

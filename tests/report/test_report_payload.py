@@ -32,8 +32,8 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table
 from cadalign.geometry.metrics import alignment_box_iou, rotation_error
-from cadalign.report import media, write_report
-from cadalign.report.instances import compact
+from cadalign.report import write_report
+from cadalign.report.instances import INLINE_LIMIT, compact
 from cadalign.retrieval import LibraryModel
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "limit")
@@ -382,7 +382,7 @@ def test_a_page_that_would_be_too_large_has_its_pictures_beside_it(
     (written.assets / "mine.txt").touch()
     write_report([drawn], tmp_path / "report.html")
     assert {path.name for path in written.assets.iterdir()} == before | {"mine.txt"}
-    assert media.INLINE_LIMIT == 60_000_000
+    assert INLINE_LIMIT == 60_000_000
 
 
 # --- odd runs --------------------------------------------------------------------------------

@@ -17,8 +17,7 @@ from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.report import FORMATS, headline_text
-from cadalign.report.headline import Headline, HeadlineRow
-from cadalign.report.tables import table_text
+from cadalign.report.headline import Headline, HeadlineRow, table_text
 
 HOSTILE = "a|b_c\\ & 50 % #1 {x} ~^$ <img src=x onerror=alert(1)> *`[]\nnext"
 COLUMNS = (Metric("n", "instances", digits=0, better=None), Metric("r", "R error", "deg", digits=3))

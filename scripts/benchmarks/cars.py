@@ -1,0 +1,331 @@
+"""Real cars of KITTI: a detector's noise, runs over keypoints of networks, tracks and scenes."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import cadalign
+from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, percent, spread
+from cadalign.arrays import FloatArray
+from cadalign.datasets import ImageKeypoints
+from cadalign.datasets import open as open_data
+from cadalign.datasets.photos.kitti import KittiLabel, read_labels
+from cadalign.datasets.photos.kitti_keypoints import (
+    HIDDEN,
+    SIZE,
+    car_bounds,
+    car_box,
+    car_keypoints,
+    car_shape,
+    yaw_of_car,
+)
+from cadalign.geometry.metrics import rotation_error
+from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.seeding import instance_rng
+
+_LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6
+_WIDTHS = 0.06  # relative standard deviation of cars' widths
+_SIGMA = 3.0  # [px] of the network's keypoints
+_RATE = 10.0  # frames in a second
+
+
+def _yaw_error(rotation: FloatArray, box: cadalign.Box) -> float:
+    """Error of yaw, without a sign [deg]."""
+    turn = yaw_of_car(rotation) - yaw_of_car(box.rotation)
+    return float(np.degrees(abs((turn + np.pi) % (2 * np.pi) - np.pi)))
+
+
+def _middle(result: cadalign.Result) -> FloatArray:
+    return result.bounds.mean(axis=0)[None]
+
+
+def _real_cars(folder: Path) -> Iterator[tuple[Any, cadalign.Camera, cadalign.Box, Any]]:
+    """Keypoints of a network, camera, true box and mean car of every car."""
+    for photo in open_data(folder):
+        for car in photo.objects:
+            box = None if car.truth is None else car.truth.box
+            if car.keypoints is not None and box is not None and photo.camera is not None:
+                yield car.keypoints, photo.camera, box, car.model
+
+
+# Keypoints of a network ---------------------------------------------------------------------------
+
+
+@dataclass
+class NoiseOfDetector:
+    """Coverage of the yaw of KITTI's cars with an hourglass network's keypoints, by their noise.
+
+    "left out" is calibrated without the block of 6 successive cars that it is used for; "without a
+    common shift" takes the errors' correlation as a shift of all keypoints, which the translation
+    follows.
+    """
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        folder = given.real("kitti_cars")
+        model = car_shape(folder)
+        seen, true, placed = [], [], []
+        for found, camera, box, _ in _real_cars(folder):
+            if found.scores is not None:
+                scores = np.where(found.scores >= _LEAST_SCORE, found.scores, 0.0)
+                seen.append(ImageKeypoints(found.points_2d, scores, names=found.names))
+                true.append(car_keypoints(model, box, camera))
+                placed.append((camera, box))
+        blocks = np.arange(len(seen)) // _BLOCK
+        without = []
+        for block in range(blocks[-1] + 1):
+            kept = np.flatnonzero(blocks != block)
+            pairs = [seen[k] for k in kept], [true[k] for k in kept]
+            without.append(cadalign.calibrate_detector(*pairs))
+        noise = cadalign.calibrate_detector(seen, true)
+        ways = {f"{sigma:g} px": [{"sigma": sigma}] * len(seen) for sigma in (1.0, 3.0, 5.0)}
+        ways["calibrated"] = [{"noise": noise}] * len(seen)
+        ways["left out"] = [{"noise": without[block]} for block in blocks]
+        ways["left out, without a common shift"] = [
+            {"noise": _without_shift(without[block])} for block in blocks
+        ]
+        rows = []
+        for name, fields in ways.items():
+            found = [
+                attempt(_yaw_of_view, model, *each)
+                for each in zip(seen, placed, fields, strict=True)
+                if (each[0].scores > 0).sum() >= _LEAST_KEYPOINTS
+            ]
+            errors, held = np.array([each for each in found if each is not None]).T
+            row = {"noise": name, "cars": len(errors), "yaw, deg": spread(errors)}
+            rows.append(row | {"95 % regions hold, %": percent(held)})
+        yield RatioTable("Yaw of cars", rows)
+
+
+def _without_shift(noise: cadalign.DetectorNoise) -> cadalign.DetectorNoise:
+    """The noise of each keypoint beside what all of an object have in common.
+
+    An unknown shift of all keypoints is one of the pose's translation, of which nothing else is
+    known.
+    """
+    share = np.sqrt(1 - noise.correlation)
+    return replace(noise, sigmas=share * np.asarray(noise.sigmas), correlation=0.0)
+
+
+def _yaw_of_view(
+    model: cadalign.ShapeModel,
+    seen: ImageKeypoints,
+    placed: tuple[cadalign.Camera, cadalign.Box],
+    fields: dict[str, Any],
+) -> tuple[float, bool]:
+    """Error of yaw [deg], and if the 95 % region holds the truth."""
+    camera, box = placed
+    kept = np.flatnonzero(seen.scores > 0)
+    ids, scores = [seen.names[row] for row in kept], seen.scores[kept]
+    result = cadalign.align(
+        model, cadalign.View(camera, seen.points_2d[kept], ids=ids, scores=scores, **fields)
+    )
+    forward = -result.alignment.rotation[:, 1]
+    moved = np.cross(np.eye(3), forward)  # by a turn about each axis
+    across = float((forward[[0, 2]] ** 2).sum())
+    slope = (moved[:, 0] * forward[2] - moved[:, 2] * forward[0]) / across
+    std = float(np.sqrt(slope @ result.covariance[:3, :3] @ slope))
+    error = _yaw_error(result.alignment.rotation, box)
+    return error, bool(np.radians(error) < result.radius(0.95) * std)
+
+
+@dataclass
+class RealDetections:
+    """Runs over real keypoints of networks: share aligned, errors of yaw and depth.
+
+    Cars are all frames of KITTI with at least 6 keypoints that score 0.1, aligned with a mean car
+    or with a learned shape; web photos are those of PASCAL3D+, whose poses and focal lengths are
+    not known. Errors are medians, of yaw with the 90th percentile in parentheses.
+    """
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        folder, web = given.real("kitti_cars"), given.real("pascal3d") / "observations"
+        cars = list(_observed_cars(folder))
+        with tempfile.TemporaryDirectory() as temporary:
+            learned: dict[str, Any] = {"shape": Path(temporary, "car.shape"), "sigma": _SIGMA}
+            car_shape(folder).save(learned["shape"])
+            robust, cauchy, similar = {"robust": True}, {"loss": "cauchy"}, {"similar": True}
+            ways: dict[str, dict[str, Any]] = {
+                "plain": {},
+                "--robust": robust,
+                "--loss cauchy": cauchy,
+                "--similar": similar,
+                "--similar --robust": similar | robust,
+                "--similar --loss cauchy": similar | cauchy,
+                "--shape --sigma 3": learned,
+                "--shape --sigma 3 --robust": learned | robust,
+                "--shape --sigma 3 --loss cauchy": learned | cauchy,
+            }
+            rows = [_detections_row(name, cars, web, options) for name, options in ways.items()]
+        yield RatioTable(f"{len(cars)} cars, and web photos", rows)
+
+
+_Car = tuple[cadalign.Observation, cadalign.Box, FloatArray]
+
+
+def _observed_cars(folder: Path) -> Iterator[_Car]:
+    """Observations of a mean car's keypoints, the car's true box, and the mean car's middle."""
+    for seen, camera, box, model in _real_cars(folder):
+        kept = np.flatnonzero(seen.visible)
+        if len(kept) >= _LEAST_KEYPOINTS and model is not None:
+            known = model.source.keypoints
+            names = tuple(seen.names[k] for k in kept)
+            points = known.xyz[[known.names.index(name) for name in names]]
+            observed = cadalign.Observation(points, seen.points_2d[kept], camera, names=names)
+            yield observed, box, car_bounds(known.xyz).mean(axis=0)[None]
+
+
+def _detections_row(name: str, cars: list[_Car], web: Path, options: dict[str, Any]) -> Row:
+    found = cadalign.fit_many((seen for seen, _, _ in cars), **options)
+    errors = []
+    for each, (_, box, middle) in zip(found, cars, strict=True):
+        if isinstance(each, cadalign.Result):
+            center = _middle(each) if each.method == "align" else middle
+            depth = each.alignment.apply(center)[0, 2]
+            yaw = _yaw_error(each.alignment.rotation, box)
+            errors.append((yaw, abs(depth / box.center[2] - 1)))
+    yaws, depths = np.array(errors).T
+    row = {"cadalign fit": name, "cars aligned": f"{len(yaws)} of {len(cars)}"}
+    row |= {"yaw, deg": spread(yaws), "depth, %": 100 * float(np.median(depths))}
+    if "shape" not in options:  # that of cars is not theirs
+        photos = cadalign.fit_many(web, **options)
+        row["web photos aligned"] = f"{int(photos.solved.sum())} of {len(photos)}"
+    return row
+
+
+# Tracks -------------------------------------------------------------------------------------------
+
+
+def car_tracks(folder: Path) -> Iterator[Row]:
+    """Yaw, depth and jitter of KITTI's tracks by five ways."""
+    shape = car_shape(folder)
+    table = json.loads((folder / "car_tracks.json").read_text())
+    for way in ("frame by frame", "shape shared", "smooth", "smooth, robust", "online"):
+        errors, jitters = [], []
+        for track in table["tracks"]:
+            frames, size = track["frames"], np.array(track["dims_hwl"])
+            poses = _poses(shape, [_view(each, table["names"], track["K"]) for each in frames], way)
+            boxes = [
+                car_box(size, np.array(each["location_bottom_centre"]), each["rotation_y"])
+                for each in frames[-len(poses) :]
+            ]
+            for (rotation, center), box in zip(poses, boxes, strict=True):
+                depth = 100 * abs(center[2] / box.center[2] - 1)
+                errors.append((_yaw_error(rotation, box), depth))
+            yaws = np.unwrap([yaw_of_car(rotation) for rotation, _ in poses])
+            jitters.append(np.degrees(np.diff(yaws, 2)))
+        yaw, depth = np.transpose(errors)
+        yield {
+            "way": way,
+            "frames": len(yaw),
+            "yaw, deg": spread(yaw),
+            "depth, %": float(np.median(depth)),
+            "jitter, deg": float(np.concatenate(jitters).std()),
+        }
+
+
+def _view(frame: dict[str, Any], names: list[str], matrix: list[list[float]]) -> cadalign.View:
+    (fx, _, cx), (_, fy, cy), _ = matrix
+    shown = np.flatnonzero(np.array(frame["score"]) >= HIDDEN)
+    camera = cadalign.Camera(*SIZE, fx, fy, cx + 0.5, cy + 0.5)
+    pixels, ids = np.array(frame["uv"])[shown], [names[row] for row in shown]
+    return cadalign.View(camera, pixels, ids=ids, sigma=_SIGMA, time=frame["frame"] / _RATE)
+
+
+def _poses(
+    shape: cadalign.ShapeModel, views: list[cadalign.View], way: str
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Rotation and the box's centre in the camera of every frame."""
+    if way == "frame by frame":
+        results = [cadalign.align(shape, view) for view in views]
+        return [(r.alignment.rotation, r.alignment.apply(_middle(r))[0]) for r in results]
+    if way == "online":
+        tracker = cadalign.Tracker(shape)
+        found = [tracker.update(view).pose for view in views]
+        middle = _middle(tracker.smooth())
+        known = [each.alignment for each in found if each is not None]
+    else:
+        ransac = cadalign.RansacOptions() if "robust" in way else None
+        motion = None if way == "shape shared" else cadalign.Motion()
+        result = cadalign.align(shape, views, motion=motion, ransac=ransac)
+        middle, known = _middle(result), [view.alignment for view in result.views]
+    return [(each.rotation, each.apply(middle)[0]) for each in known]
+
+
+# Scenes -------------------------------------------------------------------------------------------
+
+
+def car_scenes(folder: Path, sigma: float) -> list[Row]:
+    """Errors of a street's cars, alone and together, whose keypoints are simulated."""
+    mean = np.array(json.loads((folder / "car_tracks.json").read_text())["model_xyz"])
+    frames: dict[int, list[KittiLabel]] = defaultdict(list)
+    for label in read_labels(folder / "label_02" / "0010.txt", tracking=True):
+        if isinstance(label, KittiLabel) and label.kind == "Car" and 5 < label.numbers[12] < 35:
+            frames[label.frame or 0].append(label)
+    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for frame, labels in frames.items():
+        if 2 <= len(labels) <= 4 and frame % 2 == 0:
+            truths = [_pose_of(label, mean) for label in labels]
+            for name, results in _scene_results(frame, truths, mean, sigma):
+                for result, truth in zip(results, truths, strict=True):
+                    for column, error in _scene_errors(result, truth, mean).items():
+                        found[name][column].append(error)
+    return [
+        {"method": name, "cars": len(columns["yaw deg"])}
+        | {column: spread(errors) for column, errors in columns.items()}
+        for name, columns in found.items()
+    ]
+
+
+def _scene_results(
+    frame: int, truths: list[cadalign.Alignment], mean: FloatArray, sigma: float
+) -> Iterator[tuple[str, Sequence[Any]]]:
+    """Results of the cars of a frame, by every method."""
+    camera = cadalign.Camera(*SIZE, 721.5, 721.5, 609.6, 172.9)
+    rng = instance_rng(frame, "kitti")
+    pixels = [camera.project(each.apply(mean)) for each in truths]
+    pixels = [each + sigma * rng.normal(size=each.shape) for each in pixels]
+    model = cadalign.Model(points_3d=mean, stretch_sigma=0.1, up_axis="z")
+    size = cadalign.Size(width=float(np.ptp(mean[:, 0])), sigma=_WIDTHS)
+    ground = {"up": (0.0, -1.0, 0.0), "camera_height": 1.65, "camera_height_sigma": 0.03}
+    for name, evidence, share in (
+        ("each alone", {}, ()),
+        ("each on the ground", ground, ()),
+        ("together, gravity shared", {}, ("gravity",)),
+        ("together, on one ground", ground, ("ground",)),
+    ):
+        objects = [
+            cadalign.SceneObject(model, cadalign.View(camera, uv, sigma=sigma, **evidence), size)
+            for uv in pixels
+        ]
+        yield name, cadalign.align_scene(objects, share=share).results
+
+
+def _pose_of(label: KittiLabel, mean: FloatArray) -> cadalign.Alignment:
+    """Pose of the mean car stretched to a label's box; x lateral, y to the rear, z up."""
+    height, width, length, *location, rotation_y = label.numbers[7:14]
+    low, high = mean.min(axis=0), mean.max(axis=0)
+    scale = np.array([width, length, height]) / (high - low)
+    yaw = rotation_from_vector(np.array([0.0, rotation_y, 0.0]))
+    in_box = yaw @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    lowest = in_box @ (scale * [(low + high)[0] / 2, (low + high)[1] / 2, low[2]])
+    return cadalign.Alignment(in_box, np.array(location) - lowest, scale)
+
+
+def _scene_errors(result: Any, truth: cadalign.Alignment, mean: FloatArray) -> dict[str, float]:
+    """Errors of a car; one without result counts as wrong as can be."""
+    names = ("yaw deg", "depth %", "length %")
+    if not isinstance(result, cadalign.Result):
+        return dict(zip(names, (180.0, 100.0, 100.0), strict=True))
+    est, center = result.alignment, mean.mean(axis=0)[None]
+    depth = est.apply(center)[0, 2] / truth.apply(center)[0, 2]
+    length = est.scale[1] / truth.scale[1]
+    errors = rotation_error(est=est, gt=truth), 100 * abs(depth - 1), 100 * abs(length - 1)
+    return dict(zip(names, map(float, errors), strict=True))

@@ -1,0 +1,210 @@
+"""Coverage of stated uncertainties, and warnings of large errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
+
+import cadalign
+from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, fitted, percent
+from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
+from cadalign.arrays import FloatArray
+from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.shapes.tails import probability_within
+
+_LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25
+_COVERED = 0.95
+_CALIBRATED_SIZES = (5, 6, 7, 8, 10, 20, 50, 100)
+_KINDS = ("fit", "sigma=None", "20 % outliers", "focal", "shape_sigma=.05", "two views")
+_REGION_SIZES = (5, 6, 8, 12, 30, 100, 200)
+_REGION_CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
+_SHAPE_SIGMA = 0.05
+_REGIONS = ("R", "t", "lengths")
+
+Draw = Callable[[np.random.Generator], Problem]
+
+
+@dataclass
+class Coverage:
+    """Coverage of stated uncertainties, and how often large errors come without a warning.
+
+    Problems are the simulation's (f = 150 px). An error is large from 15 deg or 25 % of a scale,
+    and silent without warning and alternative.
+    """
+
+    problems: int = 1000
+    """Random problems per row."""
+    noise_px: float = 1.0
+    """Standard deviation of the noise [px], which sigma states."""
+    region_problems: int = 150
+    """Random objects in a unit cube per row of the regions."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        yield RatioTable("Truths within nominal 68, 95 %", list(self._regions(given.seed)))
+        yield RatioTable("Errors within the 95 % ellipsoid", list(self._coverage(given.seed)))
+        title = "Large errors without a warning, and misfits found"
+        yield RatioTable(title, list(self._warnings(given.seed)))
+
+    def _regions(self, seed: int) -> Iterator[Row]:
+        """Regions of rotation, translation and lengths, by what is estimated from how much."""
+        for kind in _KINDS:
+            for points in _REGION_SIZES:
+                reached = []
+                for number in range(self.region_problems):
+                    rng = np.random.default_rng([seed, points, number])
+                    found = attempt(_estimated, rng, kind, points, self.noise_px)
+                    if found is not None:
+                        reached.append(_regions_reached(*found))
+                row: Row = {"estimate": kind, "keypoints": points, "results": len(reached)}
+                if reached:  # not all were refused
+                    for name, levels in zip(_REGIONS, np.transpose(reached), strict=True):
+                        shares = (percent(levels <= share) for share in (0.68, 0.95))
+                        row[name] = ", ".join(f"{share:.0f}" for share in shares)
+                yield row
+
+    def _coverage(self, seed: int) -> Iterator[Row]:
+        for sigma, loss in ((self.noise_px, "linear"), (None, "linear"), (None, "cauchy")):
+            for points in _CALIBRATED_SIZES[1:]:
+                draw = partial(simulate_problem, points=points, noise_px=self.noise_px)
+                held = [
+                    [
+                        _holds(result, problem.alignment, result.fisher_covariance),
+                        _holds(result, problem.alignment, result.covariance),
+                        not result.alternatives,
+                    ]
+                    for problem, result in self._fits(seed, draw, sigma=sigma, loss=loss)
+                ]
+                names = ("inverse Fisher %", "stated %", "no alternative %")
+                row = {"sigma": str(sigma), "loss": loss, "keypoints": points}
+                yield row | dict(zip(names, map(percent, np.transpose(held)), strict=True))
+
+    def _warnings(self, seed: int) -> Iterator[Row]:
+        for name, draw, options in _warned_cases(self.noise_px):
+            fits = list(self._fits(seed, draw, **options))
+            large = [result for problem, result in fits if _is_large(result, problem.alignment)]
+            silent = sum(not result.warnings and not result.alternatives for result in large)
+            misfits = sum(result.misfit is not None for _, result in fits)
+            yield {
+                "data": name,
+                "fits": len(fits),
+                "large errors": len(large),
+                "silent": silent,
+                "silent %": 100 * silent / max(len(large), 1),
+                "misfits %": 100 * misfits / max(len(fits), 1),
+            }
+
+    def _fits(self, seed: int, draw: Draw, **options: Any) -> Iterator[tuple[Problem, Result]]:
+        """Problems with their fits; those that are refused are left out."""
+        for number in range(self.problems):
+            problem = draw(np.random.default_rng([seed, number]))
+            result = fitted(problem, **options)
+            if result is not None:
+                yield problem, result
+
+
+def _estimated(
+    rng: np.random.Generator, kind: str, points: int, noise_px: float
+) -> tuple[Result, Alignment]:
+    """An estimate of a random object from its first view, and the truth."""
+    model = rng.uniform(-0.5, 0.5, (points, 3))
+    scale = np.array([1.0, *np.exp(rng.normal(0, 0.2, 2))])
+    differs = _SHAPE_SIGMA if kind.startswith("shape_sigma") else 0.0
+    object_points = model * scale + rng.normal(0, 1, model.shape) * differs
+    poses = []
+    for _ in range(2):
+        turn = Rotation.random(random_state=rng).as_matrix()
+        place = rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0))
+        poses.append(Alignment(turn, place, np.ones(3)))
+    seen = [
+        _REGION_CAMERA.project(pose.apply(object_points)) + rng.normal(0, noise_px, (points, 2))
+        for pose in poses
+    ]
+    truth = Alignment(poses[0].rotation, poses[0].translation, scale)
+    if kind == "two views" or differs:
+        views = [View(_REGION_CAMERA, each, sigma=noise_px) for each in seen]
+        own = Model(points_3d=model, shape_sigma=differs) if differs else Model(points_3d=model)
+        return cadalign.align(own, views[:1] if differs else views), truth
+    camera, options = _REGION_CAMERA, dict[str, Any](sigma=noise_px)
+    if kind == "sigma=None":
+        options = {"sigma": None}
+    elif kind == "20 % outliers":
+        wrong = rng.choice(points, points // 5, replace=False)
+        seen[0][wrong] = rng.uniform(0, (640, 480), (len(wrong), 2))
+        options["ransac"] = RansacOptions()
+    elif kind == "focal":
+        camera, options["focal"] = Camera.without_focal(640, 480), "estimate"
+    return cadalign.fit(model, seen[0], camera, **options), truth
+
+
+def _regions_reached(result: Result, truth: Alignment) -> list[float]:
+    """Nominal probabilities of the regions of R, t and lengths that reach the truth."""
+    covariance, found = result.covariance, []
+    for first in (0, 3, 6):
+        rows = [row for row in range(first, first + 3) if covariance[row, row] > 0]
+        square = _square(result, truth, covariance, rows)
+        found.append(float(probability_within(square, len(rows), result.degrees_of_freedom)))
+    return found
+
+
+def _warned_cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:
+    """Names, problems and options of `fit`; first data with outliers, then inliers alone."""
+
+    def draw(points: int, change: Callable[..., None] | None = None) -> Draw:
+        def problem_of(rng: np.random.Generator) -> Problem:
+            problem = simulate_problem(rng, points=points, noise_px=noise_px)
+            if change is not None:
+                change(rng, problem.points_2d)
+            return problem
+
+        return problem_of
+
+    def misplace(rng: np.random.Generator, points_2d: FloatArray) -> None:
+        points_2d[rng.integers(len(points_2d))] = rng.uniform(0, (640, 480))
+
+    def swap(rng: np.random.Generator, points_2d: FloatArray) -> None:
+        pair = rng.choice(len(points_2d), 2, replace=False)
+        points_2d[pair] = points_2d[pair[::-1]]
+
+    given = {"sigma": noise_px}
+    return [
+        ("1 wrong of 8", draw(8, misplace), given),
+        ("2 swapped of 12", draw(12, swap), given),
+        ("20 shuffled", draw(20, np.random.Generator.shuffle), given),
+        ("10, stretch none", draw(10), given | {"stretch": "none"}),
+        ("1 wrong of 8, cauchy", draw(8, misplace), given | {"loss": "cauchy"}),
+        *((f"{points} right", draw(points), given) for points in _CALIBRATED_SIZES),
+        ("8 right, cauchy", draw(8), given | {"loss": "cauchy"}),
+        ("8 right, prior", draw(8), given | {"stretch_sigma": 0.5}),
+        ("8 right, covariances", draw(8), {"sigma": np.tile(noise_px**2 * np.eye(2), (8, 1, 1))}),
+        ("8 right, focal unknown", draw(8), given | {"focal": "estimate"}),
+        ("20 right, RANSAC", draw(20), given | {"ransac": RansacOptions(max_iterations=300)}),
+    ]
+
+
+def _is_large(result: Result, gt: Alignment) -> bool:
+    errors = alignment_errors(est=result.alignment, gt=gt)
+    return errors["rotation_error_deg"] > _LARGE_ROTATION_DEG or bool(
+        np.abs(result.alignment.scale / gt.scale - 1).max() > _LARGE_SCALE
+    )
+
+
+def _holds(result: Result, gt: Alignment, covariance: FloatArray) -> bool:
+    """True if the truth lies within the 95 % ellipsoid."""
+    free = np.flatnonzero(covariance.diagonal()).tolist()
+    return _square(result, gt, covariance, free) < float(chdtri(len(free), 1 - _COVERED))
+
+
+def _square(result: Result, gt: Alignment, covariance: FloatArray, rows: list[int]) -> float:
+    """Squared Mahalanobis distance of some of the errors, in the order of a covariance's rows."""
+    est = result.alignment
+    turn = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
+    shift, logs = gt.translation - est.translation, np.log(gt.scale / est.scale)
+    kept = np.concatenate([turn, shift, logs])[rows]
+    return float(kept @ np.linalg.solve(covariance[np.ix_(rows, rows)], kept))

@@ -125,14 +125,19 @@ class RunFolder:
 
     def claim(self, config: dict[str, Any]) -> None:
         """Write ``run.json``, or see that the one that is there says the same."""
-        wanted = json.loads(json.dumps({**config, **_versions()}))
+        # Results depend to their last bits on these versions.
+        names = ("cadalign", "numpy", "scipy", "numba", "pyarrow")
+        versions = {name: version(name) for name in names}
+        versions |= {"python": platform.python_version(), "machine": platform.machine()}
+        stated = {**config, "format": _FORMAT, "versions": versions}
+        wanted = json.loads(json.dumps(stated))
         found = self.read_config()
         if found is None:
             if self.parts.exists() or self.results.exists():
                 raise DataError("holds results, but no run.json", where=str(self.path), fix=_FIX)
             write_json(self.config_file, wanted)
             return
-        differences = _differences(found, wanted)
+        differences = list(_differences(found, wanted))
         if differences:
             listed, rest = differences[:_MOST_DIFFERENCES], len(differences) - _MOST_DIFFERENCES
             more = f"; and {rest} more differences" if rest > 0 else ""
@@ -152,34 +157,16 @@ class _Config(ForeignDocument):
     versions: dict[str, Any] = field(default_factory=dict)
 
 
-def _versions() -> dict[str, Any]:
-    """Versions that results depend on to their last bits."""
-    return {
-        "format": _FORMAT,
-        "versions": {
-            "cadalign": version("cadalign"),
-            "python": platform.python_version(),
-            "machine": platform.machine(),
-            **{name: version(name) for name in ("numpy", "scipy", "numba", "pyarrow")},
-        },
-    }
-
-
-def _differences(found: Any, wanted: Any, name: str = "") -> list[str]:
+def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[str]:
     """Differences of two configurations, as text."""
     if isinstance(found, dict) and isinstance(wanted, dict):
-        return [
-            difference
-            for key in sorted({*found, *wanted})
-            for difference in _differences(
-                found.get(key), wanted.get(key), f"{name}.{key}" if name else key
-            )
-        ]
-    if found == wanted:
-        return []
-    return [f"{name} is {_shown(found)} there and {_shown(wanted)} now"]
+        for key in sorted({*found, *wanted}):
+            inner = f"{name}.{key}" if name else key
+            yield from _differences(found.get(key), wanted.get(key), inner)
+    elif found != wanted:
+        there, now = map(json.dumps, (found, wanted))
+        yield f"{name} is {_shortened(there)} there and {_shortened(now)} now"
 
 
-def _shown(value: Any) -> str:
-    text = json.dumps(value)
+def _shortened(text: str) -> str:
     return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 3]}..."

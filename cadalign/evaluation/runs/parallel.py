@@ -54,12 +54,13 @@ class Chunk(Generic[T]):
     tasks: Sequence[T]
 
 
+Evaluated = Iterator[tuple[Chunk[T], Rows]]
+
+
 class Workers(Protocol):
     """Place where chunks are evaluated."""
 
-    def evaluate(
-        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Rows]]:
+    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
         """Evaluate chunks; yields each with its result, in any order."""
 
 
@@ -72,10 +73,7 @@ class InProcess:
 
     threads: int = 1
 
-    def evaluate(
-        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Rows]]:
-        """See `Workers.evaluate`."""
+    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
         if self.threads > 1:
             with ThreadPoolExecutor(self.threads) as pool:
                 yield from evaluate_on(
@@ -92,10 +90,7 @@ class LocalProcesses:
 
     count: int
 
-    def evaluate(
-        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Rows]]:
-        """See `Workers.evaluate`."""
+    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
         from joblib import cpu_count
         from joblib.externals.loky import get_reusable_executor
 
@@ -141,7 +136,7 @@ def evaluate_on(
     *,
     window: int,
     deadly: tuple[type[BaseException], ...],
-) -> Iterator[tuple[Chunk[T], Rows]]:
+) -> Evaluated[T]:
     """Evaluate chunks on an executor, ``window`` at a time.
 
     ``executor`` gives one that works, and is asked again after every death; ``deadly`` is raised by
@@ -290,10 +285,7 @@ class DaskWorkers:
     address: str
     timeout: float = 30.0  # of the scheduler, and of its first worker [s]
 
-    def evaluate(
-        self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]
-    ) -> Iterator[tuple[Chunk[T], Rows]]:
-        """See `cadalign.evaluation.runs.parallel.Workers`."""
+    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
         try:
             from distributed import Client, KilledWorker
         except ImportError:

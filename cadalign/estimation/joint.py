@@ -279,7 +279,7 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
 def _covariance(evidence: Evidence, state: State, track: Track | None) -> JointCovariance:
     if track is None:
         return joint_covariance(evidence, state)
-    from cadalign.solvers.tracks.system import Path, moving_covariance  # kernels of tracks alone
+    from cadalign.solvers.joint.tracks import Path, moving_covariance  # kernels of tracks alone
 
     found = moving_covariance(evidence, track.motion, Path(state, track.velocities)).joint
     return JointCovariance(*(track.widening * part for part in found))

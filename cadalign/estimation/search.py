@@ -30,7 +30,7 @@ from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
 if TYPE_CHECKING:
-    from cadalign.solvers.tracks.motion import MotionPrior
+    from cadalign.solvers.joint.motion import MotionPrior
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3

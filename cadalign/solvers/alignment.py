@@ -6,7 +6,7 @@ and add its terms in `add_evidence` and `evaluate_cost`; everything else sums th
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,11 +21,16 @@ from cadalign.solvers.evidence import (
     keypoint_cost,
     scale_prior_cost,
 )
-from cadalign.solvers.linalg import cholesky, copy_into, expected_decrease, solve_cholesky
+from cadalign.solvers.linalg import (
+    LEAST_INFORMATION,
+    cholesky,
+    copy_into,
+    expected_decrease,
+    solve_cholesky,
+)
 from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
 from cadalign.solvers.unknowns import hold_fixed, move_pose, uncenter
 
-_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
 _SAME_CHORD = 1e-3
 
 
@@ -131,7 +136,7 @@ def least_information(hessian: FloatArray, unknowns: int) -> float:
     """Addition to the diagonal that holds unknowns without evidence where they are."""
     least = 1e-300
     for k in range(unknowns):
-        least = max(least, _LEAST_INFORMATION * hessian[k, k])
+        least = max(least, LEAST_INFORMATION * hessian[k, k])
     return least
 
 
@@ -150,7 +155,8 @@ def _move(
 
 @score_of.of(Objective)
 @inlined
-def _score_of(objective: Objective, pose: FloatArray, cost: float) -> float:
+def rank_by_cost(system: Any, state: FloatArray, cost: float) -> float:
+    """The cost itself; see `cadalign.solvers.search.score_of`."""
     return cost
 
 

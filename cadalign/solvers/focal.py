@@ -23,6 +23,7 @@ from cadalign.solvers.alignment import (
     centered,
     evaluate_cost,
     invert,
+    rank_by_cost,
     room_for,
     room_for_two,
     solve_damped,
@@ -209,10 +210,7 @@ def _move(
     moved[11] *= np.exp(log_ratio - state[POSE_SIZE])
 
 
-@score_of.of(FocalObjective)
-@inlined
-def _score_of(system: FocalObjective, state: FloatArray, cost: float) -> float:
-    return cost
+score_of.of(FocalObjective)(rank_by_cost)
 
 
 @are_same.of(FocalObjective)

@@ -10,7 +10,8 @@ from cadalign.compile import fast_sums, inlined, kernel
 Triple = tuple[float, float, float]
 
 _COLUMNS = 32
-_LEAST_INFORMATION = 1e-15  # about an unknown, over that about the best known one
+LEAST_INFORMATION = 1e-15
+"""Least information about an unknown, over that about the best known one."""
 
 
 @inlined
@@ -23,6 +24,12 @@ def cross(a: Triple, b: Triple) -> Triple:
 def dot(a: Triple, b: Triple) -> float:
     """The scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def triple(row: FloatArray) -> Triple:
+    """The first three numbers of a row."""
+    return row[0], row[1], row[2]
 
 
 @kernel
@@ -166,9 +173,9 @@ def damp(blocks: FloatArray, border: FloatArray, damping: float) -> None:
     least = 1e-300
     for p in range(blocks.shape[0]):
         for k in range(blocks.shape[1]):
-            least = max(least, _LEAST_INFORMATION * blocks[p, k, k])
+            least = max(least, LEAST_INFORMATION * blocks[p, k, k])
     for k in range(border.shape[0]):
-        least = max(least, _LEAST_INFORMATION * border[k, k])
+        least = max(least, LEAST_INFORMATION * border[k, k])
     for p in range(blocks.shape[0]):
         for k in range(blocks.shape[1]):
             blocks[p, k, k] += damping * blocks[p, k, k] + least

@@ -9,6 +9,7 @@ the functions here is a family of kernels with a member for each system, in that
 `focal.FocalObjective`      the same, and the focal length
 `marginal.equations.Posed`  a pose, the shape integrated out
 `joint.system.Joint`        poses, scales, focal lengths and shape from all evidence
+`joint.tracks.Moving`       the same, and velocities, with a prior on motion between poses
 =========================  =====================================================================
 
 Costs are -2 log of a likelihood times a prior, up to a constant; equations hold half the cost's
@@ -161,6 +162,27 @@ def _descend(
         # A small step counts as the end only where it is not the damping that made it small.
         done = damping < 1e-2 and expected <= _ABSOLUTE_DECREASE + _RELATIVE_DECREASE * cost
         move(system, state, current, damping, step, trial)
+
+
+@kernel
+def step_at(system: Any, state: FloatArray, followers: int) -> FloatArray:
+    """The step that the equations at a state predict, whose root is the optimum.
+
+    The changes of the last numbers of the state, so many ``followers``, follow that of the
+    unknowns. NaN where the equations do not determine these.
+    """
+    equations, _ = room_of(system)
+    size, first = equations.gradient.shape[0], state.shape[0] - followers
+    found, step, moved = np.full(size + followers, np.nan), np.zeros(size), state.copy()
+    if not evaluate(system, state, equations) < np.inf:
+        return found
+    if np.isnan(solve(system, equations, 0.0, step)):
+        return found
+    move(system, state, equations, 0.0, step, moved)
+    copy_into(found[:size], step)
+    for k in range(followers):
+        found[size + k] = moved[first + k] - state[first + k]
+    return found
 
 
 class Effort(NamedTuple):

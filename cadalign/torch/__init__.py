@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.torch.fits import fit
+    from cadalign.torch.fits import align, fit
     from cadalign.torch.losses import box_loss, reprojection_loss, rotation_loss
     from cadalign.torch.poses import PoseBatch
     from cadalign.torch.posterior import posterior_loss
-    from cadalign.torch.shapes import align
 
 __all__ = [
     "PoseBatch",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.torch.library import torch
+from cadalign.torch.poses import torch
 from cadalign.torch.renders import RenderedViews
 
 if TYPE_CHECKING:

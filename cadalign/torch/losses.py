@@ -14,8 +14,7 @@ import numpy as np
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
-from cadalign.torch.library import torch
-from cadalign.torch.poses import PoseBatch
+from cadalign.torch.poses import PoseBatch, torch
 
 if TYPE_CHECKING:
     from torch import Tensor

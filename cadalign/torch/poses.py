@@ -1,19 +1,39 @@
-"""Batches of alignments as tensors."""
+"""Batches of alignments as tensors, arguments of a batch, and PyTorch itself, imported on use."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray
+from cadalign.errors import CadalignError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.torch.library import torch
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
+else:
+
+    class _LazyLibrary:
+        """PyTorch's names; CadalignError, which names the extra, where it is not installed."""
+
+        def __getattr__(self, name: str) -> Any:
+            try:
+                import torch
+            except ImportError:
+                raise CadalignError(
+                    "PyTorch is not installed",
+                    where="cadalign.torch",
+                    fix="pip install 'cadalign[torch]'",
+                ) from None
+            return getattr(torch, name)
+
+    torch = _LazyLibrary()
+
+__all__ = ["PoseBatch", "as_array", "calibrations", "checked", "expanded", "torch"]
 
 _LEAST_DEPTH = 1e-3  # over the distance; what lies nearer or behind is projected from there
 
@@ -108,3 +128,41 @@ def cameras_of(camera: Camera | Sequence[Camera], count: int) -> tuple[Camera, .
     if len(cameras) != count:
         raise InputError(f"{len(cameras)} cameras for {count} problems", where="camera")
     return cameras
+
+
+def checked(
+    points_2d: Tensor,
+    camera: Camera | Sequence[Camera],
+    sigma: Tensor | float,
+    mask: Tensor | None,
+) -> tuple[Tensor, Tensor, tuple[Camera, ...]]:
+    """Sigmas (B, n), the mask (B, n) on the processor, and the cameras of keypoints (B, n, 2).
+
+    Raises InputError if a shape is wrong.
+    """
+    if points_2d.ndim != 3 or points_2d.shape[2] != 2:
+        what = f"shape {tuple(points_2d.shape)}, expected (B, n, 2)"
+        raise InputError(what, where="points_2d")
+    shape = tuple(points_2d.shape[:2])
+    if not isinstance(sigma, torch.Tensor):
+        sigma = points_2d.new_full((), sigma)
+    mask = torch.tensor(True) if mask is None else mask.detach().to("cpu", torch.bool)
+    cameras = cameras_of(camera, len(points_2d))
+    return expanded(sigma, shape, "sigma"), expanded(mask, shape, "mask"), cameras
+
+
+def expanded(tensor: Tensor, shape: tuple[int, ...], where: str) -> Tensor:
+    """The tensor expanded to a shape.
+
+    Raises InputError if that is not possible.
+    """
+    try:
+        return tensor.expand(shape)
+    except RuntimeError:
+        what = f"shape {tuple(tensor.shape)}, expected one that expands to {shape}"
+        raise InputError(what, where=where) from None
+
+
+def as_array(tensor: Tensor) -> FloatArray:
+    """The tensor as an array of double precision."""
+    return np.asarray(tensor.detach().to("cpu", torch.float64).numpy())

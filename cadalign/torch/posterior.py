@@ -21,9 +21,7 @@ from typing import TYPE_CHECKING
 from cadalign.errors import InputError
 from cadalign.estimation.options import BOUNDING_PRIOR
 from cadalign.geometry.camera import Camera
-from cadalign.torch.keypoints import GivenTensors, expanded
-from cadalign.torch.library import torch
-from cadalign.torch.poses import PoseBatch, calibrations
+from cadalign.torch.poses import PoseBatch, calibrations, checked, expanded, torch
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -97,13 +95,13 @@ def posterior_loss(
     if found.covariance is None or found.valid is None:
         what = "the poses have no covariance to draw samples from"
         raise InputError(what, where="found", fix="give poses of cadalign.torch.fit")
-    given = GivenTensors.of(points_2d, camera, sigma, mask)
+    sigmas, present, _ = checked(points_2d, camera, sigma, mask)
     points = expanded(points_3d, (*points_2d.shape[:2], 3), "points_3d")
     valid = found.valid
-    weights = given.mask.to(points_2d) * valid[:, None].to(points_2d)
+    weights = present.to(points_2d) * valid[:, None].to(points_2d)
     calibration = calibrations(camera, len(points)).to(points_2d)
     pixels = torch.where(weights[..., None] > 0, points_2d, torch.zeros_like(points_2d))
-    scene = _SampledKeypoints(points, pixels, given.sigma, weights, calibration, loss, loss_scale)
+    scene = _SampledKeypoints(points, pixels, sigmas, weights, calibration, loss, loss_scale)
     with torch.no_grad():
         steps, log_density = _samples(scene, found, found.covariance, (samples, rounds), seed)
     costs = scene.costs(*_moved(found, steps))

@@ -23,8 +23,7 @@ from cadalign.solvers.joint.evidence import (
     packed,
     points_of,
 )
-from cadalign.solvers.joint.reduction import reduce_modes, used_points
-from cadalign.solvers.joint.search import search_joint
+from cadalign.solvers.joint.search import reduce_modes, search_joint, used_points
 from cadalign.solvers.joint.system import Joint
 from cadalign.solvers.search import evaluate
 
@@ -109,7 +108,7 @@ def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, score = best_of(evidence, rank)
     cost, information = information_of(evidence, state)
     system = Joint(evidence, True)
-    room = joint_room(system.evidence)
+    room = joint_room(system.evidence, 6, 0)
     evaluate(system, packed(state), room)
     slope = np.linalg.solve(information, room.gradient)
     assert room.gradient @ slope < 1e-9 * max(cost, 1.0)

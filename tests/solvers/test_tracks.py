@@ -6,16 +6,21 @@ import numpy as np
 import pytest
 
 from cadalign.estimation.tracks.motion import moved_by
-from cadalign.solvers.tracks.chain import (
-    STATE,
-    Chain,
-    copy_chain,
-    empty_chain,
-    factorize_chain,
-    invert_chain,
-    solve_chain,
+from cadalign.solvers.joint.arrow import (
+    Arrow,
+    copy_matrix,
+    empty_arrow,
+    factorize_arrow,
+    invert_arrow,
+    solve_arrow,
 )
-from cadalign.solvers.tracks.motion import MotionPrior, add_motion, twist_between, write_interval
+from cadalign.solvers.joint.motion import (
+    STATE,
+    MotionPrior,
+    add_motion,
+    twist_between,
+    write_interval,
+)
 from cadalign.solvers.unknowns import move_rigid
 
 
@@ -23,35 +28,35 @@ def random_pose(rng: np.random.Generator) -> np.ndarray:
     return moved_by(np.concatenate([np.eye(3).ravel(), np.zeros(3)]), rng.normal(size=6))
 
 
-def dense(chain: Chain) -> np.ndarray:
-    frames, size = len(chain.frames), len(chain.border)
+def dense(chain: Arrow) -> np.ndarray:
+    frames, size = len(chain.blocks), len(chain.border)
     whole = np.zeros((STATE * frames + size,) * 2)
     for p in range(frames):
         own = slice(STATE * p, STATE * (p + 1))
-        whole[own, own] = chain.frames[p]
-        whole[own, STATE * frames :] = chain.later[p, :, STATE:]
+        whole[own, own] = chain.blocks[p]
+        whole[own, STATE * frames :] = chain.coupling[p, :, STATE:]
         if p + 1 < frames:
-            whole[own, STATE * (p + 1) : STATE * (p + 2)] = chain.later[p, :, :STATE]
+            whole[own, STATE * (p + 1) : STATE * (p + 2)] = chain.coupling[p, :, :STATE]
     whole[STATE * frames :, STATE * frames :] = chain.border
     upper = np.triu(whole)
     return upper + np.triu(whole, 1).T
 
 
 @pytest.fixture
-def chain() -> Chain:
+def chain() -> Arrow:
     rng = np.random.default_rng(0)
     frames, size = 5, 3
-    made = empty_chain(frames, size)
+    made = empty_arrow(frames, STATE, STATE, size)
     for p in range(frames):
         rows = rng.normal(size=(40, 2 * STATE + size))
         products = rows.T @ rows
-        made.frames[p] += products[:STATE, :STATE]
-        made.later[p, :, STATE:] += products[:STATE, 2 * STATE :]
+        made.blocks[p] += products[:STATE, :STATE]
+        made.coupling[p, :, STATE:] += products[:STATE, 2 * STATE :]
         made.border[:] += products[2 * STATE :, 2 * STATE :]
         if p + 1 < frames:
-            made.frames[p + 1] += products[STATE : 2 * STATE, STATE : 2 * STATE]
-            made.later[p + 1, :, STATE:] += products[STATE : 2 * STATE, 2 * STATE :]
-            made.later[p, :, :STATE] += products[:STATE, STATE : 2 * STATE]
+            made.blocks[p + 1] += products[STATE : 2 * STATE, STATE : 2 * STATE]
+            made.coupling[p + 1, :, STATE:] += products[STATE : 2 * STATE, 2 * STATE :]
+            made.coupling[p, :, :STATE] += products[:STATE, STATE : 2 * STATE]
     made.gradient[:] = rng.normal(size=len(made.gradient))
     return made
 
@@ -95,27 +100,29 @@ def test_a_constant_twist_has_no_cost() -> None:
     start = random_pose(rng)
     poses = np.array([moved_by(start, time * twist) for time in times])
     motion = MotionPrior(np.diff(times), np.ones(2))
-    assert add_motion(motion, poses, np.tile(twist, (4, 1)), empty_chain(4, 0)) < 1e-20
+    assert (
+        add_motion(motion, poses, np.tile(twist, (4, 1)), empty_arrow(4, STATE, STATE, 0)) < 1e-20
+    )
 
 
-def test_a_chain_is_solved_as_the_whole_matrix(chain: Chain) -> None:
-    factor, step = empty_chain(5, 3), np.zeros_like(chain.gradient)
-    copy_chain(chain, factor)
-    assert factorize_chain(factor)
-    solve_chain(factor, chain.gradient, step)
+def test_a_chain_is_solved_as_the_whole_matrix(chain: Arrow) -> None:
+    factor, step = empty_arrow(5, STATE, STATE, 3), np.zeros_like(chain.gradient)
+    copy_matrix(chain, factor)
+    assert factorize_arrow(factor)
+    solve_arrow(factor, chain.gradient, step)
     np.testing.assert_allclose(step, -np.linalg.solve(dense(chain), chain.gradient), rtol=1e-9)
 
 
-def test_the_inverse_of_a_chain_has_the_blocks_of_the_inverse(chain: Chain) -> None:
+def test_the_inverse_of_a_chain_has_the_blocks_of_the_inverse(chain: Arrow) -> None:
     whole = np.linalg.inv(dense(chain))
-    assert factorize_chain(chain)
-    inverse = invert_chain(chain)
+    assert factorize_arrow(chain)
+    inverse = invert_arrow(chain)
     last = 4
-    inverse.later[last, :, :STATE] = 0.0  # there is no next frame
+    inverse.coupling[last, :, :STATE] = 0.0  # there is no next frame
     expected = dense(inverse)
     np.testing.assert_allclose(np.where(expected != 0, whole, 0.0), expected, atol=1e-9)
 
 
-def test_an_indefinite_chain_is_refused(chain: Chain) -> None:
-    chain.frames[2, 0, 0] = -1.0
-    assert not factorize_chain(chain)
+def test_an_indefinite_chain_is_refused(chain: Arrow) -> None:
+    chain.blocks[2, 0, 0] = -1.0
+    assert not factorize_arrow(chain)

@@ -39,8 +39,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.reduction import reduced
-from cadalign.solvers.joint.search import objective_of, refine_joint, score_state
+from cadalign.solvers.joint.search import objective_of, reduced, refine_joint, score_state
 
 _ITERATIONS = 12
 _MOST_STEPS = 20

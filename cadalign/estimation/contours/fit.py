@@ -25,7 +25,7 @@ from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.reduction import reduced
+from cadalign.solvers.joint.search import reduced
 
 _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 8  # where nothing but the masks determines the estimate

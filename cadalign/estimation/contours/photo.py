@@ -36,8 +36,7 @@ from cadalign.io.images import ByteImage
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.reduction import reduced
-from cadalign.solvers.joint.search import score_state
+from cadalign.solvers.joint.search import reduced, score_state
 
 _MOST_MINIMA = 3  # that are starts
 _MOST_FINISHED = 2

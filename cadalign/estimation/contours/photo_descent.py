@@ -36,8 +36,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, log_focals_of
-from cadalign.solvers.joint.reduction import reduced
-from cadalign.solvers.joint.search import refine_joint
+from cadalign.solvers.joint.search import reduced, refine_joint
 
 COARSE = (0.16, 0.08)
 """Reaches of the lines of a first approach, relative to the silhouette's size."""

@@ -29,8 +29,8 @@ from cadalign.estimation.tracks.motion import moved_by
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import needs_facing
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, kept_rows
+from cadalign.solvers.joint.motion import twist_between
 from cadalign.solvers.joint.search import view_starts
-from cadalign.solvers.tracks.motion import twist_between
 
 _MOST_FIRST = 40  # frames that the shape is first estimated from
 _OUTLIER = 4.0  # whitened residual at which one counts no more

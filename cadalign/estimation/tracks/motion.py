@@ -16,7 +16,7 @@ from cadalign.arrays import FloatArray, as_positive, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.solvers.tracks.motion import twist_between
+from cadalign.solvers.joint.motion import twist_between
 
 _RELATIVE_TIME = 1e-9  # of the track's length: such a time is that of a frame
 _STEP = 1e-6  # of finite differences, in radians and in units of the translation's size

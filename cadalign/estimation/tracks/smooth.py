@@ -41,8 +41,8 @@ from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import Evidence
-from cadalign.solvers.tracks.motion import MotionPrior
-from cadalign.solvers.tracks.system import Path, moving_covariance, refine_moving
+from cadalign.solvers.joint.motion import MotionPrior
+from cadalign.solvers.joint.tracks import Path, moving_covariance, refine_moving
 
 _FIRST_ITERATIONS = 15
 _ITERATIONS = 60

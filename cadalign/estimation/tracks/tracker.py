@@ -26,8 +26,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import Evidence, Shape, points_of
-from cadalign.solvers.joint.reduction import reduce_modes, reduced_state
-from cadalign.solvers.tracks.system import Path
+from cadalign.solvers.joint.search import reduce_modes, reduced_state
+from cadalign.solvers.joint.tracks import Path
 
 _FIRST_FRAMES = 6  # with keypoints that determine a pose, from which the track begins
 _FIRST_WITH_OUTLIERS = 12

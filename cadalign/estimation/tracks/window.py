@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.solvers.joint.arrow import Arrow, factorize_arrow, invert_arrow
 from cadalign.solvers.joint.evidence import Evidence, Focals, Rig, State, kept_rows
-from cadalign.solvers.tracks.chain import STATE, Chain, factorize_chain, invert_chain
-from cadalign.solvers.tracks.motion import MotionPrior
-from cadalign.solvers.tracks.system import (
+from cadalign.solvers.joint.motion import STATE, MotionPrior
+from cadalign.solvers.joint.tracks import (
     NOTHING_KNOWN,
     Anchor,
     Moving,
@@ -40,7 +40,7 @@ class Window:
     """Evidence of successive frames at ``times`` (P,), their path, and what is known from earlier.
 
     ``prior`` is that of the motion, but for the times. The evidence's modes are all used, as
-    `cadalign.solvers.joint.reduction.reduce_modes` leaves them.
+    `cadalign.solvers.joint.search.reduce_modes` leaves them.
     """
 
     evidence: Evidence
@@ -62,12 +62,12 @@ class Window:
 
     def newest(self) -> NewestFrame:
         """Uncertainty of the last frame."""
-        cost, chain = equations_of(self.system, self.path)
+        cost, arrow = equations_of(self.system, self.path)
         for diagonal in range(STATE):
-            chain.frames[:, diagonal, diagonal] *= 1 + 1e-12
-        if not factorize_chain(chain):
+            arrow.blocks[:, diagonal, diagonal] *= 1 + 1e-12
+        if not factorize_arrow(arrow):
             return NewestFrame(np.full((STATE, STATE), np.inf), cost)
-        return NewestFrame(invert_chain(chain).frames[-1], cost)
+        return NewestFrame(invert_arrow(arrow).blocks[-1], cost)
 
     def without_first(self) -> Window:
         """The window without its first frame, which is marginalised."""
@@ -122,12 +122,12 @@ def _told_by_first(window: Window) -> Anchor:
     state = path.state._replace(poses=path.state.poses[:2])
     pair = Path(state, path.velocities[:2])
     motion = window.prior._replace(seconds=np.diff(window.times[:2]))
-    _, chain = equations_of(Moving(own, False, motion, window.anchor), pair)
+    _, arrow = equations_of(Moving(own, False, motion, window.anchor), pair)
     none = kept_rows(evidence.sightings, np.zeros(len(first), dtype=bool))
     nothing = own._replace(sightings=none)
     _, prior = equations_of(Moving(nothing, False, motion, NOTHING_KNOWN), pair)
-    information, gradient = _dense(chain)
-    size = len(chain.border)
+    information, gradient = _dense(arrow)
+    size = len(arrow.border)
     information[2 * STATE :, 2 * STATE :] -= prior.border  # it stays in the evidence
     gradient[2 * STATE :] -= prior.gradient[2 * STATE :]
     gone, kept = slice(0, STATE), slice(STATE, 2 * STATE + size)
@@ -151,17 +151,17 @@ def border_of(state: State) -> FloatArray:
     return np.concatenate([state.log_focals, state.log_scales, state.coefficients])
 
 
-def _dense(chain: Chain) -> tuple[FloatArray, FloatArray]:
-    """The matrix and the gradient of a chain of two frames."""
-    size = len(chain.border)
+def _dense(arrow: Arrow) -> tuple[FloatArray, FloatArray]:
+    """The matrix and the gradient of two frames."""
+    size = len(arrow.border)
     last = 2 * STATE
     whole = np.zeros((last + size, last + size))
     for p in range(2):
         own = slice(STATE * p, STATE * (p + 1))
-        whole[own, own] = chain.frames[p]
-        whole[own, last:] = chain.later[p, :, STATE:]
-        whole[last:, own] = chain.later[p, :, STATE:].T
-    whole[:STATE, STATE:last] = chain.later[0, :, :STATE]
-    whole[STATE:last, :STATE] = chain.later[0, :, :STATE].T
-    whole[last:, last:] = chain.border
-    return whole, chain.gradient.copy()
+        whole[own, own] = arrow.blocks[p]
+        whole[own, last:] = arrow.coupling[p, :, STATE:]
+        whole[last:, own] = arrow.coupling[p, :, STATE:].T
+    whole[:STATE, STATE:last] = arrow.coupling[0, :, :STATE]
+    whole[STATE:last, :STATE] = arrow.coupling[0, :, :STATE].T
+    whole[last:, last:] = arrow.border
+    return whole, arrow.gradient.copy()

@@ -30,8 +30,7 @@ from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, packed
-from cadalign.solvers.joint.reduction import reduced
-from cadalign.solvers.joint.search import refine_joint, search_joint
+from cadalign.solvers.joint.search import reduced, refine_joint, search_joint
 from cadalign.solvers.joint.system import Joint, joint_cost
 
 _FALSE_ALARMS = 0.005  # of all tests of an estimate together

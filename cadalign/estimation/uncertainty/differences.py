@@ -26,9 +26,9 @@ from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.joint.evidence import Evidence, State, log_focals_of, points_of, unpacked
-from cadalign.solvers.joint.reduction import reduced_row, sighted_points
-from cadalign.solvers.joint.search import has_latent
-from cadalign.solvers.joint.slopes import joint_step
+from cadalign.solvers.joint.search import has_latent, reduced_row, sighted_points
+from cadalign.solvers.joint.system import Joint
+from cadalign.solvers.search import step_at
 from cadalign.solvers.unknowns import move_rigid
 
 _DIFFERENCE = 1e-5  # in standard deviations, radians, and shares of lengths
@@ -211,7 +211,8 @@ class JointOptimum:
 
     def _equations(self, place: _Place) -> FloatArray:
         evidence, row, keypoints, shift = place
-        step = joint_step(evidence, has_latent(evidence), row)[self._free]
+        system = Joint(evidence, has_latent(evidence))
+        step = step_at(system, row, evidence.shape.mean.size)[self._free]
         if self.principal_weight is None:
             return np.asarray(step)
         forces = keypoints.forces(evidence, unpacked(evidence, row)).sum(axis=0)

@@ -35,7 +35,7 @@ from cadalign.solvers.joint.evidence import (
     log_focals_of,
     points_of,
 )
-from cadalign.solvers.joint.reduction import reduced
+from cadalign.solvers.joint.search import reduced
 
 _OUTLIER = 8.0  # [sigma], of a depth: it is that of something else
 _WEAKEST = 1e-12  # share of the information about an unknown that counts as none

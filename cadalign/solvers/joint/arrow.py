@@ -1,7 +1,9 @@
-"""Normal equations of many poses that share a border: an arrow, factorized in linear time.
+"""Normal equations of successive poses that share a border, factorized in linear time.
 
-The unknowns are six for each of P poses, and b that all share. Poses have no products with each
-other, so that each is eliminated by itself; what is left is a matrix of the border's size.
+The unknowns are s for each of P poses, and b that all share. A pose has products with the border
+and, where motion links successive poses, with the next one, so that eliminating one after the other
+fills nothing in. The inverse has the blocks of that pattern from the last pose to the first
+(Takahashi, Fagan, Chen, "Formation of a sparse bus impedance matrix", 1973).
 """
 
 from __future__ import annotations
@@ -12,15 +14,17 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
-from cadalign.solvers.linalg import factorize, invert_factor, solve_factor
+from cadalign.solvers.linalg import copy_into, factorize, invert_factor, solve_factor
 
 _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
 
 class Arrow(NamedTuple):
-    """A symmetric matrix: ``blocks`` (P, 6, 6), ``coupling`` (P, 6, b), ``border`` (b, b).
+    """A symmetric matrix and a right side.
 
-    The ``gradient`` (6 P + b,) is the right side of the equations.
+    ``blocks`` (P, s, s) are those of each pose, whose first 6 unknowns move it; ``coupling``
+    (P, s, n + b) its products with the next one and with the border, where n is s or, without
+    motion, 0; ``border`` (b, b) is the rest. The ``gradient`` (s P + b,) is the right side.
     """
 
     blocks: FloatArray
@@ -30,14 +34,26 @@ class Arrow(NamedTuple):
 
 
 @kernel
-def empty_arrow(poses: int, border: int) -> Arrow:
-    """Room for an arrow."""
+def empty_arrow(poses: int, size: int, ahead: int, border: int) -> Arrow:
+    """Room for poses of a ``size``, of which ``ahead`` have products with the pose before."""
     return Arrow(
-        np.zeros((poses, 6, 6)),
-        np.zeros((poses, 6, border)),
+        np.zeros((poses, size, size)),
+        np.zeros((poses, size, ahead + border)),
         np.zeros((border, border)),
-        np.zeros(6 * poses + border),
+        np.zeros(size * poses + border),
     )
+
+
+@inlined
+def ahead_of(arrow: Arrow) -> int:
+    """Place of the border in the coupling: the number n of a next pose's unknowns."""
+    return int(arrow.coupling.shape[2] - arrow.border.shape[0])
+
+
+@inlined
+def border_start(arrow: Arrow) -> int:
+    """Place of the border in the gradient."""
+    return int(arrow.gradient.shape[0] - arrow.border.shape[0])
 
 
 @kernel
@@ -49,35 +65,27 @@ def clear(arrow: Arrow) -> None:
 
 
 @kernel
-def copy_arrow(source: Arrow, target: Arrow) -> None:
-    """Copy all entries."""
-    for p in range(source.blocks.shape[0]):
-        for k in range(6):
-            for m in range(6):
-                target.blocks[p, k, m] = source.blocks[p, k, m]
-            for m in range(source.border.shape[0]):
-                target.coupling[p, k, m] = source.coupling[p, k, m]
-    for k in range(source.border.shape[0]):
-        for m in range(source.border.shape[0]):
-            target.border[k, m] = source.border[k, m]
-    for k in range(source.gradient.shape[0]):
-        target.gradient[k] = source.gradient[k]
+def copy_matrix(source: Arrow, target: Arrow) -> None:
+    """Copy all entries but the right side."""
+    copy_into(target.blocks.ravel(), source.blocks.ravel())
+    copy_into(target.coupling.ravel(), source.coupling.ravel())
+    copy_into(target.border.ravel(), source.border.ravel())
 
 
 @kernel
 def add_row(arrow: Arrow, pose: int, row: FloatArray, value: float) -> None:
     """Add an equation ``row . step = -value`` about one pose and the border, (6 + b,)."""
-    first = 6 * arrow.blocks.shape[0]
+    first, own, ahead = border_start(arrow), arrow.blocks.shape[1] * pose, ahead_of(arrow)
     for k in range(row.shape[0]):
         slope = row[k]
         if slope == 0.0:
             continue
         if k < 6:
-            arrow.gradient[6 * pose + k] += slope * value
+            arrow.gradient[own + k] += slope * value
             for m in range(6):
                 arrow.blocks[pose, k, m] += slope * row[m]
             for m in range(arrow.border.shape[0]):
-                arrow.coupling[pose, k, m] += slope * row[6 + m]
+                arrow.coupling[pose, k, ahead + m] += slope * row[6 + m]
         else:
             arrow.gradient[first + k - 6] += slope * value
             for m in range(arrow.border.shape[0]):
@@ -93,7 +101,7 @@ def add_products(
     Row 6 + b holds the residuals; ``products`` (6 + b + 1, 6 + b + 1) is scratch space.
     """
     unknowns = 6 + arrow.border.shape[0]
-    first = 6 * arrow.blocks.shape[0]
+    first, own, ahead = border_start(arrow), arrow.blocks.shape[1] * pose, ahead_of(arrow)
     for k in range(unknowns):
         for m in range(k, unknowns + 1):
             total = 0.0
@@ -101,11 +109,11 @@ def add_products(
                 total += rows[k, c] * rows[m, c]
             products[k, m] = products[m, k] = total
     for k in range(6):
-        arrow.gradient[6 * pose + k] += products[k, unknowns]
+        arrow.gradient[own + k] += products[k, unknowns]
         for m in range(6):
             arrow.blocks[pose, k, m] += products[k, m]
         for m in range(unknowns - 6):
-            arrow.coupling[pose, k, m] += products[k, 6 + m]
+            arrow.coupling[pose, k, ahead + m] += products[k, 6 + m]
     for k in range(unknowns - 6):
         arrow.gradient[first + k] += products[6 + k, unknowns]
         for m in range(unknowns - 6):
@@ -115,26 +123,26 @@ def add_products(
 @inlined
 def hold(arrow: Arrow, k: int) -> None:
     """Replace the equations of unknown k of the border by a unit row."""
-    arrow.gradient[6 * arrow.blocks.shape[0] + k] = 0.0
+    arrow.gradient[border_start(arrow) + k] = 0.0
     for p in range(arrow.blocks.shape[0]):
-        for m in range(6):
-            arrow.coupling[p, m, k] = 0.0
+        for m in range(arrow.blocks.shape[1]):
+            arrow.coupling[p, m, ahead_of(arrow) + k] = 0.0
     for m in range(arrow.border.shape[0]):
         arrow.border[k, m] = arrow.border[m, k] = 0.0
     arrow.border[k, k] = 1.0
 
 
 @kernel
-def decide_on_undetermined(arrow: Arrow, views: int) -> None:
-    """Make a singular matrix definite beside other views, and indefinite for a single one.
+def decide_on_undetermined(arrow: Arrow, is_shared: bool) -> None:
+    """Make a singular matrix definite where several views share a shape, and else indefinite.
 
-    What the evidence leaves open gets a deviation, a million times its own scale, where several
-    views share a shape, and is refused for one alone. Otherwise the rounding of the entries would
-    tell whether the matrix has a Cholesky factor.
+    What the evidence leaves open gets a deviation, a million times its own scale, beside other
+    views, and is refused for one alone. Otherwise the rounding of the entries would tell whether
+    the matrix has a Cholesky factor.
     """
-    share = 1.0 + (_LEAST_SHARE if views > 1 else -_LEAST_SHARE)
+    share = 1.0 + (_LEAST_SHARE if is_shared else -_LEAST_SHARE)
     for p in range(arrow.blocks.shape[0]):
-        for k in range(6):
+        for k in range(arrow.blocks.shape[1]):
             arrow.blocks[p, k, k] *= share
     for k in range(arrow.border.shape[0]):
         arrow.border[k, k] *= share
@@ -142,60 +150,74 @@ def decide_on_undetermined(arrow: Arrow, views: int) -> None:
 
 @fast_sums
 def factorize_arrow(arrow: Arrow) -> bool:
-    """Replace a matrix by its factor: blocks and border by Cholesky's, coupling by L^-1 C.
+    """Replace a matrix by its factor: blocks and border by Cholesky's, coupling by L^-1 of it.
 
     Returns False where it is not positive definite. The gradient stays.
     """
-    size = arrow.border.shape[0]
-    for p in range(arrow.blocks.shape[0]):
+    poses, size, width = arrow.coupling.shape
+    border, ahead = arrow.border.shape[0], ahead_of(arrow)
+    for p in range(poses):
         block, coupling = arrow.blocks[p], arrow.coupling[p]
         if not factorize(block):
             return False
-        for k in range(6):
+        linked = ahead if p < poses - 1 else 0
+        for k in range(size):
             for j in range(k):
                 share = block[k, j]
-                for m in range(size):
+                for m in range(ahead - linked, width):
                     coupling[k, m] -= share * coupling[j, m]
             inverse = 1.0 / block[k, k]
-            for m in range(size):
+            for m in range(ahead - linked, width):
                 coupling[k, m] *= inverse
-        for k in range(6):
-            for m in range(size):
+        for k in range(size):
+            for m in range(border):
+                share = coupling[k, ahead + m]
+                for j in range(m + 1):
+                    arrow.border[m, j] -= share * coupling[k, ahead + j]
+            for m in range(linked):
                 share = coupling[k, m]
                 for j in range(m + 1):
-                    arrow.border[m, j] -= share * coupling[k, j]
+                    arrow.blocks[p + 1, m, j] -= share * coupling[k, j]
+                for j in range(ahead, width):
+                    arrow.coupling[p + 1, m, j] -= share * coupling[k, j]
     return factorize(arrow.border)
 
 
 @fast_sums
 def solve_arrow(factor: Arrow, gradient: FloatArray, step: FloatArray) -> None:
     """Write the solution of ``matrix @ step = -gradient`` with the factor of the matrix."""
-    poses, size = factor.blocks.shape[0], factor.border.shape[0]
-    first = 6 * poses
+    poses, size, _ = factor.coupling.shape
+    border, ahead = factor.border.shape[0], ahead_of(factor)
     for k in range(step.shape[0]):
         step[k] = -gradient[k]
-    shared = step[first:]
+    shared = step[size * poses :]
     for p in range(poses):
         block, coupling = factor.blocks[p], factor.coupling[p]
-        own = step[6 * p : 6 * p + 6]
-        for k in range(6):
+        own = step[size * p : size * (p + 1)]
+        for k in range(size):
             for j in range(k):
                 own[k] -= block[k, j] * own[j]
             own[k] /= block[k, k]
-        for k in range(6):
-            for m in range(size):
-                shared[m] -= coupling[k, m] * own[k]
+        for k in range(size):
+            for m in range(border):
+                shared[m] -= coupling[k, ahead + m] * own[k]
+            if p < poses - 1:
+                for m in range(ahead):
+                    step[size * (p + 1) + m] -= coupling[k, m] * own[k]
     solve_factor(factor.border, shared)
-    for p in range(poses):
+    for p in range(poses - 1, -1, -1):
         block, coupling = factor.blocks[p], factor.coupling[p]
-        own = step[6 * p : 6 * p + 6]
-        for k in range(6):
+        own = step[size * p : size * (p + 1)]
+        for k in range(size):
             total = 0.0
-            for m in range(size):
-                total += coupling[k, m] * shared[m]
+            for m in range(border):
+                total += coupling[k, ahead + m] * shared[m]
+            if p < poses - 1:
+                for m in range(ahead):
+                    total += coupling[k, m] * step[size * (p + 1) + m]
             own[k] -= total
-        for k in range(5, -1, -1):
-            for j in range(k + 1, 6):
+        for k in range(size - 1, -1, -1):
+            for j in range(k + 1, size):
                 own[k] -= block[j, k] * own[j]
             own[k] /= block[k, k]
 
@@ -205,7 +227,7 @@ def log_determinant(factor: Arrow) -> float:
     """Log determinant of the matrix, from its factor."""
     total = 0.0
     for p in range(factor.blocks.shape[0]):
-        for k in range(6):
+        for k in range(factor.blocks.shape[1]):
             total += 2.0 * np.log(factor.blocks[p, k, k])
     for k in range(factor.border.shape[0]):
         total += 2.0 * np.log(factor.border[k, k])
@@ -214,15 +236,22 @@ def log_determinant(factor: Arrow) -> float:
 
 @kernel
 def invert_arrow(factor: Arrow) -> Arrow:
-    """Blocks of the inverse matrix, from its factor: those of an arrow, with an empty gradient."""
-    poses, size = factor.blocks.shape[0], factor.border.shape[0]
-    inverse = empty_arrow(poses, size)
+    """Blocks of the inverse matrix in the same pattern, from its factor; an empty gradient."""
+    poses, size, width = factor.coupling.shape
+    ahead = ahead_of(factor)
+    inverse = empty_arrow(poses, size, ahead, factor.border.shape[0])
     triangle = invert_factor(factor.border)
     inverse.border[:] = triangle.T @ triangle
-    for p in range(poses):
+    rest = np.zeros((width, width))  # of the next pose and the border
+    rest[ahead:, ahead:] = inverse.border
+    for p in range(poses - 1, -1, -1):
         lower = invert_factor(factor.blocks[p].copy())
-        gain = lower.T @ factor.coupling[p].copy()  # - d(pose) / d(border)
-        across = gain @ inverse.border
+        gain = lower.T @ factor.coupling[p].copy()  # - d(pose) / d(next pose, border)
+        across = gain @ rest
         inverse.coupling[p] = -across
         inverse.blocks[p] = lower.T @ lower + across @ gain.T
+        if ahead > 0:
+            rest[:ahead, :ahead] = inverse.blocks[p]
+            rest[:ahead, ahead:] = inverse.coupling[p, :, ahead:]
+            rest[ahead:, :ahead] = inverse.coupling[p, :, ahead:].T
     return inverse

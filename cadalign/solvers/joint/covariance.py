@@ -18,8 +18,8 @@ from cadalign.solvers.joint.arrow import (
 )
 from cadalign.solvers.joint.equations import JointEquations, joint_room
 from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked, unstretched
-from cadalign.solvers.joint.reduction import reduced_row, sighted_points
 from cadalign.solvers.joint.rows import first_scale
+from cadalign.solvers.joint.search import reduced_row, sighted_points
 from cadalign.solvers.joint.system import Joint, evaluate_joint
 
 
@@ -63,10 +63,10 @@ def _covariance_of(
 ) -> JointCovariance:
     """Covariances from those in ``reduced`` modes, whose ``basis`` (K, r) is that of all."""
     system = Joint(reduced, False)
-    equations = joint_room(reduced)
+    equations = joint_room(reduced, 6, 0)
     evaluate_joint(system, row, equations)
     arrow = equations.arrow
-    decide_on_undetermined(arrow, arrow.blocks.shape[0])
+    decide_on_undetermined(arrow, arrow.blocks.shape[0] > 1)
     if not factorize_arrow(arrow):
         return unbounded(evidence, arrow.blocks.shape[0])
     inverse = invert_arrow(arrow)
@@ -267,7 +267,7 @@ def _cam_from_model(evidence: Evidence, state: State) -> FloatArray:
 def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
     """The cost at a state, and the information (U, U) about all unknowns, border last."""
     system = Joint(evidence, False)
-    equations = joint_room(evidence)
+    equations = joint_room(evidence, 6, 0)
     cost = evaluate_joint(system, packed(state), equations)
     arrow = equations.arrow
     poses, size = len(arrow.blocks), len(arrow.border)

@@ -24,7 +24,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
-from cadalign.solvers.joint.arrow import Arrow, empty_arrow
+from cadalign.solvers.joint.arrow import Arrow, border_start, empty_arrow
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, count_poses, unstretched
 from cadalign.solvers.joint.rows import count_equations, exp_of, first_scale, stretched_point
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
@@ -56,8 +56,8 @@ class JointEquations(NamedTuple):
 
 
 @kernel
-def joint_room(evidence: Evidence) -> JointEquations:
-    """Room for the normal equations."""
+def joint_room(evidence: Evidence, size: int, ahead: int) -> JointEquations:
+    """Room for the normal equations; size and number ahead are those of `Arrow`."""
     sightings, rig = evidence.sightings, evidence.rig
     poses, points = count_poses(evidence), evidence.shape.mean.shape[0]
     border = evidence.focals.low.shape[0] + 3 + evidence.shape.modes.shape[0]
@@ -75,11 +75,11 @@ def joint_room(evidence: Evidence) -> JointEquations:
             columns[i, 1] = counts[0]
     for p in range(poses):
         first[p + 1] += first[p]
-    arrow = empty_arrow(poses, border)
+    arrow = empty_arrow(poses, size, ahead, border)
     return JointEquations(
         arrow,
         arrow.gradient,
-        empty_arrow(poses, border),
+        empty_arrow(poses, size, ahead, border),
         order,
         first,
         columns,
@@ -88,25 +88,6 @@ def joint_room(evidence: Evidence) -> JointEquations:
         np.zeros((7 + border, 7 + border)),
         np.zeros(1),
         np.zeros((points, 3)),
-    )
-
-
-@kernel
-def with_turns(one: JointEquations) -> tuple[JointEquations, JointEquations]:
-    """Equations, and others that take turns with them and share scratch space."""
-    arrow = empty_arrow(one.arrow.blocks.shape[0], one.arrow.border.shape[0])
-    return one, JointEquations(
-        arrow,
-        arrow.gradient,
-        one.factor,
-        one.order,
-        one.first,
-        one.columns,
-        one.rows.copy(),
-        one.seen,
-        one.products,
-        np.zeros(1),
-        one.slopes.copy(),
     )
 
 
@@ -161,6 +142,7 @@ def shift_means(evidence: Evidence, equations: JointEquations) -> None:
     """Move the displacements' prior means as the slopes of the log determinant do."""
     spread, rows, columns = evidence.shape.spread, equations.rows, equations.columns
     unknowns = rows.shape[0] - 4
+    beyond_pose = equations.gradient.shape[0] - unknowns
     for i in range(spread.shape[0]):
         if not spread[i] > 0:
             continue
@@ -170,7 +152,7 @@ def shift_means(evidence: Evidence, equations: JointEquations) -> None:
                 moved -= spread[i] ** 2 * rows[unknowns + 1 + a, c] * equations.slopes[i, a]
             rows[unknowns, c] += moved
             for k in range(unknowns):
-                equations.gradient[k] += rows[k, c] * moved
+                equations.gradient[k if k < 6 else k + beyond_pose] += rows[k, c] * moved
 
 
 @borrowing
@@ -275,7 +257,7 @@ def _add_slopes(
     """Add half the derivatives, from the coefficients' ``response`` (K, N) to each equation."""
     shape, sightings, rig = evidence.shape, evidence.sightings, evidence.rig
     seen, slopes, gradient = equations.seen, equations.slopes, equations.gradient
-    start = 6 * equations.arrow.blocks.shape[0]
+    size, start = equations.arrow.blocks.shape[1], border_start(equations.arrow)
     first = start + first_scale(evidence)
     scale = exp_of(state.log_scales)
     slopes[:] = 0.0
@@ -306,8 +288,8 @@ def _add_slopes(
             )
             by_turn, by_row, by_point = cross(turned, h), cross(y, a), turn_back(motion, h)
             for c in range(3):
-                gradient[6 * p + c] += by_turn[c] + by_row[c]
-                gradient[6 * p + 3 + c] += h[c]
+                gradient[size * p + c] += by_turn[c] + by_row[c]
+                gradient[size * p + 3 + c] += h[c]
                 gradient[first + c] += by_model[c, column] * back[c]
                 slopes[i, c] += scale[c] * by_point[c]
             if group >= 0:

@@ -12,9 +12,9 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, inlined, kernel
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root
-from cadalign.solvers.joint.arrow import Arrow, add_row
+from cadalign.solvers.joint.arrow import Arrow, add_row, border_start
 from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State, unstretched
-from cadalign.solvers.linalg import Triple
+from cadalign.solvers.linalg import Triple, cross, dot, triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
 
 
@@ -152,7 +152,7 @@ def bounded_scales(evidence: Evidence) -> FloatArray:
 @kernel
 def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """Add the priors on focal lengths, log scales and coefficients."""
-    border, gradient = arrow.border, arrow.gradient[6 * arrow.blocks.shape[0] :]
+    border, gradient = arrow.border, arrow.gradient[border_start(arrow) :]
     focals = evidence.focals
     first = first_scale(evidence)
     cost = 0.0
@@ -194,30 +194,18 @@ def _add_directions(evidence: Evidence, state: State, arrow: Arrow) -> float:
     The residual is the whitened difference of two unit vectors: its length is 2 sin(angle / 2).
     """
     directions, rig = evidence.directions, evidence.rig
+    row = np.zeros(6 + arrow.border.shape[0])
     cost = 0.0
-    row, seen, by_rig = np.zeros(6 + arrow.border.shape[0]), np.empty(3), np.empty(3)
     for d in range(directions.image.shape[0]):
         v = directions.image[d]
         camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-        rotated = np.zeros(3)
-        for r in range(3):
-            for a in range(3):
-                rotated[r] += pose[3 * r + a] * directions.model[d, a]
-        for c in range(3):
-            seen[c] = -directions.camera[d, c]
-            for r in range(3):
-                seen[c] += camera[3 * c + r] * rotated[r]
+        rotated = turn(pose, triple(directions.model[d]))
+        (x, y, z), known = turn(camera, rotated), directions.camera[d]
         for w in range(3):
-            whitening = directions.whitening[d, w]
-            value = whitening[0] * seen[0] + whitening[1] * seen[1] + whitening[2] * seen[2]
+            whitening = triple(directions.whitening[d, w])
+            value = dot(whitening, (x - known[0], y - known[1], z - known[2]))
             cost += value * value
-            for r in range(3):
-                by_rig[r] = (
-                    whitening[0] * camera[r]
-                    + whitening[1] * camera[3 + r]
-                    + whitening[2] * camera[6 + r]
-                )
-            _write_turn(rotated, by_rig, row)
+            row[0], row[1], row[2] = cross(rotated, turn_back(camera, whitening))
             add_row(arrow, rig.pose[v], row, value)
     return cost
 
@@ -231,7 +219,6 @@ def _add_offsets(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """
     offsets, rig = evidence.offsets, evidence.rig
     row = np.empty(6 + arrow.border.shape[0])
-    turned, q = np.empty(3), np.empty(3)
     cost = 0.0
     for j in range(offsets.value.shape[0]):
         v, weight = offsets.image[j], offsets.weight[j]
@@ -243,16 +230,12 @@ def _add_offsets(evidence: Evidence, state: State, arrow: Arrow) -> float:
             i = offsets.ends[j, end]
             if i < 0:
                 camera, pose = rig.cam_from_rig[v], state.poses[p]
+                turned = turn(pose, triple(offsets.direction[j]))
+                q = shift(pose, turn_back(camera, triple(camera[9:])))
+                value -= sign * dot(turned, q)
+                by_turn = cross(turned, q)
                 for r in range(3):
-                    turned[r] = 0.0
-                    q[r] = pose[9 + r]
-                    for a in range(3):
-                        turned[r] += pose[3 * r + a] * offsets.direction[j, a]
-                        q[r] += camera[3 * a + r] * camera[9 + a]
-                _write_turn(turned, q, row)
-                for r in range(3):
-                    value -= sign * turned[r] * q[r]
-                    row[r] *= -sign * weight
+                    row[r] = -sign * weight * by_turn[r]
                     row[3 + r] = -sign * weight * turned[r]
                 continue
             for a in range(3):
@@ -276,50 +259,39 @@ def _add_planes(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """
     planes, rig = evidence.planes, evidence.rig
     row = np.empty(6 + arrow.border.shape[0])
-    rotated, normal, stretched = np.empty(3), np.empty(3), np.empty(3)
+    scale = exp_of(state.log_scales)
     cost = 0.0
     for j in range(planes.point.shape[0]):
         v, i = planes.image[j], planes.point[j]
         camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-        for a in range(3):
-            stretched[a] = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
+        x, y, z = triple(planes.normal[j])
         group = evidence.focals.group[v]
-        tilt = planes.normal[j, 0] * planes.ray[j, 0] + planes.normal[j, 1] * planes.ray[j, 1]
+        tilt = x * planes.ray[j, 0] + y * planes.ray[j, 1]
         if group >= 0:
             tilt *= np.exp(-state.log_focals[group])
-        along = planes.normal[j, 2] + tilt
-        met = 0.0
-        for r in range(3):
-            normal[r] = rotated[r] = 0.0
-            for c in range(3):
-                normal[r] += planes.normal[j, c] / along * camera[3 * c + r]
-                rotated[r] += pose[3 * r + c] * stretched[c]
-            met += planes.normal[j, r] / along * camera[9 + r]
-            met += normal[r] * (rotated[r] + pose[9 + r])
+        along = z + tilt
+        normal = x / along, y / along, z / along
+        point = (
+            scale[0] * _undisplaced(evidence, state, i, 0),
+            scale[1] * _undisplaced(evidence, state, i, 1),
+            scale[2] * _undisplaced(evidence, state, i, 2),
+        )
+        rotated = turn(pose, point)
+        met = dot(normal, shift(camera, turn(camera, shift(pose, rotated))))
         value = (met - planes.depth[j]) * planes.weight[j]
         part, root = loss_and_root(planes.loss[j], planes.loss_scale[j], value * value)
         cost += part
         weight = root * planes.weight[j]
-        for r in range(3):
-            normal[r] *= weight
+        by_rig = turn_back(camera, (weight * normal[0], weight * normal[1], weight * normal[2]))
+        by_turn, by_model = cross(rotated, by_rig), turn_back(pose, by_rig)
         row[:] = 0.0
-        _write_turn(rotated, normal, row)
         if group >= 0:
             row[6 + group] = weight * met * tilt / along
-        for a in range(3):
-            row[3 + a] = normal[a]
-            slope = normal[0] * pose[a] + normal[1] * pose[3 + a] + normal[2] * pose[6 + a]
-            _add_shape(evidence, state, i, a, slope, row)
+        for k in range(3):
+            row[k], row[3 + k] = by_turn[k], by_rig[k]
+            _add_shape(evidence, state, i, k, by_model[k], row)
         add_row(arrow, rig.pose[v], row, root * value)
     return cost
-
-
-@inlined
-def _write_turn(rotated: FloatArray, slope: FloatArray, row: FloatArray) -> None:
-    """Write the derivatives by the rotation of ``slope . rotated``."""
-    row[0] = rotated[1] * slope[2] - rotated[2] * slope[1]
-    row[1] = rotated[2] * slope[0] - rotated[0] * slope[2]
-    row[2] = rotated[0] * slope[1] - rotated[1] * slope[0]
 
 
 @inlined

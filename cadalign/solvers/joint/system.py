@@ -1,14 +1,14 @@
 """The system of all unknowns: poses, focal lengths, scales and shape from all evidence.
 
 Of one pose, displacements of points are eliminated (see `cadalign.solvers.joint.equations`); of
-several, they are modes (see `cadalign.solvers.joint.reduction`), so that poses have no products
+several, they are modes (see `cadalign.solvers.joint.search`), so that poses have no products
 with each other. What is integrated out, coefficients and displacements, leaves its log determinant
 in the objective (see `cadalign.solvers.joint.equations`).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,9 @@ from cadalign.solvers.evidence import score_of_distance, whole_information
 from cadalign.solvers.joint.arrow import (
     Arrow,
     add_products,
+    border_start,
     clear,
-    copy_arrow,
+    copy_matrix,
     decide_on_undetermined,
     factorize_arrow,
     hold,
@@ -33,7 +34,6 @@ from cadalign.solvers.joint.equations import (
     follow,
     joint_room,
     shift_means,
-    with_turns,
 )
 from cadalign.solvers.joint.evidence import Evidence, State, unpacked
 from cadalign.solvers.joint.rows import (
@@ -79,7 +79,7 @@ def _integrating(system: Joint, integrates: bool) -> Joint:
 @room_of.of(Joint)
 @kernel
 def _room_of(system: Joint) -> tuple[JointEquations, JointEquations]:
-    return with_turns(joint_room(system.evidence))
+    return joint_room(system.evidence, 6, 0), joint_room(system.evidence, 6, 0)
 
 
 @evaluate.of(Joint)
@@ -127,7 +127,7 @@ def _hold_at_bounds(evidence: Evidence, state: State, arrow: Arrow) -> None:
     """Hold focal lengths where they would leave their bounds."""
     focals = evidence.focals
     for f in range(focals.low.shape[0]):
-        slope = arrow.gradient[6 * arrow.blocks.shape[0] + f]
+        slope = arrow.gradient[border_start(arrow) + f]
         if leaves_bounds(state.log_focals[f], focals.low[f], focals.high[f], slope):
             hold(arrow, f)
 
@@ -136,14 +136,15 @@ def _hold_at_bounds(evidence: Evidence, state: State, arrow: Arrow) -> None:
 @kernel
 def joint_cost(system: Joint, row: FloatArray) -> float:
     """The cost at a state."""
-    return evaluate_joint(system, row, joint_room(system.evidence))
+    return evaluate_joint(system, row, joint_room(system.evidence, 6, 0))
 
 
 @solve.of(Joint)
 @kernel
-def _solve(system: Joint, equations: JointEquations, damping: float, step: FloatArray) -> float:
+def solve_joint(system: Any, equations: JointEquations, damping: float, step: FloatArray) -> float:
+    """Write the damped step; see `cadalign.solvers.search.solve`."""
     factor = equations.factor
-    copy_arrow(equations.arrow, factor)
+    copy_matrix(equations.arrow, factor)
     damp(factor.blocks, factor.border, damping)
     if not factorize_arrow(factor):
         return np.nan
@@ -193,11 +194,11 @@ def _bounded(log_step: float) -> float:
 @kernel
 def joint_score(system: Joint, row: FloatArray, cost: float) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
-    equations = joint_room(system.evidence)
+    equations = joint_room(system.evidence, 6, 0)
     cost = evaluate_joint(Joint(system.evidence, False), row, equations)
     if not cost < np.inf:
         return np.inf
-    decide_on_undetermined(equations.arrow, equations.arrow.blocks.shape[0])
+    decide_on_undetermined(equations.arrow, equations.arrow.blocks.shape[0] > 1)
     _bound_volume(system.evidence, equations.arrow)
     if not factorize_arrow(equations.arrow):
         return np.inf

@@ -12,34 +12,26 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.compile import kernel
-from cadalign.solvers.joint.arrow import Arrow, empty_arrow
+from cadalign.solvers.joint.arrow import (
+    Arrow,
+    decide_on_undetermined,
+    factorize_arrow,
+    invert_arrow,
+)
 from cadalign.solvers.joint.covariance import JointCovariance, covariances_from, unbounded
-from cadalign.solvers.joint.equations import JointEquations, joint_room, with_turns
+from cadalign.solvers.joint.equations import JointEquations, joint_room
 from cadalign.solvers.joint.evidence import Evidence, State, packed, unpacked
-from cadalign.solvers.joint.reduction import (
+from cadalign.solvers.joint.motion import STATE, MotionPrior, add_motion, log_rotation, moments
+from cadalign.solvers.joint.search import (
+    has_latent,
     reduce_modes,
     reduced_row,
     reduced_state,
     sighted_points,
     whole_state,
 )
-from cadalign.solvers.joint.search import has_latent
-from cadalign.solvers.joint.system import Joint, evaluate_joint, move_joint
-from cadalign.solvers.linalg import damp, expected_decrease
+from cadalign.solvers.joint.system import Joint, evaluate_joint, move_joint, solve_joint
 from cadalign.solvers.search import evaluate, move, refine, room_of, solve
-from cadalign.solvers.tracks.chain import (
-    STATE,
-    Chain,
-    clear_chain,
-    copy_chain,
-    empty_chain,
-    factorize_chain,
-    invert_chain,
-    solve_chain,
-)
-from cadalign.solvers.tracks.motion import MotionPrior, add_motion, log_rotation, moments
-
-_LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
 
 class Anchor(NamedTuple):
@@ -72,18 +64,6 @@ class Moving(NamedTuple):
     anchor: Anchor
 
 
-class MovingEquations(NamedTuple):
-    """Normal equations: those of the evidence, and the ``chain`` that they and the motion make.
-
-    ``gradient`` is that of the chain; ``factor`` is for the damped one.
-    """
-
-    joint: JointEquations
-    chain: Chain
-    gradient: FloatArray
-    factor: Chain
-
-
 @kernel
 def _velocities(system: Moving, row: FloatArray) -> FloatArray:
     frames = system.motion.seconds.shape[0] + 1
@@ -97,42 +77,33 @@ def _joint_part(system: Moving, row: FloatArray) -> FloatArray:
 
 @room_of.of(Moving)
 @kernel
-def _room_of(system: Moving) -> tuple[MovingEquations, MovingEquations]:
-    first, second = with_turns(joint_room(system.evidence))
-    frames, size = first.arrow.blocks.shape[0], first.arrow.border.shape[0]
-    factor, one, other = (
-        empty_chain(frames, size),
-        empty_chain(frames, size),
-        empty_chain(frames, size),
-    )
-    return (
-        MovingEquations(first, one, one.gradient, factor),
-        MovingEquations(second, other, other.gradient, factor),
-    )
+def _room_of(system: Moving) -> tuple[JointEquations, JointEquations]:
+    return joint_room(system.evidence, STATE, STATE), joint_room(system.evidence, STATE, STATE)
 
 
 @evaluate.of(Moving)
 @kernel
-def evaluate_moving(system: Moving, row: FloatArray, equations: MovingEquations) -> float:
+def evaluate_moving(system: Moving, row: FloatArray, equations: JointEquations) -> float:
     """Write the normal equations at a state; see `cadalign.solvers.search.evaluate`."""
-    joint, chain = Joint(system.evidence, system.integrates), equations.chain
-    cost = evaluate_joint(joint, _joint_part(system, row), equations.joint)
+    joint, arrow = Joint(system.evidence, system.integrates), equations.arrow
+    cost = evaluate_joint(joint, _joint_part(system, row), equations)
     if not cost < np.inf:
         return np.inf
-    clear_chain(chain)
-    _add_arrow(equations.joint.arrow, chain)
     state = unpacked(system.evidence, _joint_part(system, row))
     velocities = _velocities(system, row)
-    cost += add_motion(system.motion, state.poses, velocities, chain)
+    cost += add_motion(system.motion, state.poses, velocities, arrow)
     if system.motion.told > 0.0:
-        cost += _add_volume(system, state, chain)
+        cost += _add_volume(system, state, arrow)
     if system.anchor.information.shape[0] > 0:
-        cost += _add_anchor(system.anchor, state, velocities[0], chain)
+        cost += _add_anchor(system.anchor, state, velocities[0], arrow)
     return cost
 
 
+solve.of(Moving)(solve_joint)
+
+
 @kernel
-def _add_volume(system: Moving, state: State, chain: Chain) -> float:
+def _add_volume(system: Moving, state: State, arrow: Arrow) -> float:
     """Add the slope of what `MotionPrior` says of depths; returns its cost."""
     rig, told, cost = system.evidence.rig, system.motion.told, 0.0
     frames = state.poses.shape[0]
@@ -149,29 +120,14 @@ def _add_volume(system: Moving, state: State, chain: Chain) -> float:
         share = told / counts[p]
         cost += 2.0 * share * np.log(system.motion.farthest / depth)
         for a in range(3):
-            chain.gradient[STATE * p + 3 + a] -= share * camera[6 + a] / depth
+            arrow.gradient[STATE * p + 3 + a] -= share * camera[6 + a] / depth
     return cost
 
 
 @kernel
-def _add_arrow(arrow: Arrow, chain: Chain) -> None:
-    """Add the equations of the evidence."""
-    frames, size = arrow.blocks.shape[0], arrow.border.shape[0]
-    for p in range(frames):
-        for k in range(6):
-            chain.gradient[STATE * p + k] += arrow.gradient[6 * p + k]
-            for m in range(6):
-                chain.frames[p, k, m] += arrow.blocks[p, k, m]
-            for m in range(size):
-                chain.later[p, k, STATE + m] += arrow.coupling[p, k, m]
-    chain.border[:] += arrow.border
-    chain.gradient[STATE * frames :] += arrow.gradient[6 * frames :]
-
-
-@kernel
-def _add_anchor(anchor: Anchor, state: State, velocity: FloatArray, chain: Chain) -> float:
+def _add_anchor(anchor: Anchor, state: State, velocity: FloatArray, arrow: Arrow) -> float:
     """Add what is known of the first frame and the border; returns its cost."""
-    size, last = anchor.border.shape[0], chain.gradient.shape[0] - anchor.border.shape[0]
+    size, last = anchor.border.shape[0], arrow.gradient.shape[0] - anchor.border.shape[0]
     away = np.empty(STATE + size)
     start, now = anchor.pose[:9].reshape((3, 3)), state.poses[0, :9].copy().reshape((3, 3))
     away[:3] = log_rotation(now @ start.T)
@@ -183,24 +139,12 @@ def _add_anchor(anchor: Anchor, state: State, velocity: FloatArray, chain: Chain
     away[STATE + focals + 3 :] = state.coefficients
     away[STATE:] -= anchor.border
     slope = anchor.information @ away + anchor.gradient
-    chain.gradient[:STATE] += slope[:STATE]
-    chain.gradient[last:] += slope[STATE:]
-    chain.frames[0] += anchor.information[:STATE, :STATE]
-    chain.later[0, :, STATE:] += anchor.information[:STATE, STATE:]
-    chain.border[:] += anchor.information[STATE:, STATE:]
+    arrow.gradient[:STATE] += slope[:STATE]
+    arrow.gradient[last:] += slope[STATE:]
+    arrow.blocks[0] += anchor.information[:STATE, :STATE]
+    arrow.coupling[0, :, STATE:] += anchor.information[:STATE, STATE:]
+    arrow.border[:] += anchor.information[STATE:, STATE:]
     return float(((slope + anchor.gradient) * away).sum())
-
-
-@solve.of(Moving)
-@kernel
-def _solve(system: Moving, equations: MovingEquations, damping: float, step: FloatArray) -> float:
-    factor = equations.factor
-    copy_chain(equations.chain, factor)
-    damp(factor.frames, factor.border, damping)
-    if not factorize_chain(factor):
-        return np.nan
-    solve_chain(factor, equations.gradient, step)
-    return expected_decrease(equations.gradient, step, len(step))
 
 
 @move.of(Moving)
@@ -208,7 +152,7 @@ def _solve(system: Moving, equations: MovingEquations, damping: float, step: Flo
 def _move(
     system: Moving,
     row: FloatArray,
-    equations: MovingEquations,
+    equations: JointEquations,
     damping: float,
     step: FloatArray,
     moved_row: FloatArray,
@@ -224,7 +168,7 @@ def _move(
     move_joint(
         Joint(system.evidence, system.integrates),
         _joint_part(system, row),
-        equations.joint,
+        equations,
         damping,
         own,
         _joint_part(system, moved_row),
@@ -272,10 +216,10 @@ def row_of(path: Path) -> FloatArray:
     return np.concatenate([packed(path.state), path.velocities.ravel()])
 
 
-def equations_of(system: Moving, path: Path) -> tuple[float, Chain]:
+def equations_of(system: Moving, path: Path) -> tuple[float, Arrow]:
     """The cost and the normal equations at a path."""
-    equations, _ = _room_of(system)
-    return evaluate_moving(system, row_of(path), equations), equations.chain
+    equations = joint_room(system.evidence, STATE, STATE)
+    return evaluate_moving(system, row_of(path), equations), equations.arrow
 
 
 class PathCovariance(NamedTuple):
@@ -307,32 +251,27 @@ def moving_covariance(evidence: Evidence, motion: MotionPrior, path: Path) -> Pa
 def _covariance_of(
     evidence: Evidence, system: Moving, basis: FloatArray, row: FloatArray, sighted: BoolArray
 ) -> PathCovariance:
-    equations, _ = _room_of(system)
+    equations = joint_room(system.evidence, STATE, STATE)
     cost = evaluate_moving(system, row, equations)
-    chain = equations.chain
-    frames, size = chain.frames.shape[0], chain.border.shape[0]
-    for p in range(frames):
-        for k in range(STATE):
-            chain.frames[p, k, k] *= 1.0 + _LEAST_SHARE
-    for k in range(size):
-        chain.border[k, k] *= 1.0 + _LEAST_SHARE
-    if not factorize_chain(chain):
+    arrow = equations.arrow
+    decide_on_undetermined(arrow, True)
+    if not factorize_arrow(arrow):
+        frames = arrow.blocks.shape[0]
         nothing = np.full((frames, STATE, STATE), np.inf)
         unknown = np.full(2, np.inf)
         found = unbounded(evidence, frames)
         return PathCovariance(found, nothing, nothing, unknown, unknown, unknown)
-    inverse = invert_chain(chain)
-    arrow = empty_arrow(frames, size)
-    for p in range(frames):
-        arrow.blocks[p] = inverse.frames[p, :6, :6]
-        arrow.coupling[p] = inverse.later[p, :6, STATE:]
-    arrow.border[:] = inverse.border
-    joint = _joint_part(system, row)
-    found = covariances_from(
-        evidence, system.evidence, basis, joint, equations.joint, arrow, sighted
+    inverse = invert_arrow(arrow)
+    of_poses = Arrow(
+        inverse.blocks[:, :6, :6].copy(),
+        inverse.coupling[:, :6, STATE:].copy(),
+        inverse.border,
+        inverse.gradient,
     )
+    joint = _joint_part(system, row)
+    found = covariances_from(evidence, system.evidence, basis, joint, equations, of_poses, sighted)
     poses = unpacked(system.evidence, joint).poses
     squares, variances = moments(system.motion, poses, _velocities(system, row), inverse)
-    links = inverse.later[:, :, :STATE].copy()
+    links = inverse.coupling[:, :, :STATE].copy()
     costs = np.array([cost - squares.sum(), squares.sum()])
-    return PathCovariance(found, inverse.frames, links, squares, variances, costs)
+    return PathCovariance(found, inverse.blocks, links, squares, variances, costs)

@@ -19,8 +19,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
-from cadalign.solvers.tracks.chain import STATE, Chain
+from cadalign.solvers.joint.arrow import Arrow
 
+STATE = 12
+"""Unknowns of a frame: rotation, translation, angular and linear velocity."""
 _SERIES = (1.0 / 12.0, -1.0 / 720.0, 1.0 / 30240.0, -1.0 / 1209600.0)  # Bernoulli's, even powers
 _NEAR_ZERO = 1e-8
 
@@ -156,7 +158,7 @@ def write_interval(
 
 @fast_sums
 def add_motion(
-    motion: MotionPrior, poses: FloatArray, velocities: FloatArray, chain: Chain
+    motion: MotionPrior, poses: FloatArray, velocities: FloatArray, arrow: Arrow
 ) -> float:
     """Add the equations of all intervals; returns their cost."""
     rows = np.empty((STATE, 2 * STATE + 1))
@@ -172,18 +174,18 @@ def add_motion(
                     for b in range(2 * STATE + 1):
                         products[a, b] += row[a] * row[b]
         for a in range(STATE):
-            chain.gradient[STATE * k + a] += products[a, 2 * STATE]
-            chain.gradient[STATE * (k + 1) + a] += products[STATE + a, 2 * STATE]
+            arrow.gradient[STATE * k + a] += products[a, 2 * STATE]
+            arrow.gradient[STATE * (k + 1) + a] += products[STATE + a, 2 * STATE]
             for b in range(STATE):
-                chain.frames[k, a, b] += products[a, b]
-                chain.frames[k + 1, a, b] += products[STATE + a, STATE + b]
-                chain.later[k, a, b] += products[a, STATE + b]
+                arrow.blocks[k, a, b] += products[a, b]
+                arrow.blocks[k + 1, a, b] += products[STATE + a, STATE + b]
+                arrow.coupling[k, a, b] += products[a, STATE + b]
     return cost
 
 
 @kernel
 def moments(
-    motion: MotionPrior, poses: FloatArray, velocities: FloatArray, inverse: Chain
+    motion: MotionPrior, poses: FloatArray, velocities: FloatArray, inverse: Arrow
 ) -> tuple[FloatArray, FloatArray]:
     """Squared whitened residuals (2,) of rotation and translation, and their variances' sums (2,).
 
@@ -194,10 +196,10 @@ def moments(
     both = np.empty((2 * STATE, 2 * STATE))
     for k in range(motion.seconds.shape[0]):
         write_interval(motion, k, poses, velocities, rows)
-        both[:STATE, :STATE] = inverse.frames[k]
-        both[STATE:, STATE:] = inverse.frames[k + 1]
-        both[:STATE, STATE:] = inverse.later[k, :, :STATE]
-        both[STATE:, :STATE] = inverse.later[k, :, :STATE].T
+        both[:STATE, :STATE] = inverse.blocks[k]
+        both[STATE:, STATE:] = inverse.blocks[k + 1]
+        both[:STATE, STATE:] = inverse.coupling[k, :, :STATE]
+        both[STATE:, :STATE] = inverse.coupling[k, :, :STATE].T
         spread = rows[:, : 2 * STATE].copy() @ both
         for a in range(STATE):
             group = (a % 6) // 3

@@ -1,1 +1,0 @@
-"""Poses over time: smooth motion of one object, factorized in linear time."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
@@ -29,9 +30,9 @@ from cadalign.solvers.focal import FocalObjective, at_focal, refine_focal
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
+from cadalign.solvers.optimal import next_subset
 from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.search import refine
-from cadalign.solvers.starts import draw_sample, grow_pool, next_subset, seed_state, start_pool
 
 _FEW_POINTS = 24  # so few are always all looked at
 _RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first
@@ -305,3 +306,83 @@ def _finish(objective: Objective, threshold: float, best: float, pose: FloatArra
         best = min(best, score)
         support = inside
     return best
+
+
+# Random samples ----------------------------------------------------------------------------------
+
+StateArray = npt.NDArray[np.uint64]
+
+
+@kernel
+def seed_state(seed: int, state: StateArray) -> None:
+    """Start a random stream (1,) from a seed: one step of SplitMix64, never zero."""
+    z = np.uint64(seed) + np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    state[0] = z | np.uint64(1)
+
+
+@kernel
+def draw_below(state: StateArray, bound: int) -> int:
+    """A whole number from 0 to ``bound - 1``; xorshift64*."""
+    x = state[0]
+    x ^= x >> np.uint64(12)
+    x ^= x << np.uint64(25)
+    x ^= x >> np.uint64(27)
+    state[0] = x
+    return int(np.int64(((x * np.uint64(0x2545F4914F6CDD1D)) >> np.uint64(33)) % np.uint64(bound)))
+
+
+@kernel
+def draw_subset(state: StateArray, count: int, chosen: IntArray) -> None:
+    """Draw distinct point numbers below ``count``, any of them alike."""
+    k = 0
+    while k < chosen.shape[0]:
+        index = draw_below(state, count)
+        fresh = True
+        for m in range(k):
+            fresh = fresh and chosen[m] != index
+        if fresh:
+            chosen[k] = index
+            k += 1
+
+
+@kernel
+def grow_pool(growth: FloatArray, size: int, count: int, iteration: int) -> None:
+    """Widen the pool of the best points as PROSAC does.
+
+    Chum, Matas, "Matching with PROSAC - progressive sample consensus", 2005. ``growth`` (3,) holds
+    the pool's size, the average number of samples that fall into it (T_n), and the iteration until
+    which it lasts (T'_n).
+    """
+    while growth[0] < count and iteration > growth[2]:
+        wider = growth[1] * (growth[0] + 1) / (growth[0] + 1 - size)
+        growth[2] += np.ceil(wider - growth[1])
+        growth[1] = wider
+        growth[0] += 1
+
+
+@kernel
+def start_pool(growth: FloatArray, size: int, count: int, budget: float) -> None:
+    """The pool before the first sample: as many points as a sample has."""
+    average = budget
+    for i in range(size):
+        average *= (size - i) / (count - i)
+    growth[0], growth[1], growth[2] = size, average, 1.0
+
+
+@kernel
+def draw_sample(
+    state: StateArray, growth: FloatArray, guided: bool, count: int, chosen: IntArray
+) -> None:
+    """Draw a sample: of the pool's points, with its newest one, or of all."""
+    pool = int(growth[0]) if guided else count
+    if pool >= count:
+        draw_subset(state, count, chosen)
+    elif pool == chosen.shape[0]:
+        for k in range(pool):
+            chosen[k] = k
+    else:
+        draw_subset(state, pool - 1, chosen[1:])
+        chosen[0] = pool - 1

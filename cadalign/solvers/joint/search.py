@@ -11,9 +11,8 @@ from cadalign.compile import fast_sums
 from cadalign.solvers.constants import UNKNOWNS, ScalePrior
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed, unpacked
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
-from cadalign.solvers.optimal import optimal_batch
+from cadalign.solvers.optimal import optimal_batch, widen_by_shape
 from cadalign.solvers.search import Effort, descend, refine, room_for_minima, search
-from cadalign.solvers.starts import widen_by_shape
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200

@@ -18,8 +18,7 @@ import cadalign
 from cadalign import Result, ShapeModel, View
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.tracks import METHODS, SPEC, TracksOptions
-from cadalign.evaluation.instances.tracks import SimulatedVideo, track_errors
-from cadalign.evaluation.methods.tracks import TrackEstimate
+from cadalign.evaluation.instances.tracks import SimulatedVideo, TrackEstimate, track_errors
 from cadalign.evaluation.runs.folder import RunFolder
 
 SYNSET = "03001627"

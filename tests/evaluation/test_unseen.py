@@ -20,12 +20,9 @@ from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
-from cadalign.evaluation.instances.unseen import (
-    UnseenTasks,
-    keep_preview,
-    observe_object,
-    probability_level,
-)
+from cadalign.evaluation.instances.pictures import keep_preview
+from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
+from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress

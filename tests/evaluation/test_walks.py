@@ -25,7 +25,7 @@ from cadalign.evaluation.methods.method import MethodInput
 from cadalign.evaluation.metrics import photos as metrics
 from cadalign.evaluation.metrics.sets import medians_of, score_alignment, score_columns
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.photos.methods import PhotoInstance
+from cadalign.evaluation.photos.methods import Sighting
 from cadalign.evaluation.photos.objects import PhotoObjects
 from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
@@ -54,8 +54,8 @@ class WrongClickOptions(PhotosOptions):
 class WrongClicks(PhotoObjects):
     """Objects in photos, the first keypoint of which is moved."""
 
-    def given(self, instance: PhotoInstance) -> MethodInput:
-        found = super().given(instance)
+    def given(self, sighting: Sighting) -> MethodInput:
+        found = super().given(sighting)
         assert isinstance(self.options, WrongClickOptions)
         moved = found.points_2d.copy()
         moved[0, 0] += self.options.click_px

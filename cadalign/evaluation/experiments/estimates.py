@@ -101,7 +101,8 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
         unread[name], strays[name] = len(file.problems), file.strays(dataset.names)
         for problem in file.problems[:_LOGGED]:
             logger.warning("%s: left out: %s", name, problem)
-    return estimates_benchmark(options, methods, folder.made_for_pictures()).plan(
+    pictures = folder.made_for_pictures()
+    return estimates_benchmark(dataset.kind, options, methods, pictures).plan(
         options,
         tasks,
         chunk=_CHUNK,

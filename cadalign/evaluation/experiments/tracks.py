@@ -163,8 +163,8 @@ def plan(options: TracksOptions, folder: RunFolder) -> Plan[TrackTask]:
         place = folder.path / "sample_dataset"
         root = write_sample_dataset(place, per_category=_SAMPLE, keep=True)
     make = recorded_videos if (root / "car_tracks.json").is_file() else simulated_videos
-    found = make(root, options, folder)
-    return found.benchmark.plan(options, found.tasks, chunk=1, data=found.fingerprint)
+    tasks, benchmark, data = make(root, options, folder)
+    return benchmark.plan(options, tasks, chunk=1, data=data)
 
 
 def _describe(run: Run) -> str:

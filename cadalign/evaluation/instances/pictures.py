@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import base64
+import logging
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import numpy.typing as npt
 from PIL import Image
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import RenderError
-from cadalign.evaluation.instances.instance import Instance
+from cadalign.datasets import KeypointNet
+from cadalign.errors import DataError, RenderError
+from cadalign.evaluation.instances.instance import Instance, KeypointTask
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.alignment import Alignment
@@ -23,10 +25,12 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
 from cadalign.geometry.mesh import Mesh, cluster, mesh_edges, simplify
-from cadalign.io.files import dense_json, write_text, write_whole
+from cadalign.io.files import dense_json, write_text, write_whole, writing
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
+
+logger = logging.getLogger("cadalign")
 
 _THUMB_WIDTH = 320
 _QUALITY, _THUMB_QUALITY = 85, 75
@@ -154,6 +158,24 @@ def preview_of(
 def write_preview(path: Path, mesh: Mesh) -> None:
     """Write a preview of a mesh as JSON."""
     write_text(path, dense_json(preview_of(mesh).to_dict()))
+
+
+def keep_preview(folder: RunFolder, root: Path, task: KeypointTask) -> None:
+    """Write the preview of an object's mesh to a run's folder; nothing without a readable mesh."""
+    model = _dataset(root)[task.category, task.model_id]
+    if model.mesh_path is None:
+        return
+    try:
+        mesh = model.load_mesh()
+    except DataError as error:
+        logger.warning("no preview of the mesh: %s", error)
+        return
+    with writing(folder.previews):
+        folder.previews.mkdir(exist_ok=True)
+    write_preview(folder.previews / f"{record_stem(task.category, task.model_id)}.json", mesh)
+
+
+_dataset = lru_cache(maxsize=1)(KeypointNet)
 
 
 def _base64(values: npt.NDArray[Any], kind: str) -> str:

@@ -1,12 +1,13 @@
-"""Videos with a known answer: simulated ones of a data set's objects, and KITTI's cars."""
+"""Videos with a known answer, simulated ones of a data set's objects and KITTI's, and methods."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,15 +22,17 @@ from cadalign.datasets.photos.kitti_keypoints import (
     list_tracks,
     yaw_of_car,
 )
-from cadalign.errors import DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.estimation.align import align
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
+from cadalign.estimation.tracks.motion import Motion
+from cadalign.estimation.tracks.tracker import Tracker
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting
-from cadalign.evaluation.experiments.tracks import COLUMNS, TracksOptions
-from cadalign.evaluation.instances.unseen import probability_level
+from cadalign.evaluation.experiments.tracks import COLUMNS, METHODS, TracksOptions
 from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.methods.tracks import OWN_METHODS, TrackEstimate, TrackVideo, of_result
+from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.metrics.trajectories import (
     absolute_pose_error,
     count_flips,
@@ -39,7 +42,7 @@ from cadalign.evaluation.metrics.trajectories import (
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.runs.work import fingerprint
-from cadalign.evaluation.shape_files import LearnedFiles, learn
+from cadalign.evaluation.shape_files import learn
 from cadalign.evaluation.simulation.tracks import (
     simulate_track,
     with_correlated_errors,
@@ -132,24 +135,95 @@ def pose_of(alignment: Alignment, middle: FloatArray) -> FloatArray:
     return np.concatenate([alignment.rotation.ravel(), alignment.apply([middle])[0]])
 
 
-@dataclass(frozen=True)
-class CarShape:
-    """The shape of the cars of a folder; small, as `LearnedFiles` are."""
-
-    root: Path
-
-    def shape(self, category: str) -> ShapeModel:
-        """The shape, whatever the category is called."""
-        return _car_shape(self.root)
-
-
 @lru_cache(maxsize=1)
-def _car_shape(root: Path) -> ShapeModel:
+def car_shape_of(root: Path, category: str) -> ShapeModel:
+    """The shape of the cars of a folder, whatever their category is called."""
     shape = car_shape(root)
     if shape is None:
         fix = "give a folder with the mean car and its modes"
         raise DataError("there is no shape of the cars", where=str(root), fix=fix)
     return shape
+
+
+# Methods ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TrackVideo:
+    """A video as methods are given it, and the true poses (P, 12), which they do not use."""
+
+    shape: ShapeModel
+    views: tuple[View, ...]
+    truth: FloatArray
+    ransac: RansacOptions | None
+
+
+@dataclass(frozen=True, eq=False)
+class TrackEstimate:
+    """Poses (P, 12) of an object's axes and its box's centre, NaN where there is none.
+
+    ``covariances`` (P, 3, 3) are those of the rotation vectors [rad].
+    """
+
+    poses: FloatArray
+    covariances: FloatArray
+    degrees_of_freedom: float | None = None
+
+
+def _of_result(result: Result) -> TrackEstimate:
+    """The estimate of a result, whose views are the frames."""
+    middle = result.bounds.mean(axis=0)
+    return _estimate(result.views, middle, result.degrees_of_freedom)
+
+
+def _estimate(
+    frames: Sequence[Any], middle: FloatArray, freedom: float | None = None
+) -> TrackEstimate:
+    """The estimate of frames, each with an alignment and its covariance, None without a pose."""
+    poses, covariances = np.full((len(frames), 12), np.nan), np.full((len(frames), 3, 3), np.nan)
+    for k, frame in enumerate(frames):
+        if frame is not None:
+            poses[k] = pose_of(frame.alignment, middle)
+            if frame.covariance is not None:
+                covariances[k] = frame.covariance[:3, :3]
+    return TrackEstimate(poses, covariances, freedom)
+
+
+def _frame_by_frame(video: TrackVideo) -> TrackEstimate:
+    found, freedom = [], None
+    for view in video.views:
+        try:
+            result = align(video.shape, view, ransac=video.ransac)
+        except CadalignError:  # too few keypoints, or no consensus
+            found.append(_estimate([None], np.zeros(3)))
+        else:
+            found.append(_of_result(result))
+            freedom = result.degrees_of_freedom
+    poses, covariances = ([getattr(e, name)[0] for e in found] for name in ("poses", "covariances"))
+    return TrackEstimate(np.array(poses), np.array(covariances), freedom)
+
+
+def _aligned(video: TrackVideo, *, motion: Motion | None) -> TrackEstimate:
+    return _of_result(align(video.shape, video.views, motion=motion, ransac=video.ransac))
+
+
+def _online(video: TrackVideo) -> TrackEstimate:
+    tracker = Tracker(video.shape, ransac=video.ransac)
+    found = [tracker.update(view).pose for view in video.views]
+    # The box is not known before the end: that of the category's mean stands for it.
+    return _estimate(found, video.shape.mean[-2:].mean(axis=0))
+
+
+_SOLVERS = {
+    "frames": _frame_by_frame,
+    "shared": partial(_aligned, motion=None),
+    "smooth": partial(_aligned, motion=Motion()),
+    "online": _online,
+}
+_METHODS = {name: Method(name, _SOLVERS[name]) for name in METHODS}
+
+
+# Errors -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -159,41 +233,41 @@ class TrackVideos(Setting):
     names = VIEW_NAMES
     columns = COLUMNS
 
-    shapes: LearnedFiles | CarShape
+    shape_of: Callable[[str], ShapeModel]  # the shape of a category
     options: TracksOptions
+    has_yaw: bool  # they are KITTI's cars
 
     def case(self, task: TrackTask) -> Case:
         views, truth = task.video(self.options)
         count = float(np.mean([len(view.keypoint_ids) for view in views]))
         facts = {"frames": len(views), "keypoints": count}
         ransac = RansacOptions() if self.options.is_robust else None
-        shape = self.shapes.shape(task.category)
-        return Case(task.names, facts, TrackVideo(shape, tuple(views), truth, ransac))
+        video = TrackVideo(self.shape_of(task.category), tuple(views), truth, ransac)
+        return Case(task.names, facts, video)
 
-    def given(self, instance: TrackVideo) -> MethodInput:
-        shape, first = instance.shape, instance.views[0]
+    def given(self, video: TrackVideo) -> MethodInput:
+        shape, first = video.shape, video.views[0]
         row_of: dict[Hashable, int] = {name: row for row, name in enumerate(shape.ids)}
-        rows = [row_of[name] for name in first.keypoint_ids]
         return MethodInput(
-            shape.mean[rows],
+            shape.mean[[row_of[name] for name in first.keypoint_ids]],
             np.asarray(first.points_2d),
             first.camera,
             self.options.sigma,
             bounds=shape.mean[-2:],
-            ransac=instance.ransac,
-            make_views=lambda: (shape, instance.views),
+            ransac=video.ransac,
+            make_views=lambda: (shape, video.views),
         )
 
     def answered(
-        self, method: Method, instance: TrackVideo, answer: Alignment | Result
+        self, method: Method, video: TrackVideo, answer: Alignment | Result
     ) -> TrackEstimate:
-        if not isinstance(answer, Result) or len(answer.views) != len(instance.views):
+        if not isinstance(answer, Result) or len(answer.views) != len(video.views):
             what = f"{method.name} does not return the result of all views"
             raise InputError(what, where="methods", fix="take model and views, as align does")
-        return of_result(answer)
+        return _of_result(answer)
 
-    def row(self, method: Method, instance: TrackVideo, estimate: TrackEstimate) -> Row:
-        return track_errors(estimate, instance.truth, has_yaw=isinstance(self.shapes, CarShape))
+    def row(self, method: Method, video: TrackVideo, estimate: TrackEstimate) -> Row:
+        return track_errors(estimate, video.truth, has_yaw=self.has_yaw)
 
 
 def track_errors(estimate: TrackEstimate, gt: FloatArray, *, has_yaw: bool = False) -> Row:
@@ -232,16 +306,13 @@ def track_errors(estimate: TrackEstimate, gt: FloatArray, *, has_yaw: bool = Fal
     }
 
 
-@dataclass(frozen=True, eq=False)
-class PlannedVideos:
-    """The tasks of a run, their benchmark, and the hash of all data."""
+# Data sets ----------------------------------------------------------------------------------------
 
-    tasks: Sequence[TrackTask]
-    benchmark: Benchmark
-    fingerprint: str
+Videos = tuple[Sequence[TrackTask], Benchmark, str]
+"""The tasks of a run, their benchmark, and the hash of all data."""
 
 
-def simulated_videos(root: Path, options: TracksOptions, folder: RunFolder) -> PlannedVideos:
+def simulated_videos(root: Path, options: TracksOptions, folder: RunFolder) -> Videos:
     """Videos of the objects of a split; the folder gets the shapes of the other one."""
     dataset = KeypointNet(root)
     objects = dataset.subset(categories=options.categories, split=options.split)
@@ -256,11 +327,11 @@ def simulated_videos(root: Path, options: TracksOptions, folder: RunFolder) -> P
             has = np.isin(known.ids, shape.ids)
             tasks.append(SimulatedVideo(category, model.model_id, known.xyz[has], known.ids[has]))
     parts = [part for each in tasks for part in (each.model_id, each.xyz, each.ids)]
-    benchmark = _benchmark(learned, options)
-    return PlannedVideos(tasks, benchmark, fingerprint(learned.fingerprint(), *parts))
+    setting = TrackVideos(learned.shape, options, has_yaw=False)
+    return tasks, _benchmark(setting), fingerprint(learned.fingerprint(), *parts)
 
 
-def recorded_videos(root: Path, options: TracksOptions, folder: RunFolder) -> PlannedVideos:
+def recorded_videos(root: Path, options: TracksOptions, folder: RunFolder) -> Videos:
     """The tracks of a folder of KITTI's cars."""
     tracks: dict[tuple[int, int], list[KeypointFrame]] = defaultdict(list)
     for each in list_tracks(root / TRACKS):
@@ -272,11 +343,11 @@ def recorded_videos(root: Path, options: TracksOptions, folder: RunFolder) -> Pl
         RecordedVideo("Car", f"{sequence:04d}/{track}", tuple(frames))
         for (sequence, track), frames in list(tracks.items())[: options.max_models]
     ]
-    _car_shape(root)  # or it is said here that there is none
-    benchmark = _benchmark(CarShape(root), options)
-    return PlannedVideos(tasks, benchmark, fingerprint(read_bytes(root / TRACKS)))
+    car_shape_of(root, "Car")  # or it is said here that there is none
+    setting = TrackVideos(partial(car_shape_of, root), options, has_yaw=True)
+    return tasks, _benchmark(setting), fingerprint(read_bytes(root / TRACKS))
 
 
-def _benchmark(shapes: LearnedFiles | CarShape, options: TracksOptions) -> Benchmark:
-    setting = TrackVideos(shapes, options)
-    return Benchmark.chosen(setting, options.methods, OWN_METHODS, metrics=options.metrics)
+def _benchmark(setting: TrackVideos) -> Benchmark:
+    options = setting.options
+    return Benchmark.chosen(setting, options.methods, _METHODS, metrics=options.metrics)

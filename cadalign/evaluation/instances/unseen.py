@@ -1,49 +1,36 @@
-"""Unseen objects, which are no stretched copy of any model: tasks, errors and records."""
+"""Unseen objects, which are no stretched copy of any model: tasks, methods, errors and records."""
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets import KeypointNet
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import DataError, DegenerateError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
+from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting
-from cadalign.evaluation.experiments.unseen import COLUMNS, UnseenOptions
+from cadalign.evaluation.experiments.unseen import COLUMNS, METHODS, UnseenOptions
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
-from cadalign.evaluation.instances.instance import (
-    KEYPOINT_CAMERA,
-    KeypointTask,
-    example_view,
-)
-from cadalign.evaluation.instances.pictures import write_preview
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask, example_view
+from cadalign.evaluation.instances.pictures import keep_preview
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     AlignedShape,
-    Warp,
-    placed_in_model,
+    aligned_shape,
     record_of,
-    record_stem,
-    shape_of_result,
 )
 from cadalign.evaluation.instances.views import KeypointTasks
-from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.methods.unseen import (
-    OWN_METHODS,
-    ShapeEstimate,
-    UnseenInstance,
-    UnseenObject,
-)
+from cadalign.evaluation.methods.method import LIMIT, SHAPE, Method, MethodInput
+from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.folder import RunFolder
@@ -58,15 +45,14 @@ from cadalign.geometry.metrics import (
     translation_error_up_to_scale,
 )
 from cadalign.geometry.rotations import vector_from_rotation
-from cadalign.io.files import writing
 from cadalign.seeding import instance_rng
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.tails import probability_within
 
-logger = logging.getLogger("cadalign")
-
-# Smallest share of a covariance's largest eigenvalue that counts as variance.
-_NO_VARIANCE = 1e-12
+_LEAST_SIGMA = 0.5  # of retrieval [px]: keypoints without noise would leave no model any chance
+_SIMILAR = 0.02  # of retrieval: misfit of the best model, as a share of its extent
+_INLIER_BOUND = 3.5  # standard deviations
+_MISFIT_PX = 30.0  # a residual that another model of the category leaves
+_LEAST_SHARED = 6
 # Free of the size: log(y / x) and log(z / x).
 _RATIOS = np.array([[-1.0, 1.0, 0.0], [-1.0, 0.0, 1.0]])
 
@@ -95,6 +81,41 @@ class UnseenTasks(KeypointTasks):
         return fingerprint(*parts)
 
 
+@dataclass(frozen=True, eq=False)
+class UnseenObject:
+    """View of an object, whose scale is 1, and what was learned of its category from others."""
+
+    task: KeypointTask  # names and keypoints of the object
+    options: UnseenOptions
+    gt: Alignment  # the pose
+    rows: IntArray  # (n,), rows of the given keypoints among all of the object
+    points_2d: FloatArray  # (n, 2), the given keypoints [px], with noise and outliers
+    is_outlier: BoolArray  # (n,)
+    learned: LearnedFiles | None = None
+
+    @property
+    def xyz(self) -> FloatArray:
+        """All keypoints of the object, (k, 3) float."""
+        return self.task.hull.xyz
+
+    @property
+    def ids(self) -> IntArray:
+        """Semantic ids of the given keypoints, (n,) int."""
+        return self.task.ids[self.rows]
+
+    @property
+    def shape(self) -> ShapeModel:
+        """The shape model of the category."""
+        assert self.learned is not None
+        return self.learned.shape(self.task.category)
+
+    def view_of(self, model: Model | ShapeModel) -> View:
+        """Those given keypoints that a model has."""
+        shared = np.isin(self.ids, np.array(model.ids, dtype=np.int64))
+        ids, pixels = self.ids[shared].tolist(), self.points_2d[shared]
+        return View(KEYPOINT_CAMERA, pixels, ids=ids, sigma=self.options.sigma)
+
+
 def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
     """Draw a view of an object, the keypoints that are given, their noise and outliers.
 
@@ -107,48 +128,127 @@ def observe_object(task: KeypointTask, options: UnseenOptions) -> UnseenObject:
     names = (task.category, task.model_id, str(task.view))
     xyz = task.hull.xyz
     count = len(xyz)
-    gt, _ = sample_hull_view(
-        task.hull, KEYPOINT_CAMERA, rng=instance_rng(options.seed, *names), min_visible=0
-    )
+    rng = instance_rng(options.seed, *names)
+    gt, _ = sample_hull_view(task.hull, KEYPOINT_CAMERA, rng=rng, min_visible=0)
     rng = instance_rng(options.seed, *names, "keypoints")
     order, noise = rng.permutation(count), rng.standard_normal((count, 2))
     elsewhere = rng.uniform(0, (KEYPOINT_CAMERA.width, KEYPOINT_CAMERA.height), (count, 2))
     given = order[: options.keypoints]
     rows = np.sort(given)
     is_outlier = np.isin(rows, given[: round(options.outliers * len(given))])
-    clean = KEYPOINT_CAMERA.project(gt.apply(xyz[rows]))
-    points = clean + options.noise_px * noise[rows]
+    points = KEYPOINT_CAMERA.project(gt.apply(xyz[rows])) + options.noise_px * noise[rows]
     points[is_outlier] = elsewhere[rows][is_outlier]
-    return UnseenObject(task, gt, rows, points, is_outlier)
+    return UnseenObject(task, options, gt, rows, points, is_outlier)
 
 
-def probability_level(
-    error: FloatArray, covariance: FloatArray, degrees_of_freedom: float | None = None
-) -> float | None:
-    """Probability of the smallest ellipsoid about the estimate that holds the truth.
+# Methods ------------------------------------------------------------------------------------------
 
-    ``error`` (k,) is estimate minus truth, ``covariance`` (k, k) as the estimator states it, where
-    directions without variance are held to be known; with ``degrees_of_freedom`` errors follow a t
-    distribution, without a Gaussian. The level is uniform over [0, 1] where the covariance is that
-    of the errors, 1 if the error has a part in a direction without variance, and None if there is
-    no variance at all.
 
-    Examples
-    --------
-    >>> round(probability_level(np.array([1.0]), np.array([[1.0]])), 4)
-    0.6827
-    >>> probability_level(np.zeros(2), np.zeros((2, 2))) is None
-    True
-    """
-    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
-    free = values > _NO_VARIANCE * max(float(values[-1]), 0.0)
-    if not np.isfinite(values).all() or not free.any():
-        return None
-    parts = vectors.T @ error
-    if (parts[~free] ** 2 > 1e-6 * values[-1]).any():
-        return 1.0
-    square = float((parts[free] ** 2 / values[free]).sum())
-    return float(probability_within(square, int(free.sum()), degrees_of_freedom))
+@dataclass(frozen=True, eq=False)
+class ShapeEstimate:
+    """Pose and shape of an object as a method found them."""
+
+    alignment: Alignment
+    bounds: FloatArray  # (2, 3), least and greatest coordinates before the stretch
+    ids: IntArray  # (m,)
+    points_3d: FloatArray  # (m, 3), keypoints before the stretch
+    result: Result | None = None  # with the covariances; None for methods that have none
+
+    @classmethod
+    def of(cls, result: Result) -> ShapeEstimate:
+        """The estimate of a result, whose keypoints have semantic ids."""
+        ids = np.array(result.ids, dtype=np.int64)
+        return cls(result.alignment, result.bounds, ids, result.points_3d, result)
+
+
+def _of_shape(seen: UnseenObject) -> ShapeEstimate:
+    return _aligned(seen.shape, seen)
+
+
+def _of_own_model(seen: UnseenObject) -> ShapeEstimate:
+    return _aligned(Model(points_3d=seen.xyz, ids=seen.task.ids.tolist()), seen)
+
+
+def _of_mean(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
+    points, ids = seen.shape.mean, seen.shape.ids
+    model = Model(points_3d=points[:-2], ids=ids, bounds=points[-2:], stretch=stretch)
+    return _aligned(model, seen, misfit_px=_MISFIT_PX)
+
+
+def _of_random_model(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
+    """The estimate of a random model, among those that share enough keypoints with the image."""
+    assert seen.learned is not None
+    library, task = seen.learned.opened_library(), seen.task
+    keys = [key for key in library.keys if key[0] == task.category]
+    names = (task.category, task.model_id, str(task.view), "another model")
+    least = min(_LEAST_SHARED, len(seen.ids))
+    for place in instance_rng(seen.options.seed, *names).permutation(len(keys)).tolist():
+        other = library[keys[place]]
+        if np.isin(seen.ids, other.ids).sum() >= least:
+            ids = other.ids.tolist()
+            model = Model(points_3d=other.xyz, ids=ids, bounds=other.bounds, stretch=stretch)
+            return _aligned(model, seen, misfit_px=_MISFIT_PX)
+    raise DegenerateError(f"no other model has {least} of the keypoints", where="keypoints")
+
+
+def _aligned(
+    model: Model | ShapeModel, seen: UnseenObject, *, misfit_px: float = 0.0
+) -> ShapeEstimate:
+    """Align a model with those given keypoints that it has."""
+    bound = max(_INLIER_BOUND * seen.options.sigma, misfit_px)
+    ransac = RansacOptions(max_reproj_error=bound) if seen.options.outliers else None
+    return ShapeEstimate.of(align(model, seen.view_of(model), ransac=ransac))
+
+
+def _nearest(seen: UnseenObject) -> ShapeEstimate:
+    """The best match of the library."""
+    assert seen.learned is not None
+    library = seen.learned.opened_library()
+    first = library.retrieve(
+        seen.points_2d,
+        seen.ids,
+        KEYPOINT_CAMERA,
+        top=1,
+        category=seen.task.category,
+        sigma=max(seen.options.noise_px, _LEAST_SIGMA),
+        shape_sigma=_SIMILAR,
+        loss="cauchy" if seen.options.outliers else "linear",
+        workers=1,
+    )[0]
+    model = library[first.category, first.model_id]
+    return ShapeEstimate(first.alignment, first.bounds, model.ids, model.xyz)
+
+
+def _bound(seen: UnseenObject) -> ShapeEstimate:
+    """The ideal estimate with the object's own model from the keypoints that are no outliers."""
+    kept = ~seen.is_outlier
+    points, pixels = seen.xyz[seen.rows[kept]], seen.points_2d[kept]
+    alignment = limit_estimate(points, pixels, KEYPOINT_CAMERA, seen.gt)
+    return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
+
+
+_SOLVERS = {
+    "random-rigid": partial(_of_random_model, stretch="none"),
+    "random-stretched": partial(_of_random_model, stretch=None),
+    "nearest": _nearest,
+    "mean-rigid": partial(_of_mean, stretch="none"),
+    "mean-stretched": partial(_of_mean, stretch=None),
+    SHAPE: _of_shape,
+    "exact": _of_own_model,
+    LIMIT: _bound,
+}
+
+
+def unseen_benchmark(
+    learned: LearnedFiles, options: UnseenOptions, previews: RunFolder | None = None
+) -> Benchmark:
+    """The methods of the options on unseen objects."""
+    own = {name: Method(name, _SOLVERS[name]) for name in METHODS}
+    setting = UnseenObjects(learned, options, previews)
+    return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
+
+
+# Errors -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -167,7 +267,7 @@ class UnseenObjects(Setting):
         """Compile the kernels."""
         (points, pixels, pose), ids = example_view(), np.arange(9)
         task = KeypointTask("", "", hull=KeypointHull(points), ids=ids)
-        seen = UnseenObject(task, pose, ids, pixels, np.zeros(9, dtype=bool))
+        seen = UnseenObject(task, self.options, pose, ids, pixels, np.zeros(9, dtype=bool))
         view = View(KEYPOINT_CAMERA, pixels)
         for model in (Model(points_3d=points), ShapeModel.from_basis(points, [points], [0.1])):
             _coverage(align(model, view), seen, ids, ids)
@@ -178,78 +278,86 @@ class UnseenObjects(Setting):
     def case(self, task: KeypointTask) -> Case:
         seen = observe_object(task, self.options)
         facts = {"keypoints": len(seen.points_2d)}
-        o = self.options
-        own = UnseenInstance(seen, self.learned, o.seed, o.noise_px, o.sigma, o.outliers)
-        return Case(task.names, facts, own)
+        return Case(task.names, facts, replace(seen, learned=self.learned))
 
-    def given(self, instance: UnseenInstance) -> MethodInput:
-        shape, seen = instance.shape, instance.seen
+    def given(self, seen: UnseenObject) -> MethodInput:
+        shape = seen.shape
         known = np.isin(seen.ids, shape.ids)
-        rows = shape.rows(seen.ids[known].tolist())
+        points = shape.mean[shape.rows(seen.ids[known].tolist())]
         return MethodInput(
-            shape.mean[rows],
+            points,
             seen.points_2d[known],
             KEYPOINT_CAMERA,
-            instance.sigma,
+            self.options.sigma,
             bounds=shape.mean[-2:],
             gt=seen.gt,
-            make_views=lambda: (shape, [instance.view_of(shape)]),
+            make_views=lambda: (shape, [seen.view_of(shape)]),
         )
 
     def answered(
-        self, method: Method, instance: UnseenInstance, answer: Alignment | Result
+        self, method: Method, seen: UnseenObject, answer: Alignment | Result
     ) -> ShapeEstimate:
-        shape = instance.shape
-        ids = np.array(shape.ids, dtype=np.int64)
+        shape = seen.shape
         if isinstance(answer, Result) and tuple(answer.ids) == tuple(shape.ids):
-            return ShapeEstimate(answer.alignment, answer.bounds, ids, answer.points_3d, answer)
+            return ShapeEstimate.of(answer)
         found = answer if isinstance(answer, Alignment) else answer.alignment
+        ids = np.array(shape.ids, dtype=np.int64)
         return ShapeEstimate(found, shape.mean[-2:], ids, shape.mean[:-2])
 
-    def row(self, method: Method, instance: UnseenInstance, estimate: ShapeEstimate) -> Row:
-        return _errors(estimate, instance.seen)
+    def row(self, method: Method, seen: UnseenObject, estimate: ShapeEstimate) -> Row:
+        return _errors(estimate, seen)
 
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row]:
-        instance: UnseenInstance = case.instance
-        if self.previews is not None and instance.seen.task.view == 0:
-            keep_preview(self.previews, self.options.root, instance.seen.task)
-        return outcomes, _record(instance, outcomes, estimates)
-
-
-def unseen_benchmark(
-    learned: LearnedFiles, options: UnseenOptions, previews: RunFolder | None = None
-) -> Benchmark:
-    """The methods of the options on unseen objects."""
-    setting = UnseenObjects(learned, options, previews)
-    return Benchmark.chosen(setting, options.methods, OWN_METHODS, metrics=options.metrics)
+        """Keep the preview of the object's mesh; its record has the box of its keypoints."""
+        seen: UnseenObject = case.instance
+        if self.previews is not None and seen.task.view == 0:
+            keep_preview(self.previews, self.options.root, seen.task)
+        record = record_of(
+            outcomes,
+            [e if isinstance(e, Exception) else _described(e, seen) for e in estimates],
+            camera=KEYPOINT_CAMERA,
+            gt=seen.gt,
+            bounds=seen.task.hull.bounds,
+            points_3d=seen.xyz[seen.rows],
+            points_2d=seen.points_2d,
+            ids=seen.ids,
+        )
+        return outcomes, record
 
 
 def _errors(found: ShapeEstimate, seen: UnseenObject) -> Row:
     est, gt = found.alignment, seen.gt
+    others = () if found.result is None else found.result.alternatives
+    poses = [est, *(other.alignment for other in others)]
     known, rows = _shared(found, seen)
     own = found.points_3d[rows]
     box = Box.from_model([own.min(axis=0), own.max(axis=0)], est)
-    gt_box = Box.from_model(seen.task.hull.bounds, gt)
-    boxes = {"est": box, "gt": gt_box}
+    stated, gt_box = Box.from_model(found.bounds, est), Box.from_model(seen.task.hull.bounds, gt)
     centre = Alignment(est.rotation, box.center, np.ones(3))
     gt_centre = Alignment(gt.rotation, gt_box.center, np.ones(3))
     values: Row = {
         "rotation_error_deg": rotation_error(est=est, gt=gt),
-        "best_rotation_error_deg": min(rotation_error(est=one, gt=gt) for one in found.poses),
+        "best_rotation_error_deg": min(rotation_error(est=one, gt=gt) for one in poses),
         "translation_error": translation_error(est=centre, gt=gt_centre),
         "translation_error_up_to_scale": translation_error_up_to_scale(est=centre, gt=gt_centre),
-        "box_iou": overlap(**boxes),
-        "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
-        "stated_box_iou_up_to_scale": overlap_up_to_scale(
-            est=Box.from_model(found.bounds, est), gt=gt_box
-        ),
+        "box_iou": overlap(est=box, gt=gt_box),
+        "box_iou_up_to_scale": overlap_up_to_scale(est=box, gt=gt_box),
+        "stated_box_iou_up_to_scale": overlap_up_to_scale(est=stated, gt=gt_box),
         "keypoint_error": _distance_up_to_scale(est.apply(own), gt.apply(seen.xyz[known])),
     }
     if found.result is not None:
         values |= _coverage(found.result, seen, known, rows)
     return values
+
+
+def _shared(found: ShapeEstimate, seen: UnseenObject) -> tuple[IntArray, IntArray]:
+    """Rows of the object's keypoints that an estimate has, and their rows in it."""
+    row_of = {name: row for row, name in enumerate(found.ids.tolist())}
+    ids = seen.task.ids.tolist()
+    known = np.flatnonzero([name in row_of for name in ids])
+    return known, np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
 
 
 def _distance_up_to_scale(est: FloatArray, gt: FloatArray) -> float:
@@ -276,92 +384,38 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
         spread = _RATIOS @ covariance[6:, 6:] @ _RATIOS.T
         level = probability_level(ratios, spread, freedom)
     gaps = result.points_3d[rows] * est.scale - seen.xyz[known]
-    levels = [
-        found
-        for gap, own in zip(gaps, of_points[rows], strict=True)
-        if (found := probability_level(gap, own, freedom)) is not None
-    ]
+    found = map(partial(probability_level, degrees_of_freedom=freedom), gaps, of_points[rows])
+    levels = np.array([each for each in found if each is not None])
+    within_68, within_95 = (
+        float((levels <= nominal).mean()) if len(levels) else None for nominal in (0.68, 0.95)
+    )
     return {
         "rotation_level": probability_level(turn, covariance[:3, :3], freedom),
         "stretch_level": level,
-        "keypoints_within_68": _share(levels, 0.68),
-        "keypoints_within_95": _share(levels, 0.95),
+        "keypoints_within_68": within_68,
+        "keypoints_within_95": within_95,
     }
 
 
-def _share(levels: Sequence[float], nominal: float) -> float | None:
-    """Share of the levels that are at most the nominal one; None of none."""
-    return float((np.array(levels) <= nominal).mean()) if levels else None
+# Records ------------------------------------------------------------------------------------------
 
 
-def keep_preview(folder: RunFolder, root: Path, task: KeypointTask) -> None:
-    """Write the preview of an object's mesh to a run's folder; nothing without a readable mesh."""
-    model = _dataset(root)[task.category, task.model_id]
-    if model.mesh_path is None:
-        return
-    try:
-        mesh = model.load_mesh()
-    except DataError as error:
-        logger.warning("no preview of the mesh: %s", error)
-        return
-    with writing(folder.previews):
-        folder.previews.mkdir(exist_ok=True)
-    write_preview(folder.previews / f"{record_stem(task.category, task.model_id)}.json", mesh)
-
-
-_dataset = lru_cache(maxsize=1)(KeypointNet)
-
-
-def _record(
-    instance: UnseenInstance,
-    outcomes: Sequence[Outcome],
-    estimates: Sequence[ShapeEstimate | CadalignError],
-) -> Row:
-    """The record of a view of an object, whose box is that of its keypoints."""
-    seen, sigma = instance.seen, instance.sigma
-    return record_of(
-        camera=KEYPOINT_CAMERA,
-        gt=seen.gt,
-        stretch=1 / seen.gt.scale,
-        bounds=seen.task.hull.bounds,
-        points_3d=seen.xyz[seen.rows],
-        points_2d=seen.points_2d,
-        ids=seen.ids,
-        outcomes=outcomes,
-        estimates=[
-            each if isinstance(each, CadalignError) else _aligned(each, seen, sigma)
-            for each in estimates
-        ],
-    )
-
-
-def _shared(found: ShapeEstimate, seen: UnseenObject) -> tuple[IntArray, IntArray]:
-    """Rows of the object's keypoints that an estimate has, and their rows in it."""
-    row_of = {name: row for row, name in enumerate(found.ids.tolist())}
-    ids = seen.task.ids.tolist()
-    known = np.flatnonzero([name in row_of for name in ids])
-    return known, np.array([row_of[ids[place]] for place in known.tolist()], dtype=np.int64)
-
-
-def _aligned(found: ShapeEstimate, seen: UnseenObject, sigma: float) -> AlignedShape:
+def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
     """An estimate in terms of the object, of which it has some keypoints."""
     known, rows = _shared(found, seen)
-    how: dict[str, Any] = {"model_bounds": seen.task.hull.bounds, "spans_points": True}
-    source = seen.xyz[known]
-    alignment, warp = placed_in_model(found, rows, source, **how)
-    rms = _rms(alignment, warp, seen, known)
-    if found.result is None:
-        return AlignedShape(alignment, warp, rms, sigma)
-    return shape_of_result(found.result, rows, source, rms=rms, sigma=sigma, **how)
-
-
-def _rms(alignment: Alignment, warp: Warp, seen: UnseenObject, known: IntArray) -> float:
-    """Root mean square residual [px] of the given keypoints that the method has."""
+    shape = aligned_shape(
+        found if found.result is None else found.result,
+        rows,
+        seen.xyz[known],
+        model_bounds=seen.task.hull.bounds,
+        spans_points=True,
+        sigma=seen.options.sigma,
+    )
+    # The residuals are those of the given keypoints that the method has, before the camera.
     given = np.isin(seen.rows, known)
-    places = warp.target[np.searchsorted(known, seen.rows[given])]
-    in_camera = alignment.apply(places)
+    in_camera = shape.alignment.apply(shape.target[np.searchsorted(known, seen.rows[given])])
     ahead = in_camera[:, 2] > 0
     if not ahead.any():
-        return float("nan")
+        return shape
     residuals = KEYPOINT_CAMERA.project(in_camera[ahead]) - seen.points_2d[given][ahead]
-    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    return replace(shape, rms=float(np.sqrt((residuals**2).sum(axis=1).mean())))

@@ -6,12 +6,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError, DataError
+from cadalign.estimation.view import View
 from cadalign.evaluation.benchmark import (
     VIEW_NAMES,
     Benchmark,
@@ -35,9 +36,9 @@ from cadalign.evaluation.instances.instance import (
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     AlignedShape,
-    align_instance,
+    aligned_shape,
     pose_of,
-    record_row,
+    record_of,
 )
 from cadalign.evaluation.methods.method import SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.errors import estimate_errors, overlap_up_to_scale
@@ -47,27 +48,24 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.evaluation.runs.work import fingerprint
 from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 
+if TYPE_CHECKING:
+    from cadalign.evaluation.experiments.evidence import EvidenceRunOptions
+    from cadalign.evaluation.experiments.unseen import UnseenOptions
 
-class TaskOptions(Protocol):
-    """Options that say which tasks there are."""
-
-    @property
-    def visibility(self) -> str: ...
-
-    @property
-    def views_per_model(self) -> int: ...
-
-    @property
-    def max_models(self) -> int | None: ...
+KeypointView = tuple[KeypointTask, Instance]
+"""A view of a model as an instance of the benchmark: its task, and what it shows."""
 
 
 class KeypointTasks(Tasks[KeypointTask]):
     """All views of all models of a dataset in the order of their names."""
 
-    def __init__(self, dataset: KeypointNet, options: TaskOptions) -> None:
+    def __init__(
+        self,
+        dataset: KeypointNet,
+        options: KeypointNetOptions | EvidenceRunOptions | UnseenOptions,
+    ) -> None:
         self.dataset, self._visibility = dataset, options.visibility
         self._views = options.views_per_model
         self.keys = [
@@ -107,16 +105,6 @@ class KeypointTasks(Tasks[KeypointTask]):
         return fingerprint(*parts)
 
 
-@dataclass(frozen=True, eq=False)
-class KeypointView:
-    """A view of a model as an instance: its task, what it shows, and the shapes that are known."""
-
-    task: KeypointTask
-    instance: Instance
-    sigma: float
-    shapes: ShapeFiles
-
-
 @dataclass(frozen=True)
 class KeypointViews(Setting):
     """Views of annotated models: the setting of the KeypointNet experiment.
@@ -151,9 +139,16 @@ class KeypointViews(Setting):
             (case,) = self.failed(task)
             if isinstance(instance, Exception):
                 found.append(replace(case, error=instance, seconds=share))
-            else:
-                view = KeypointView(task, instance, self.options.sigma, self.shapes)
-                found.append(Case(case.names, _facts(task, instance), view, without=case.without))
+                continue
+            _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
+            facts = {
+                "visibility": instance.visibility,
+                "keypoints": len(instance.points_3d),
+                "stretch_y": stretch_y,
+                "stretch_z": stretch_z,
+                "symmetry": str(task.symmetry),
+            }
+            found.append(replace(case, facts=facts, instance=(task, instance)))
         return found
 
     def failed(self, task: KeypointTask) -> list[Case]:
@@ -177,46 +172,38 @@ class KeypointViews(Setting):
         return instances
 
     def given(self, view: KeypointView) -> MethodInput:
-        found = view.instance
-        return MethodInput(
-            found.points_3d,
-            found.points_2d,
-            found.camera,
-            view.sigma,
-            bounds=found.bounds,
-            gt=found.gt,
-        )
+        _, found = view
+        keypoints = found.points_3d, found.points_2d, found.camera
+        return MethodInput(*keypoints, self.options.sigma, bounds=found.bounds, gt=found.gt)
 
     def measure(self, method: Method, pairs: Sequence[Pair]) -> list[Row | Exception]:
-        rows: list[Row | Exception] = [
-            *estimate_errors(
-                [pose_of(estimate) for _, estimate in pairs],
-                [view.instance for view, _ in pairs],
-                [view.task.symmetry for view, _ in pairs],
-            )
-        ]
-        for (view, estimate), row in zip(pairs, rows, strict=True):
+        poses = [pose_of(estimate) for _, estimate in pairs]
+        tasks, instances = zip(*(view for view, _ in pairs), strict=True)
+        symmetries = [task.symmetry for task in tasks]
+        rows: list[Row | Exception] = [*estimate_errors(poses, instances, symmetries)]
+        for (_, estimate), instance, pose, row in zip(pairs, instances, poses, rows, strict=True):
             if isinstance(row, Exception):
                 continue
             if isinstance(estimate, AlignedShape):
                 row["rms_px"] = estimate.rms
             if self.shapes.paths:  # it takes longer than most methods
-                box = Box.from_model(view.instance.bounds, pose_of(estimate))
-                overlap = overlap_up_to_scale(est=box, gt=view.instance.gt_box)
-                row[BOX_IOU_UP_TO_SCALE.key] = overlap
+                box = Box.from_model(instance.bounds, pose)
+                row[BOX_IOU_UP_TO_SCALE.key] = overlap_up_to_scale(est=box, gt=instance.gt_box)
         return rows
 
     def finish(
         self, case: Case, outcomes: list[Outcome], estimates: list[Any]
     ) -> tuple[list[Outcome], Row | None]:
-        view: KeypointView = case.instance
+        _, instance = case.instance
         first = outcomes[0]
-        if self.drawn_in is not None and first.is_ok:
-            problem = attempt(_draw, self.drawn_in, view, pose_of(estimates[0]))
+        if self.drawn_in is not None and first.is_ok and instance.scene is not None:
+            problem = attempt(_draw, self.drawn_in, case.instance, pose_of(estimates[0]))
             if problem is not None:
                 failed = replace(first, status=FAILED, reason=reason_of(problem), values=case.facts)
                 outcomes = [failed, *outcomes[1:]]
-        return outcomes, record_row(view.instance, outcomes, estimates)
+        names = ("camera", "gt", "bounds", "points_3d", "points_2d", "ids")
+        parts = {name: getattr(instance, name) for name in names}
+        return outcomes, record_of(outcomes, estimates, **parts)
 
 
 def keypointnet_benchmark(
@@ -226,26 +213,42 @@ def keypointnet_benchmark(
     setting = KeypointViews(options, drawn_in, shapes)
     found = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
     batched = frozenset(each.name for each in found.methods if not each.has_statistics)
-    of_shapes = (Method(SHAPE, _aligned),) if shapes.paths else ()
+    aligned = partial(_aligned, shapes=shapes, sigma=options.sigma)
+    of_shapes = (Method(SHAPE, aligned),) if shapes.paths else ()
     return replace(found, batched=batched, methods=(*found.methods, *of_shapes))
 
 
-def _aligned(view: KeypointView) -> AlignedShape:
-    """The estimate from the learned shape of the model's category."""
-    task = view.task
-    shape = view.shapes.shape(task.category)
+def _aligned(view: KeypointView, *, shapes: ShapeFiles, sigma: float) -> AlignedShape:
+    """The estimate from the learned shape of the model's category, of the keypoints that it has."""
+    # Only here: its kernels take time to import, and most runs do without.
+    from cadalign.estimation.align import align
+
+    task, instance = view
+    shape = shapes.shape(task.category)
     assert shape is not None
-    own = task.ids, task.hull.xyz
-    return align_instance(shape, view.instance, *own, sigma=view.sigma)
+    known = np.isin(instance.ids, shape.ids)
+    ids, pixels = instance.ids[known].tolist(), instance.points_2d[known]
+    result = align(shape, View(instance.camera, pixels, ids=ids, sigma=sigma))
+    shared = np.isin(task.ids, shape.ids)
+    rows = shape.rows(task.ids[shared].tolist())
+    return aligned_shape(
+        result,
+        rows,
+        task.hull.xyz[shared] / instance.gt.scale,
+        # Outliers included, as of the other methods.
+        rms=float(np.sqrt((result.residuals**2).sum(axis=1).mean())),
+        sigma=sigma,
+        model_bounds=instance.bounds,
+        spans_points=instance.scene is None and len(rows) > 0,
+    )
 
 
-def _draw(folder: RunFolder, view: KeypointView, estimate: Alignment) -> None:
+def _draw(folder: RunFolder, view: KeypointView, estimate: Any) -> None:
     # Only here: runs on annotations alone are not to load the renderer.
     from cadalign.evaluation.instances.pictures import draw_instance
 
-    if view.instance.scene is not None:
-        names = (view.task.category, view.task.model_id, view.task.view)
-        write_picture(draw_instance, folder, view.instance, estimate, *names)
+    task, instance = view
+    write_picture(draw_instance, folder, instance, estimate, *task.names.values())
 
 
 # Views of one model come one after another.
@@ -256,15 +259,3 @@ def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
     """The instance of a model with a mesh."""
     assert task.model is not None
     return make_instance(task.model, scene=_scene_of(task.model), view_index=task.view, **how)
-
-
-def _facts(task: KeypointTask, instance: Instance) -> Row:
-    """Columns that do not depend on the estimate."""
-    _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
-    return {
-        "visibility": instance.visibility,
-        "keypoints": len(instance.points_3d),
-        "stretch_y": stretch_y,
-        "stretch_z": stretch_z,
-        "symmetry": str(task.symmetry),
-    }

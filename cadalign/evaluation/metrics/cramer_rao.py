@@ -1,4 +1,4 @@
-"""Cramer-Rao bound: the least covariance of an unbiased estimate, for a known true alignment."""
+"""Cramer-Rao bound, the least covariance of an unbiased estimate, and levels of stated ones."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.shapes.tails import probability_within
 from cadalign.solvers.alignment import covariance_of, keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.evidence import LogFocalPrior
@@ -21,6 +22,8 @@ from cadalign.solvers.projection import projection_jacobian
 
 _LEAST_INFORMATION = 1e-12
 _LARGEST_LOG = 50.0
+# Smallest share of a covariance's largest eigenvalue that counts as variance.
+_NO_VARIANCE = 1e-12
 _FOCAL = 9  # row of the focal length
 _OF_STRETCHED = [0, 1, 2, 3, 4, 5, 7, 8]  # unknowns where x has the scale 1
 
@@ -106,3 +109,32 @@ def limit_estimate(
         gt.translation + step[3:6],
         gt.scale * np.append(1.0, factors),
     )
+
+
+def probability_level(
+    error: FloatArray, covariance: FloatArray, degrees_of_freedom: float | None = None
+) -> float | None:
+    """Probability of the smallest ellipsoid about the estimate that holds the truth.
+
+    ``error`` (k,) is estimate minus truth, ``covariance`` (k, k) as the estimator states it, where
+    directions without variance are held to be known; with ``degrees_of_freedom`` errors follow a t
+    distribution, without a Gaussian. The level is uniform over [0, 1] where the covariance is that
+    of the errors, 1 if the error has a part in a direction without variance, and None if there is
+    no variance at all.
+
+    Examples
+    --------
+    >>> round(probability_level(np.array([1.0]), np.array([[1.0]])), 4)
+    0.6827
+    >>> probability_level(np.zeros(2), np.zeros((2, 2))) is None
+    True
+    """
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    free = values > _NO_VARIANCE * max(float(values[-1]), 0.0)
+    if not np.isfinite(values).all() or not free.any():
+        return None
+    parts = vectors.T @ error
+    if (parts[~free] ** 2 > 1e-6 * values[-1]).any():
+        return 1.0
+    square = float((parts[free] ** 2 / values[free]).sum())
+    return float(probability_within(square, int(free.sum()), degrees_of_freedom))

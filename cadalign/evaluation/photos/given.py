@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -23,9 +23,9 @@ from cadalign.evaluation.metrics.bop import mssd
 from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import LeftOutError, Outcome
 from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
-from cadalign.evaluation.photos.objects import draw_sighting, sighting_record, targets_of
-from cadalign.evaluation.photos.protocols import Protocol, protocol_of
-from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened
+from cadalign.evaluation.photos.objects import draw_sighting, sighting_record
+from cadalign.evaluation.photos.protocols import protocol_of
+from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.summary import Summary
@@ -43,9 +43,7 @@ class GivenPoses:
     """An object of a photo, and each method's pose of it, or why it has none."""
 
     target: PhotoTarget
-    protocol: Protocol
     poses: tuple[PoseEstimate | CadalignError | None, ...]
-    is_shown: bool = False
 
 
 @dataclass(frozen=True)
@@ -55,11 +53,13 @@ class PosesOfObjects(Setting):
     names = VIEW_NAMES
     columns = COLUMNS
 
+    kind: str  # of the data set
+
     def case(self, task: GivenPoses) -> Case:
         return Case(task.target.names, _FACTS, task)
 
     def row(self, method: Method, instance: GivenPoses, estimate: PhotoEstimate) -> Row:
-        sets = instance.protocol.metrics
+        sets = protocol_of(self.kind).metrics
         return score_alignment(instance.target, sets, estimate.alignment, estimate.box)
 
 
@@ -76,7 +76,7 @@ class PosesOfFiles(PosesOfObjects):
         return [Case(task.names, _FACTS)]
 
     def _cases(self, task: PhotoTask) -> list[Case]:
-        found = targets_of(task, self.options.root)
+        found = targets_of(task, self.options.root, pictures=self.options.pictures)
         targets = [each for each in found if isinstance(each, PhotoTarget)]
         files = [self._poses(path, targets) for path in self.options.estimates if targets]
         cases = []
@@ -88,9 +88,7 @@ class PosesOfFiles(PosesOfObjects):
                 some if isinstance(some, CadalignError) else some.get(each.found.object_id)
                 for some in files
             )
-            protocol = protocol_of(opened(self.options.root).kind)
-            shown = task.index < self.options.pictures
-            cases.append(self.case(GivenPoses(each, protocol, poses, shown)))
+            cases.append(self.case(GivenPoses(each, poses)))
         return cases
 
     def _poses(
@@ -111,20 +109,29 @@ class PosesOfFiles(PosesOfObjects):
             replace(outcome, seconds=pose.seconds if isinstance(pose, PoseEstimate) else None)
             for outcome, pose in zip(outcomes, instance.poses, strict=True)
         ]
-        sighting = _sighting(instance.target)
+        sighting = self._sighting(instance.target)
         if sighting is None or not any(outcome.is_ok for outcome in outcomes):
             return outcomes, None
-        if instance.is_shown:
+        if instance.target.is_shown:
             best = next(each for each in estimates if isinstance(each, PhotoEstimate))
             write_picture(draw_sighting, self.drawn_in, sighting, best)
         return outcomes, sighting_record(sighting, outcomes, estimates)
 
+    def _sighting(self, target: PhotoTarget) -> Sighting | None:
+        """The object without keypoints, for picture and record; None without a camera."""
+        camera, bounds = target.camera, target.bounds
+        if camera is None or bounds is None or not camera.focal_known:
+            return None
+        nothing, none = NamedPoints((), np.empty((0, 3))), np.empty((0, 2))
+        protocol = protocol_of(self.kind)
+        return Sighting(target, camera, "", (), none, 1.0, nothing, bounds, 1.0, protocol)
+
 
 def estimates_benchmark(
-    options: EstimatesOptions, names: Sequence[str], drawn_in: RunFolder
+    kind: str, options: EstimatesOptions, names: Sequence[str], drawn_in: RunFolder
 ) -> Benchmark:
-    """Files of estimates, by these names, on the objects of photos."""
-    return Benchmark(PosesOfFiles(options, drawn_in), _methods(names))
+    """Files of estimates, by these names, on the objects of photos of a data set of a kind."""
+    return Benchmark(PosesOfFiles(kind, options, drawn_in), _methods(names))
 
 
 def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -> list[Row]:
@@ -159,20 +166,21 @@ def score_poses(dataset: PhotoDataset, poses: Poses, *, method: str = "given") -
     >>> score_poses(dataset, truth)[0]["mssd"]  # doctest: +SKIP
     0.0
     """
-    protocol = protocol_of(dataset.kind)
     tasks, left = [], set(poses)
-    for target in _targets(dataset):
-        photo, object_id = target.photo.name, target.found.object_id
-        est, model = poses.get((photo, object_id)), target.found.model
-        model_id = "" if model is None else model.model_id
-        pose = None if est is None else PoseEstimate("", photo, model_id, est, 1.0)
-        tasks.append(GivenPoses(target, protocol, (pose,)))
-        left.discard((photo, object_id))
+    for photo in dataset:
+        for found in photo.objects:
+            if found.truth.cam_from_model is None and found.truth.box is None:
+                continue
+            key = photo.name, found.object_id
+            left.discard(key)
+            est, model_id = poses.get(key), "" if found.model is None else found.model.model_id
+            pose = None if est is None else PoseEstimate("", photo.name, model_id, est, 1.0)
+            tasks.append(GivenPoses(PhotoTarget(photo, found, str(dataset.root)), (pose,)))
     if left:
-        photo, object_id = sorted(left)[0]
+        name, object_id = sorted(left)[0]
         what = f"the data set has no object {quote(object_id)} with a pose in the photo "
-        raise InputError(f"{what}{quote(photo)}", where="poses")
-    return Benchmark(PosesOfObjects(), _methods([method])).evaluate(tasks).rows
+        raise InputError(f"{what}{quote(name)}", where="poses")
+    return Benchmark(PosesOfObjects(dataset.kind), _methods([method])).evaluate(tasks).rows
 
 
 def summarize_rows(rows: list[Row]) -> list[Summary]:
@@ -180,13 +188,6 @@ def summarize_rows(rows: list[Row]) -> list[Summary]:
     names = (*(name for name, _ in COLUMNS), "seconds")
     cells = {name: np.array([row.get(name) for row in rows], dtype=object) for name in names}
     return summarize_cells(cells, list(dict.fromkeys(row["method"] for row in rows)))
-
-
-def _targets(dataset: PhotoDataset) -> Iterator[PhotoTarget]:
-    for photo in dataset:
-        for found in photo.objects:
-            if found.truth.cam_from_model is not None or found.truth.box is not None:
-                yield PhotoTarget(photo, found, str(dataset.root))
 
 
 def _methods(names: Sequence[str]) -> tuple[Method, ...]:
@@ -202,16 +203,6 @@ def _pose(instance: GivenPoses, *, index: int) -> PhotoEstimate:
     if not isinstance(pose, PoseEstimate):
         raise DegenerateError("there is no estimate") if pose is None else pose
     return PhotoEstimate(pose.cam_from_model, Box.from_model(bounds, pose.cam_from_model))
-
-
-def _sighting(target: PhotoTarget) -> Sighting | None:
-    """The object without keypoints, for its picture and its record; None without a camera."""
-    camera, bounds = target.camera, target.bounds
-    if camera is None or bounds is None or not camera.focal_known:
-        return None
-    nothing = NamedPoints((), np.empty((0, 3)))
-    no_pixels = np.empty((0, 2))
-    return Sighting(target, camera, "", (), no_pixels, 1.0, nothing, bounds, 1.0, "y")
 
 
 # Files --------------------------------------------------------------------------------------------

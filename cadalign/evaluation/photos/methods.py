@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import box_alignment
-from cadalign.evaluation.methods.method import SHAPE, Method, MethodInput
+from cadalign.evaluation.methods.method import SHAPE
 from cadalign.evaluation.outcome import LeftOutError
 from cadalign.evaluation.photos.protocols import (
     DEPTH,
@@ -46,9 +45,6 @@ from cadalign.render.viewpoints import visible_keypoints
 from cadalign.seeding import instance_rng
 from cadalign.shapes.model import ShapeModel
 
-# What methods are given ---------------------------------------------------------------------------
-
-
 ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
 _OUTLINED = frozenset({MASK, IMAGE})  # evidence about the model's outline, which wants a mesh
@@ -69,7 +65,7 @@ class Sighting:
     model: NamedPoints  # all keypoints of the model, in its own unit
     bounds: FloatArray  # (2, 3), the model's box, in its own unit
     width: float  # factor of the model's size that gives it the object's width
-    up_axis: str  # the model's upward axis
+    protocol: Protocol  # of the data set
 
     @property
     def points_3d(self) -> FloatArray:
@@ -112,7 +108,7 @@ def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> 
         model=model,
         bounds=bounds,
         width=float(gt.scale[0]) if gt is not None and has_stretch else 1.0,
-        up_axis=protocol.up_axis,
+        protocol=protocol,
     )
     return sighting if camera.focal_known else _calibrated(sighting)
 
@@ -212,61 +208,35 @@ class PhotoEstimate:
     result: Result | None = None  # with shape and covariances
 
 
-@dataclass(frozen=True, eq=False)
-class PhotoInstance:
-    """An object in a photo, with what methods are given of it."""
+def estimate_object(
+    sighting: Sighting, *, method: str, shapes: Collection[ShapeModel], similar_sigma: float
+) -> PhotoEstimate:
+    """The estimate of a method by name; see `cadalign.evaluation.photos.protocols`.
 
-    sighting: Sighting
-    protocol: Protocol  # of the data set
-    shapes: tuple[ShapeModel, ...]  # each for the category that it names
-    similar_sigma: float
-    """Standard deviation of the object's keypoints from the model's [diagonals of the model]."""
-    is_shown: bool  # its pictures are drawn
-
-
-def photo_method(name: str) -> Method:
-    """The method of a name; see `cadalign.evaluation.photos.protocols`."""
-    return Method(name, partial(estimate_object, name))
-
-
-def estimate_object(method: str, instance: PhotoInstance) -> PhotoEstimate:
-    """The estimate of a method.
-
-    Raises LeftOutError if the object lacks what the method needs; and CadalignError if there is no
+    ``shapes`` are models of the categories that they name, ``similar_sigma`` is the standard
+    deviation of the object's keypoints from the model's [diagonals of the model]. Raises
+    LeftOutError if the object lacks what the method needs; and CadalignError if there is no
     estimate.
     """
-    sighting = instance.sighting
     base, evidence = parts_of(method)
     if base == TRUTH:
-        return _truth(sighting)
+        gt, box = sighting.target.gt, sighting.target.gt_box
+        if gt is None or box is None:
+            raise LeftOutError("the true pose is not known")
+        return PhotoEstimate(gt, box)
     if base == EPNP:
         points = sighting.points_3d * sighting.width
         found = fit(points, sighting.points_2d, sighting.camera, method="epnp")
-        return _of_model(found.alignment, sighting)
+        return estimate_of_model(found.alignment, sighting)
     if base == SHAPE:
-        return _of_shape(sighting, instance.shapes, evidence)
-    model = _model(base, sighting, instance.similar_sigma, with_mesh=bool(_OUTLINED & evidence))
+        return _of_shape(sighting, shapes, evidence)
+    model = _model(base, sighting, similar_sigma, with_mesh=bool(_OUTLINED & evidence))
     result = align(model, _view(sighting, evidence))
-    return _of_model(result.alignment, sighting, result)
+    return estimate_of_model(result.alignment, sighting, result)
 
 
-def given_of(instance: PhotoInstance) -> MethodInput:
-    """An object as general methods are given it."""
-    sighting = instance.sighting
-    return MethodInput(
-        sighting.points_3d * sighting.width,
-        sighting.points_2d,
-        sighting.camera,
-        sighting.sigma,
-        bounds=sighting.bounds * sighting.width,
-        gt=sighting.target.gt,
-        make_views=lambda: _with_all_evidence(instance),
-    )
-
-
-def _with_all_evidence(instance: PhotoInstance) -> tuple[Model, list[View]]:
+def with_all_evidence(sighting: Sighting) -> tuple[Model, list[View]]:
     """The model to be stretched, and the view with all evidence that there is for it."""
-    sighting = instance.sighting
     target = sighting.target
     has_mesh = target.cad is not None and target.cad.has_mesh
     kinds = {
@@ -275,23 +245,8 @@ def _with_all_evidence(instance: PhotoInstance) -> tuple[Model, list[View]]:
         GRAVITY: target.photo.up is not None,
     }
     evidence = [kind for kind, is_there in kinds.items() if is_there]
-    model = _model(STRETCHED, sighting, instance.similar_sigma, with_mesh=has_mesh)
+    model = _model(STRETCHED, sighting, 0.0, with_mesh=has_mesh)
     return model, [_view(sighting, evidence)]
-
-
-def estimate_of_answer(answer: Alignment | Result, sighting: Sighting) -> PhotoEstimate:
-    """The estimate of an object by a general method's answer."""
-    if isinstance(answer, Alignment):
-        return _of_model(answer, sighting)
-    is_of_model = tuple(answer.ids) == tuple(sighting.model.names)
-    return _of_model(answer.alignment, sighting, answer if is_of_model else None)
-
-
-def _truth(sighting: Sighting) -> PhotoEstimate:
-    gt, box = sighting.target.gt, sighting.target.gt_box
-    if gt is None or box is None:
-        raise LeftOutError("the true pose is not known")
-    return PhotoEstimate(gt, box)
 
 
 def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
@@ -305,22 +260,19 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
     elif base == SIMILAR:
         diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
         kind = {"shape_sigma": similar_sigma * diagonal}
+    if with_mesh:
+        cad = sighting.target.cad
+        if cad is None or not cad.has_mesh:
+            raise LeftOutError("the model has no mesh for the mask")
+        mesh = cad.scene.mesh
+        kind["mesh"] = Mesh(mesh.vertices * width, mesh.faces)
     return Model(
         points_3d=sighting.model.xyz * width,
         ids=sighting.model.names,
         bounds=bounds,
-        mesh=_mesh(sighting) if with_mesh else None,
-        up_axis=sighting.up_axis,
+        up_axis=sighting.protocol.up_axis,
         **kind,
     )
-
-
-def _mesh(sighting: Sighting) -> Mesh:
-    cad = sighting.target.cad
-    if cad is None or not cad.has_mesh:
-        raise LeftOutError("the model has no mesh for the mask")
-    mesh = cad.scene.mesh
-    return Mesh(mesh.vertices * sighting.width, mesh.faces)
 
 
 def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(None)) -> View:
@@ -348,12 +300,13 @@ def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(No
     return View(sighting.camera, pixels, ids=names, sigma=sighting.sigma, **given)
 
 
-def _of_model(found: Alignment, sighting: Sighting, result: Result | None = None) -> PhotoEstimate:
+def estimate_of_model(
+    found: Alignment, sighting: Sighting, result: Result | None = None
+) -> PhotoEstimate:
     """The estimate of the data set's model, from that of the model with the object's width."""
     bounds = sighting.bounds * sighting.width if result is None else result.bounds
     box = Box.from_model(bounds, found)
-    scale = found.scale * sighting.width
-    alignment = Alignment(found.rotation, found.translation, scale)
+    alignment = Alignment(found.rotation, found.translation, found.scale * sighting.width)
     return PhotoEstimate(alignment, box, result)
 
 
@@ -373,20 +326,12 @@ def _of_shape(
         raise LeftOutError("the shape model has none of the keypoints")
     view = _view(sighting, evidence, rows=known)
     result = align(shape, view)
-    box = result.box
-    factor = 1.0 if shape.unit == "m" else _width_factor(sighting, box)
-    moved = _enlarged(result.alignment, factor)
+    factor = 1.0
+    if shape.unit != "m" and sighting.target.gt is not None:  # the object's width is known
+        wanted = float(np.ptp(sighting.bounds[:, 0])) * sighting.width
+        factor = wanted / float(result.box.extents[0])
+    # Scaled about the camera centre.
+    found, shift = result.alignment, result.alignment.translation * factor
+    moved = Alignment(found.rotation, shift, found.scale * factor)
     alignment = box_alignment(moved, result.bounds, model_bounds=sighting.bounds)
     return PhotoEstimate(alignment, Box.from_model(result.bounds, moved), result)
-
-
-def _width_factor(sighting: Sighting, box: Box) -> float:
-    """Factor that gives an estimated box the object's width, where that is known."""
-    wanted = float(np.ptp(sighting.bounds[:, 0])) * sighting.width
-    return wanted / float(box.extents[0]) if sighting.target.gt is not None else 1.0
-
-
-def _enlarged(alignment: Alignment, factor: float) -> Alignment:
-    """The alignment scaled about the camera centre."""
-    shift: FloatArray = alignment.translation * factor
-    return Alignment(alignment.rotation, shift, alignment.scale * factor)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import DataError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
@@ -30,24 +30,23 @@ from cadalign.evaluation.instances.pictures import write_preview, write_webp
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     Estimate,
+    aligned_shape,
     record_of,
     record_stem,
-    shape_of_result,
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.sets import score_alignment
 from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.photos.methods import (
     PhotoEstimate,
-    PhotoInstance,
     Sighting,
-    estimate_of_answer,
-    given_of,
-    photo_method,
+    estimate_object,
+    estimate_of_model,
     sight,
+    with_all_evidence,
 )
 from cadalign.evaluation.photos.protocols import TRUTH, is_own, protocol_of
-from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened
+from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
@@ -58,6 +57,8 @@ from cadalign.io.images import ByteImage, write_image
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.shapes.model import ShapeModel
+
+_NO_SOURCE: Row = {"source": ""}
 
 
 @dataclass(frozen=True)
@@ -80,38 +81,47 @@ class PhotoObjects(Setting):
         return ()
 
     def failed(self, task: PhotoTask) -> list[Case]:
-        return [Case(task.names, {"source": ""})]
+        return [Case(task.names, _NO_SOURCE)]
 
     def _cases(self, task: PhotoTask) -> list[Case]:
         wanted = self.options.categories
         found = []
-        for each in targets_of(task, self.options.root):
+        for each in targets_of(task, self.options.root, pictures=self.options.pictures):
             if isinstance(each, Case):
-                found.append(replace(each, facts={"source": ""}))
+                found.append(replace(each, facts=_NO_SOURCE))
             elif wanted is None or each.found.category in wanted:
-                found.append(self._case(each, shown=task.index < self.options.pictures))
+                found.append(self._case(each))
         return found
 
-    def _case(self, target: PhotoTarget, *, shown: bool) -> Case:
+    def _case(self, target: PhotoTarget) -> Case:
         protocol = protocol_of(opened(self.options.root).kind)
         sighting = attempt(sight, target, protocol, self.options)
         if isinstance(sighting, Exception):
-            return Case(target.names, {"source": ""}, error=sighting)
+            return Case(target.names, _NO_SOURCE, error=sighting)
         facts = {"keypoints": len(sighting.names), "source": sighting.source}
-        similar_sigma = self.options.similar_sigma
-        instance = PhotoInstance(sighting, protocol, self.shapes, similar_sigma, shown)
-        return Case(target.names, facts, instance)
+        return Case(target.names, facts, sighting)
 
-    def given(self, instance: PhotoInstance) -> MethodInput:
-        return given_of(instance)
+    def given(self, sighting: Sighting) -> MethodInput:
+        return MethodInput(
+            sighting.points_3d * sighting.width,
+            sighting.points_2d,
+            sighting.camera,
+            sighting.sigma,
+            bounds=sighting.bounds * sighting.width,
+            gt=sighting.target.gt,
+            make_views=partial(with_all_evidence, sighting),
+        )
 
     def answered(
-        self, method: Method, instance: PhotoInstance, answer: Alignment | Result
+        self, method: Method, sighting: Sighting, answer: Alignment | Result
     ) -> PhotoEstimate:
-        return estimate_of_answer(answer, instance.sighting)
+        if isinstance(answer, Alignment):
+            return estimate_of_model(answer, sighting)
+        is_of_model = tuple(answer.ids) == tuple(sighting.model.names)
+        return estimate_of_model(answer.alignment, sighting, answer if is_of_model else None)
 
-    def row(self, method: Method, instance: PhotoInstance, estimate: PhotoEstimate) -> Row:
-        sighting, sets = instance.sighting, instance.protocol.metrics
+    def row(self, method: Method, sighting: Sighting, estimate: PhotoEstimate) -> Row:
+        sets = sighting.protocol.metrics
         scores = score_alignment(sighting.target, sets, estimate.alignment, estimate.box)
         return {"rms_px": _rms(estimate, sighting)} | scores
 
@@ -120,39 +130,28 @@ class PhotoObjects(Setting):
     ) -> tuple[list[Outcome], Row | None]:
         if not any(outcome.is_ok for outcome in outcomes):
             return outcomes, None
-        instance: PhotoInstance = case.instance
-        if instance.is_shown:
+        sighting: Sighting = case.instance
+        if sighting.target.is_shown:
             methods = [outcome.names["method"] for outcome in outcomes]
             pairs = dict(zip(methods, estimates, strict=True))
-            found = (pairs.get(name) for name in (instance.protocol.best, *methods, TRUTH))
+            found = (pairs.get(name) for name in (sighting.protocol.best, *methods, TRUTH))
             best = next((each for each in found if isinstance(each, PhotoEstimate)), None)
-            write_picture(draw_sighting, self.drawn_in, instance.sighting, best)
-        return outcomes, sighting_record(instance.sighting, outcomes, estimates)
+            write_picture(draw_sighting, self.drawn_in, sighting, best)
+        return outcomes, sighting_record(sighting, outcomes, estimates)
 
 
 def photos_benchmark(
     options: PhotosOptions, shapes: tuple[ShapeModel, ...], drawn_in: RunFolder
 ) -> Benchmark:
     """The methods of the options on objects in photos."""
-    own = {name: photo_method(name) for name in options.methods if is_own(name)}
+    how = {"shapes": shapes, "similar_sigma": options.similar_sigma}
+    own = {
+        name: Method(name, partial(estimate_object, method=name, **how))
+        for name in options.methods
+        if is_own(name)
+    }
     setting = PhotoObjects(options, shapes, drawn_in)
     return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
-
-
-def targets_of(task: PhotoTask, root: Path) -> list[PhotoTarget | Case]:
-    """The objects of a photo; cases without an instance for what cannot be read."""
-    if task.problem:
-        return [Case(task.names, error=DataError(task.problem))]
-    dataset = opened(root)
-    try:
-        photo = dataset[task.index]
-    except DataError as error:
-        return [Case(task.names, error=error)]
-    bad = [
-        Case(PhotoTask(-1, f"{photo.name}, problem {number + 1}").names, error=problem)
-        for number, problem in enumerate(photo.problems)
-    ]
-    return [*bad, *(PhotoTarget(photo, found, str(dataset.root)) for found in photo.objects)]
 
 
 def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
@@ -167,12 +166,12 @@ def _rms(found: PhotoEstimate, sighting: Sighting) -> float | None:
 
 
 def sighting_record(
-    sighting: Sighting,
-    outcomes: Sequence[Outcome],
-    estimates: Sequence[PhotoEstimate | CadalignError],
+    sighting: Sighting, outcomes: Sequence[Outcome], estimates: Sequence[PhotoEstimate | Any]
 ) -> Row:
     """The record of an object, in terms of the data set's model."""
     return record_of(
+        outcomes,
+        [_described(each, sighting) for each in estimates],
         camera=sighting.camera,
         gt=sighting.target.gt,
         stretch=np.ones(3),
@@ -180,23 +179,26 @@ def sighting_record(
         points_3d=sighting.points_3d,
         points_2d=sighting.points_2d,
         ids=np.arange(len(sighting.names)),
-        outcomes=outcomes,
-        estimates=[_described(each, sighting) for each in estimates],
     )
 
 
-def _described(estimate: PhotoEstimate | CadalignError, sighting: Sighting) -> Estimate:
-    if isinstance(estimate, CadalignError):
+def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | Any:
+    """An estimate in terms of the data set's model; the error where there is none."""
+    if not isinstance(estimate, PhotoEstimate):
         return estimate
-    result = estimate.result
+    result, model = estimate.result, sighting.model
     if result is None:
         return estimate.alignment
     row_of = {str(name): row for row, name in enumerate(result.ids)}
-    known = [row for row, name in enumerate(sighting.model.names) if name in row_of]
-    rows = [row_of[sighting.model.names[row]] for row in known]
-    source = sighting.model.xyz[known]
-    how: dict[str, Any] = {"sigma": sighting.sigma, "model_bounds": sighting.bounds}
-    return shape_of_result(result, rows, source, rms=result.rms, **how)
+    known = [row for row, name in enumerate(model.names) if name in row_of]
+    return aligned_shape(
+        result,
+        [row_of[model.names[row]] for row in known],
+        model.xyz[known],
+        model_bounds=sighting.bounds,
+        rms=result.rms,
+        sigma=sighting.sigma,
+    )
 
 
 _MOST = 1024  # pixels of a picture's longer side
@@ -259,21 +261,14 @@ def _around(
         points = np.concatenate([points, camera.project(box.corners)])
     limit = np.array([camera.width, camera.height], dtype=float)
     low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
-    middle = (low + high) / 2
     across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel
     across = min(max(across, 0.1), float((limit / _THUMB).max()))
-    corner = middle - across * np.array(_THUMB) / 2
+    left, top = (low + high) / 2 - across * np.array(_THUMB) / 2
     # A pixel's borders, not its centre, stay in place.
-    warp = np.array([[across, 0, corner[0]], [0, across, corner[1]]])
+    warp = np.array([[across, 0, left], [0, across, top]])
     how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
     crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderValue=(_GREY,) * 3)
-    near = replace(
-        camera,
-        width=_THUMB[0],
-        height=_THUMB[1],
-        fx=camera.fx / across,
-        fy=camera.fy / across,
-        cx=(camera.cx - corner[0]) / across,
-        cy=(camera.cy - corner[1]) / across,
-    )
+    focal = {"fx": camera.fx / across, "fy": camera.fy / across}
+    centre = {"cx": (camera.cx - left) / across, "cy": (camera.cy - top) / across}
+    near = replace(camera, width=_THUMB[0], height=_THUMB[1], **focal, **centre)
     return np.asarray(crop, dtype=np.uint8), near

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -14,7 +15,7 @@ from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.photos.formats import open_photos
 from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError
-from cadalign.evaluation.benchmark import Tasks
+from cadalign.evaluation.benchmark import Case, Tasks
 from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.outcome import UNREADABLE, LeftOutError
 from cadalign.evaluation.runs.tables import Row
@@ -188,6 +189,7 @@ class PhotoTarget:
     photo: Photo
     found: PhotoObject
     root: str  # the data set's folder
+    is_shown: bool = False  # its pictures are drawn
 
     @property
     def cad(self) -> Cad | None:
@@ -243,6 +245,24 @@ class PhotoTarget:
         found = self.found
         model_id = f"{self.photo.name}/{found.object_id}"
         return {"category": found.category, "model_id": model_id, "view": 0}
+
+
+def targets_of(task: PhotoTask, root: Path, *, pictures: int) -> list[PhotoTarget | Case]:
+    """The objects of a photo, and cases without an instance for what cannot be read."""
+    if task.problem:
+        return [Case(task.names, error=DataError(task.problem))]
+    dataset = opened(root)
+    try:
+        photo = dataset[task.index]
+    except DataError as error:
+        return [Case(task.names, error=error)]
+    bad = [
+        Case(PhotoTask(-1, f"{photo.name}, problem {number + 1}").names, error=problem)
+        for number, problem in enumerate(photo.problems)
+    ]
+    shown = task.index < pictures
+    good = (PhotoTarget(photo, found, str(dataset.root), shown) for found in photo.objects)
+    return [*bad, *good]
 
 
 def rectangle_of(found: PhotoObject) -> FloatArray:

@@ -19,9 +19,9 @@ from cadalign.batch.table import RECORD_COLUMNS, without_lists
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, cumulative
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ALL,
     Summary,

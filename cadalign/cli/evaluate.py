@@ -18,8 +18,8 @@ from cadalign.evaluation.options import ExperimentOptions, FunctionOptions, Plug
 from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:
+    from cadalign.evaluation.registry import Spec
     from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.spec import Spec
 
 _COMMAND = "evaluate"
 _EXIT_CODES = (

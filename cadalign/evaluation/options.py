@@ -156,30 +156,6 @@ class NoiseOption(ExperimentOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(NoiseOption):
-    """Accuracy of evidence beside keypoints, and the cameras that see an object."""
-
-    min_visible: int = 6
-    """Least number of keypoints that the first view must show."""
-    depth_sigma: float = 0.005
-    """Relative noise of the depths."""
-    up_sigma_deg: float = 1.0
-    """Noise of the upward direction about each axis across it, in degrees."""
-    length_sigma: float = 0.01
-    """Relative noise of the height."""
-    turn_deg: float = 25.0
-    """Angle about the object between neighbouring cameras, in degrees."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_least(min_visible=4)
-        for name in ("depth_sigma", "up_sigma_deg", "length_sigma", "turn_deg"):
-            value = getattr(self, name)
-            if not 0 < value < 90:
-                raise InputError(f"{value} is not between 0 and 90", where=name)
-
-
-@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """Place and workers of a run; its results do not depend on them."""
 

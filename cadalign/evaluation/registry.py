@@ -1,7 +1,8 @@
-"""Registry of experiments: the modules of `cadalign.evaluation.experiments`, and those of users.
+"""Specifications of experiments, all that command line, report and `evaluate show` know of them.
 
-An experiment of your own needs a single file, anywhere: options (`cadalign.evaluation.options`),
-tasks and an experiment (`cadalign.evaluation.runs.work`), a specification, and ::
+Experiments are the modules of `cadalign.evaluation.experiments`, and those of users, each of which
+needs a single file, anywhere: options (`cadalign.evaluation.options`), tasks and an experiment
+(`cadalign.evaluation.runs.work`), a specification, and ::
 
     SPEC = register(Spec(options=MyOptions, plan=plan, columns=COLUMNS, summarize=summarize))
 
@@ -10,17 +11,133 @@ Import that file before the command line runs; its runs, tables, page and `evalu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import DataError, InputError, quote, unknown
+from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.outcome import FAILED, SKIPPED
+from cadalign.evaluation.plots import Plot, draw_plots
+from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
+from cadalign.io.files import write_text
 
 if TYPE_CHECKING:
+    from cadalign.evaluation.runs.folder import RunFolder
     from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.spec import Spec
+    from cadalign.evaluation.runs.tables import Columns
+
+    Summaries = Sequence[Summary]
+
+RESULT_COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
+"""Columns of the result table of every experiment."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Published numbers beside a headline table, and a note on them."""
+
+    lines: tuple[Summary, ...]
+    note: str
+
+
+def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
+    statuses = run.results["status"].to_pylist()
+    skipped = statuses.count(SKIPPED)
+    note = f"{skipped} more were skipped" if skipped else ""
+    rows = len(statuses) - skipped
+    return Conclusion(rows, statuses.count(FAILED), {"skipped": skipped}, note)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """Specification of an experiment."""
+
+    options: type[ExperimentOptions]
+    """A frozen dataclass derived from `ExperimentOptions`, which names the experiment; at once
+    keywords of the API, flags of the command line and configuration of the run."""
+    plan: Callable[[Any, RunFolder], Plan[Any]]
+    """Makes the plan of a run from its options and its folder, in which it may put files."""
+    columns: tuple[Metric, ...]
+    """Columns of the headline table; those are left out that no line has a value of."""
+    summarize: Callable[[Run], Summaries]
+    """Makes summaries of a run, finished or not; see `cadalign.evaluation.summary`."""
+    results: Columns = RESULT_COLUMNS
+    """Columns that the result table of a run must have to be summarized."""
+    lines: Callable[[Summaries], Summaries] = list
+    """Makes lines of the headline table from summaries; by default a line of each."""
+    table: Callable[[Run, Summaries], ConsoleTable] | None = None
+    """Makes the table for the console of a run and its summaries; by default the headline table."""
+    group: Callable[[Run], Metric] = lambda run: CATEGORY
+    """The column that a run's tasks are grouped by."""
+    plots: Callable[[Sequence[Run]], list[Plot]] = lambda runs: []
+    """Makes the plots of a page of runs to be compared."""
+    write_more: Callable[[Run, Summaries], object] = lambda run, summaries: None
+    """Writes more files of a run and its summaries."""
+    conclude: Callable[[Run, Summaries], Conclusion] = _count_failures
+    """Counts rows and failures of a run."""
+    metrics: tuple[Metric, ...] = ()
+    """Columns of the result table that a page's gallery shows, for experiments on instances."""
+    kind: Callable[[Run], str] = lambda run: run.experiment
+    joins: bool = False
+    """Runs of one kind, whose name this gives, can be compared."""
+    title: Callable[[Sequence[Run]], str] | None = None  # names runs of one kind in a few words
+    topic: str = ""  # what is evaluated, in place of a title: ``topic on dataset``
+    describe: Callable[[Run], str] = lambda run: f"on {run.total:,} tasks of {run.experiment}"
+    """Says what the methods were run on."""
+    about: str = ""  # explains the pictures
+    note: str = ""  # explains the numbers of the headline table
+    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: Reference((), "")
+    """Published numbers for the groups of some runs."""
+
+    @property
+    def name(self) -> str:
+        """Name of the experiment."""
+        return self.options.experiment
+
+    def open(self, path: Path, name: str | None = None) -> Run:
+        """Read a run of the experiment, ``name`` being its name beside others."""
+        from cadalign.evaluation.runs.opened import Run
+
+        return Run.open(path, name, columns=self.results)
+
+    def title_of(self, runs: Sequence[Run]) -> str:
+        """A few words that name runs of one kind, such as ``alignment on keypointnet``."""
+        if self.title is not None:
+            return self.title(runs)
+        datasets = dict.fromkeys(run.dataset for run in runs)
+        return f"{self.topic or runs[0].experiment} on {', '.join(datasets)}"
+
+    def console_table(self, run: Run, summaries: Summaries) -> ConsoleTable:
+        """The table for the console."""
+        if self.table is not None:
+            return self.table(run, summaries)
+        lines = self.lines(summaries)
+        columns = self.shown_columns(lines, [run])
+        labels = (self.group(run).heading, "method")
+        return ConsoleTable.of("Medians per group and method", lines, columns, labels=labels)
+
+    def shown_columns(self, lines: Summaries, runs: Sequence[Run]) -> list[Metric]:
+        """The columns that some line has a value of, those of registered metrics last."""
+        further = {metric.key: metric for run in runs for metric in run.metrics}
+        columns = (*self.columns, *further.values())
+        return [c for c in columns if told(c, [line.number(c.key) for line in lines])]
+
+    def write(self, run: Run) -> Summaries:
+        """Write ``summary.csv`` and ``figures`` of a finished run."""
+        summaries = self.summarize(run)
+        names = {"value": self.group(run).key}
+        write_text(run.folder.summary, summary_csv(summaries, rename=names))
+        plots = self.plots([run])
+        if plots:
+            draw_plots(run.folder.made_figures(), plots)
+        self.write_more(run, summaries)
+        return summaries
+
 
 # In the order in which they are named to users.
 _MODULES = (

@@ -69,40 +69,33 @@ class ShapeFiles:
             )
         return cls(used)
 
-    def shape(self, category: str) -> ShapeModel | None:
-        """The shape of a category, None where there is none."""
-        path = dict(self.paths).get(category)
-        return None if path is None else _open(path)
+    def shape(self, category: str) -> ShapeModel:
+        """The shape of a category that there is a file of."""
+        return _open(dict(self.paths)[category])
 
     def fingerprint(self) -> str:
         """Hash of the files: a run must not go on with others."""
-        return fingerprint(
-            *(part for name, path in self.paths for part in (f"{name}\0", read_bytes(path)))
-        )
+        parts = ((f"{name}\0", read_bytes(path)) for name, path in self.paths)
+        return fingerprint(*(part for pair in parts for part in pair))
 
 
 NO_SHAPES = ShapeFiles(())
 
 
 @dataclass(frozen=True)
-class LearnedFiles:
+class LearnedFiles(ShapeFiles):
     """Files of what is learned: shape models by category, and the library of all models."""
 
-    shapes: tuple[tuple[str, str], ...]
-    library: str
+    library_file: str
 
-    def shape(self, category: str) -> ShapeModel:
-        """The shape model of a category."""
-        return _open(dict(self.shapes)[category])
-
-    def opened_library(self) -> Library:
+    def library(self) -> Library:
         """The library."""
-        return _open_library(self.library)
+        return _open_library(self.library_file)
 
     def fingerprint(self) -> str:
         """Hash of the shape models and the library."""
-        parts: list[Any] = [self.opened_library().fingerprint]
-        for category, path in self.shapes:
+        parts: list[Any] = [self.library().fingerprint]
+        for category, path in self.paths:
             shape = _open(path)
             parts.append(f"{category}\0{shape.inflation!r}\0{shape.degrees_of_freedom!r}\0")
             if shape.few_keypoints is not None:
@@ -138,7 +131,7 @@ def learn(
         if not _is_readable(file):
             logger.info("learning the shape of %s from %d models", category, len(train[category]))
             ShapeModel.from_dataset(dataset, category, split=split, meshes=False).save(file)
-        shapes.append((category, str(file.absolute())))
+        shapes.append((category, file.absolute()))
     models = [
         LibraryModel.of_annotated(model, with_mesh=False)
         for category in categories
@@ -166,7 +159,7 @@ def _is_readable(file: Path) -> bool:
 
 
 @lru_cache(maxsize=32)
-def _open(path: Path | str) -> ShapeModel:
+def _open(path: Path) -> ShapeModel:
     return ShapeModel.open(path)
 
 

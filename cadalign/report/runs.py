@@ -18,7 +18,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import refuse_nul
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.spec import Spec
+    from cadalign.evaluation.registry import Spec
 
 for many in (spec, retrievals):  # runs over many observations are shown as experiments are
     register(many.SPEC)

@@ -24,7 +24,7 @@ from cadalign import Alignment, Camera, Model, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.estimation.contours.view_contour import contour_bound
-from cadalign.evaluation.instances.scene import DAMAGES, damaged_mask
+from cadalign.evaluation.instances.evidence import DAMAGES, damaged_mask
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, rotation_error

@@ -19,7 +19,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
-from cadalign.evaluation.methods.unseen import UnseenObject
+from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.simulation.problems import Problem
 
 LIMIT_DRAWS = 20

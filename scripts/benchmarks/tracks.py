@@ -14,7 +14,7 @@ from benchmarks.section import BenchmarkData, RatioTable, Row
 from cadalign import Motion, RansacOptions, Result, ShapeModel, Tracker, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.metrics.trajectories import rotation_jitter_deg
+from cadalign.evaluation.metrics.errors import rotation_jitter_deg
 from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
 from cadalign.geometry.rotations import vector_from_rotation
 

@@ -9,7 +9,7 @@ import pytest
 
 from cadalign.errors import InputError
 from cadalign.estimation.tracks.motion import moved_by
-from cadalign.evaluation.metrics.trajectories import (
+from cadalign.evaluation.metrics.errors import (
     absolute_pose_error,
     count_flips,
     relative_pose_error,

@@ -12,8 +12,8 @@ from cadalign.errors import DataError
 from cadalign.evaluation.experiments.keypointnet import ON_INSTANCES, TABLE, KeypointNetOptions
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import NoiseOption
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, csv_text
 from cadalign.io.files import write_text
 

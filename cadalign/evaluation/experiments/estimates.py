@@ -20,8 +20,8 @@ from cadalign.evaluation.experiments.photos import (
 )
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan, fingerprint
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import Conclusion, Summary
 from cadalign.io.files import read_bytes
 

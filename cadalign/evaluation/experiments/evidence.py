@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from cadalign.datasets import KeypointNet
+from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.options import FunctionOptions, ModelOptions, SceneOptions
+from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 from cadalign.evaluation.plots import cumulative_curves
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,
@@ -52,7 +53,7 @@ _DEFAULT = tuple(name for name in METHODS if name not in DAMAGED or name == "mas
 
 
 @dataclass(frozen=True)
-class EvidenceRunOptions(ModelOptions, SceneOptions, FunctionOptions):
+class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     """Evaluate what masks, further views, depth, gravity and lengths add to keypoints.
 
     Each view shows a model with a mesh as it is; methods get its visible keypoints with noise, the
@@ -70,6 +71,16 @@ class EvidenceRunOptions(ModelOptions, SceneOptions, FunctionOptions):
     """The dataset's split to take, such as test; all models by default."""
     views_per_model: int = 1
     """Number of instances of each model."""
+    min_visible: int = 6
+    """Least number of keypoints that the first view must show."""
+    depth_sigma: float = 0.005
+    """Relative noise of the depths."""
+    up_sigma_deg: float = 1.0
+    """Noise of the upward direction about each axis across it, in degrees."""
+    length_sigma: float = 0.01
+    """Relative noise of the height."""
+    turn_deg: float = 25.0
+    """Angle about the object between neighbouring cameras, in degrees."""
     methods: tuple[str, ...] = _DEFAULT
     """keypoints: these alone; gravity, length (the height), depth (of the keypoints), mask (of the
     first view): these and one kind of evidence; views-2, views-5: two and five views with known
@@ -79,7 +90,11 @@ class EvidenceRunOptions(ModelOptions, SceneOptions, FunctionOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(views_per_model=1)
+        self.check_least(views_per_model=1, min_visible=4)
+        for name in ("depth_sigma", "up_sigma_deg", "length_sigma", "turn_deg"):
+            value = getattr(self, name)
+            if not 0 < value < 90:
+                raise InputError(f"{value} is not between 0 and 90", where=name)
         self.check_methods(METHODS)
 
 

@@ -18,8 +18,8 @@ from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE, Met
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
+from cadalign.evaluation.registry import Reference, Spec
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.spec import Reference, Spec
 from cadalign.evaluation.summary import (
     ALL,
     ConsoleTable,

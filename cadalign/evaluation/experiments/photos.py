@@ -40,8 +40,8 @@ from cadalign.evaluation.photos.protocols import (
     protocol_of,
 )
 from cadalign.evaluation.plots import cumulative_curves
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ALL,
     Conclusion,

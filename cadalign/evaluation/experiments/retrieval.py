@@ -18,8 +18,8 @@ from cadalign.evaluation.metrics.table import QUERIES, Metric
 from cadalign.evaluation.options import ModelOptions
 from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import Plot, Trace
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.photos import DEPTH, YAW
 from cadalign.evaluation.options import FunctionOptions, NoiseOption
 from cadalign.evaluation.plots import cumulative_curves
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,

@@ -15,8 +15,8 @@ from cadalign.evaluation.methods.method import LIMIT, SHAPE
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
 from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
-from cadalign.evaluation.spec import Spec
 from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,

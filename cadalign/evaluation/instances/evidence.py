@@ -1,16 +1,19 @@
-"""Keypoints with further evidence: methods, errors and their bounds."""
+"""Keypoints with further evidence: one object before several cameras, methods, errors, bounds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
-from cadalign.errors import DataError
+from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.datasets import AnnotatedModel
+from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.align import align
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths
 from cadalign.estimation.model import Model
@@ -31,15 +34,23 @@ from cadalign.evaluation.experiments.evidence import (
     VIEWS_KNOWN,
     EvidenceRunOptions,
 )
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask, example_view
-from cadalign.evaluation.instances.scene import ObjectScene, Shot, make_scene, truth_in
+from cadalign.evaluation.instances.instance import (
+    KEYPOINT_CAMERA,
+    KeypointTask,
+    example_view,
+    load_scene,
+    make_instance,
+)
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.evaluation.metrics.errors import alignment_errors, overlap
 from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.evidence import Size
+from cadalign.render import Scene, cast_geometry, visible_keypoints
 from cadalign.seeding import instance_rng
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
@@ -48,10 +59,119 @@ _DRAWS = 1000
 EVERYTHING = "all"
 """The method that gives evidence of each kind."""
 _LEAST_FREE = 3  # keypoints of a view that moved in an unknown way
+_TURNS = (0, 1, -1, 2, -2)  # places of the cameras around the object
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
+class Shot:
+    """One camera's image."""
+
+    cam_from_first: FloatArray  # (4, 4), motion of the camera
+    rows: IntArray  # (n,), the visible keypoints
+    points_2d: FloatArray  # (n, 2), with noise [px]
+    depths: FloatArray  # (n,), with noise [model units]
+    up: FloatArray  # (3,), with noise
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectScene:
+    """An object, its stretched model, and shots from all cameras."""
+
+    model: Model  # the stretched model with its mesh
+    gt: Alignment  # the truth in the first camera
+    shots: tuple[Shot, ...]
+    height: float  # of the object, with noise [model units]
+    diagonal: float  # of the object's box [model units]
+    shown: Scene  # the object as it is
+    cam_from_shown: Alignment  # its pose in the first camera
+    names: tuple[str, ...]  # names of the instance, for its randomness
+    options: EvidenceRunOptions  # the seed, and the accuracy of the evidence
+
+    def mask(self, damage: str = "exact") -> BoolArray:
+        """The object's mask in the first camera; see `damaged_mask`."""
+        mask = cast_geometry(self.shown, KEYPOINT_CAMERA, self.cam_from_shown).mask
+        return damaged_mask(mask, damage, instance_rng(self.options.seed, *self.names, damage))
+
+
+_scene_of = lru_cache(maxsize=1)(load_scene)  # views of one model come one after another
+
+
+def make_scene(model: AnnotatedModel, view: int, options: EvidenceRunOptions) -> ObjectScene:
+    """Draw a view of a model, its stretch, the other cameras, and the noise of everything.
+
+    Everything random follows from (seed, category, model id, view). The cameras turn about the
+    vertical axis of the first one through the centre of the object's box.
+    """
+    names = (model.category, model.model_id, str(view))
+    how = {name: getattr(options, name) for name in ("noise_px", "min_visible", "seed")}
+    instance = make_instance(model, view_index=view, scene=_scene_of(model), **how)
+    shown = instance.scene
+    assert shown is not None
+    stretch = 1 / instance.gt.scale
+    rng = instance_rng(options.seed, *names, "evidence")
+    pose = instance.cam_from_model
+    centre = pose.apply(shown.bounds.mean(axis=0)[None])[0]
+    shots = []
+    for place in _TURNS:
+        motion = np.eye(4)
+        turn = np.radians(place * options.turn_deg)
+        motion[:3, :3] = rotation_from_vector(np.array([0.0, turn, 0.0]))
+        motion[:3, 3] = centre - motion[:3, :3] @ centre
+        shots.append(_shoot(shown, model.keypoints.xyz, pose, motion, rng, options))
+    height = float(np.ptp(shown.bounds[:, 1]) * (1 + options.length_sigma * rng.standard_normal()))
+    mesh = Mesh(shown.mesh.vertices * stretch, shown.mesh.faces)
+    return ObjectScene(
+        model=Model(points_3d=model.keypoints.xyz * stretch, bounds=instance.bounds, mesh=mesh),
+        gt=instance.gt,
+        shots=tuple(shots),
+        height=height,
+        diagonal=instance.diagonal,
+        shown=shown,
+        cam_from_shown=pose,
+        names=names,
+        options=options,
+    )
+
+
+def _shoot(
+    shown: Scene,
+    xyz: FloatArray,
+    first_pose: Alignment,
+    motion: FloatArray,
+    rng: np.random.Generator,
+    options: EvidenceRunOptions,
+) -> Shot:
+    pose = _moved(first_pose, motion)
+    noise, of_depths = rng.standard_normal((len(xyz), 2)), rng.standard_normal(len(xyz))
+    about = rng.standard_normal(2)
+    rows = np.flatnonzero(visible_keypoints(shown, xyz, KEYPOINT_CAMERA, pose))
+    in_camera = pose.apply(xyz[rows])
+    # The model's y axis, turned about the two axes across it.
+    turn = np.radians(options.up_sigma_deg) * (pose.rotation[:, [0, 2]] @ about)
+    return Shot(
+        motion,
+        rows,
+        KEYPOINT_CAMERA.project(in_camera) + options.noise_px * noise[rows],
+        in_camera[:, 2] * (1 + options.depth_sigma * of_depths[rows]),
+        rotation_from_vector(turn) @ pose.rotation[:, 1],
+    )
+
+
+def _moved(pose: Alignment, motion: FloatArray) -> Alignment:
+    """A pose in the first camera as another camera has it, after its motion (4, 4)."""
+    rotation, shift = motion[:3, :3], motion[:3, 3]
+    return Alignment(rotation @ pose.rotation, rotation @ pose.translation + shift, pose.scale)
+
+
+def truth_in(shot: Shot, gt: Alignment) -> Alignment:
+    """The truth in the camera of a shot."""
+    return _moved(gt, shot.cam_from_first)
+
+
+# Methods ------------------------------------------------------------------------------------------
+
+
+class Given(NamedTuple):
     """Arguments of `align`, and the shots that they are of."""
 
     views: tuple[View, ...]
@@ -68,15 +188,11 @@ class EvidenceEstimate:
     given: Given | None = None
 
 
-def align_with(method: str, scene: ObjectScene) -> EvidenceEstimate:
+def _align_with(scene: ObjectScene, *, method: str) -> EvidenceEstimate:
     """Align the scene's model with the evidence that a method gives."""
     given = evidence_for(method, scene)
     result = align(scene.model, given.views, size=given.size)
     return EvidenceEstimate(result.alignment, result, given)
-
-
-OWN_METHODS = {name: Method(name, partial(align_with, name)) for name in METHODS}
-"""The experiment's methods by name: each is `align` with some evidence."""
 
 
 def evidence_for(method: str, scene: ObjectScene) -> Given:
@@ -84,13 +200,10 @@ def evidence_for(method: str, scene: ObjectScene) -> Given:
     options = scene.options
     kinds = COMBINED.get(method, (method,))
     count = next((VIEWS_KNOWN[kind] for kind in kinds if kind in VIEWS_KNOWN), 1)
-    shots = scene.shots[:count]
+    shots = scene.shots[: VIEWS_FREE.get(method, count)]
     if method in VIEWS_FREE:
-        shots = tuple(
-            shot
-            for number, shot in enumerate(scene.shots[: VIEWS_FREE[method]])
-            if number == 0 or len(shot.rows) >= _LEAST_FREE
-        )
+        others = (shot for shot in shots[1:] if len(shot.rows) >= _LEAST_FREE)
+        shots = (shots[0], *others)
     views = tuple(
         View(
             KEYPOINT_CAMERA,
@@ -106,27 +219,6 @@ def evidence_for(method: str, scene: ObjectScene) -> Given:
     return Given(views, shots, size)
 
 
-def bound_of(result: Result, given: Given, scene: ObjectScene) -> FloatArray:
-    """The Cramer-Rao bound (9, 9) of an estimate from such evidence, as `Result.covariance`.
-
-    Contours have the measured standard deviation.
-    """
-    basis = result.statistics.basis
-    if basis is None:
-        (view,), (shot,) = given.views, given.shots
-        points = np.asarray(scene.model.points_3d)[shot.rows]
-        assert view.sigma is not None
-        return cramer_rao_bound(points, view.camera, scene.gt, sigma=view.sigma, focal="known")
-    evidence, state = basis.evidence, basis.state
-    loss = np.full_like(evidence.sightings.loss, LINEAR)
-    evidence = evidence._replace(sightings=evidence.sightings._replace(loss=loss))
-    truths = [truth_in(shot, scene.gt) for shot in given.shots[: len(state.poses)]]
-    poses = [np.concatenate([each.rotation.ravel(), each.translation]) for each in truths]
-    true_state = state._replace(poses=np.array(poses), log_scales=np.log(scene.gt.scale))
-    unknowns = pose_and_border(joint_covariance(evidence, true_state), 0)
-    return pose_and_lengths(evidence, true_state, unknowns)
-
-
 def _of_first(kinds: tuple[str, ...], scene: ObjectScene) -> dict[str, Any]:
     """Fields of the first view beyond its keypoints."""
     shot, options = scene.shots[0], scene.options
@@ -139,6 +231,15 @@ def _of_first(kinds: tuple[str, ...], scene: ObjectScene) -> dict[str, Any]:
         if kind == MASK or kind in DAMAGED:
             fields["mask"] = scene.mask(DAMAGED.get(kind, "exact"))
     return fields
+
+
+def evidence_benchmark(options: EvidenceRunOptions) -> Benchmark:
+    """The kinds of evidence of the options on views of models."""
+    own = {name: Method(name, partial(_align_with, method=name)) for name in METHODS}
+    return Benchmark.chosen(EvidenceScenes(options), options.methods, own, metrics=options.metrics)
+
+
+# Errors -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -186,14 +287,23 @@ class EvidenceScenes(Setting):
         return EvidenceEstimate(answer.alignment, answer)
 
     def row(self, method: Method, scene: ObjectScene, estimate: EvidenceEstimate) -> Row:
+        est, gt, bounds = estimate.alignment, scene.gt, np.asarray(scene.model.bounds)
+        boxes = {"est": Box.from_model(bounds, est), "gt": Box.from_model(bounds, gt)}
+        values: Row = {
+            **alignment_errors(est=est, gt=gt, length=scene.diagonal),
+            "box_iou": overlap(**boxes),
+        }
         result, given = estimate.result, estimate.given
-        values = _errors(estimate.alignment, scene)
         if given is None or result is None:
             return values
-        values["keypoints"] = sum(len(shot.rows) for shot in given.shots)
-        bounds = self._bounds(bound_of(result, given, scene), scene)
-        over = values["rotation_error_deg"] / bounds["rotation_bound_deg"]
-        return values | {**bounds, "over_limit": over, "warnings": len(result.warnings)}
+        limits = self._bounds(bound_of(result, given, scene), scene)
+        return {
+            **values,
+            "keypoints": sum(len(shot.rows) for shot in given.shots),
+            **limits,
+            "over_limit": values["rotation_error_deg"] / limits["rotation_bound_deg"],
+            "warnings": len(result.warnings),
+        }
 
     def _bounds(self, bound: FloatArray, scene: ObjectScene) -> Row:
         """Median errors of a Gaussian with the bound as its covariance."""
@@ -208,14 +318,91 @@ class EvidenceScenes(Setting):
         return dict(zip(BOUNDS, (float(np.median(each)) for each in values), strict=True))
 
 
-def evidence_benchmark(options: EvidenceRunOptions) -> Benchmark:
-    """The kinds of evidence of the options on views of models."""
-    setting = EvidenceScenes(options)
-    return Benchmark.chosen(setting, options.methods, OWN_METHODS, metrics=options.metrics)
+def bound_of(result: Result, given: Given, scene: ObjectScene) -> FloatArray:
+    """The Cramer-Rao bound (9, 9) of an estimate from such evidence, as `Result.covariance`.
+
+    Contours have the measured standard deviation.
+    """
+    basis = result.statistics.basis
+    if basis is None:
+        (view,), (shot,) = given.views, given.shots
+        points = np.asarray(scene.model.points_3d)[shot.rows]
+        assert view.sigma is not None
+        return cramer_rao_bound(points, view.camera, scene.gt, sigma=view.sigma, focal="known")
+    evidence, state = basis.evidence, basis.state
+    loss = np.full_like(evidence.sightings.loss, LINEAR)
+    evidence = evidence._replace(sightings=evidence.sightings._replace(loss=loss))
+    truths = [truth_in(shot, scene.gt) for shot in given.shots[: len(state.poses)]]
+    poses = [np.concatenate([each.rotation.ravel(), each.translation]) for each in truths]
+    true_state = state._replace(poses=np.array(poses), log_scales=np.log(scene.gt.scale))
+    unknowns = pose_and_border(joint_covariance(evidence, true_state), 0)
+    return pose_and_lengths(evidence, true_state, unknowns)
 
 
-def _errors(est: Alignment, scene: ObjectScene) -> Row:
-    gt = scene.gt
-    bounds = np.asarray(scene.model.bounds)
-    boxes = {"est": Box.from_model(bounds, est), "gt": Box.from_model(bounds, gt)}
-    return {**alignment_errors(est=est, gt=gt, length=scene.diagonal), "box_iou": overlap(**boxes)}
+# Masks --------------------------------------------------------------------------------------------
+
+DAMAGES = ("exact", "dilated", "eroded", "smoothed", "hidden", "hole", "blob")
+"""Kinds of masks: without damage; with a contour 2 px outside or inside; with a contour that
+wanders by 2 px; a quarter hidden by a rectangle; with a hole; with a blob of the background."""
+
+_SHIFT = 2  # [px], of a dilated or eroded contour
+_WANDER = 2.0  # [px], standard deviation of a smoothed contour
+_WANDER_LENGTH = 5.0  # [px], over which it wanders
+_HIDDEN = 0.25  # share of the area
+_SIZE = 0.13  # radius of holes and blobs, relative to the root of the area
+
+
+def damaged_mask(mask: npt.ArrayLike, kind: str, rng: np.random.Generator) -> BoolArray:
+    """A mask (h, w) with a damage of one of the kinds `DAMAGES`.
+
+    Raises InputError if the kind is unknown.
+    """
+    pixels = np.asarray(mask).astype(np.uint8)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _SHIFT + 1, 2 * _SHIFT + 1))
+    match kind:
+        case "exact":
+            return pixels > 0
+        case "dilated":
+            return np.asarray(cv2.dilate(pixels, disc) > 0)
+        case "eroded":
+            return np.asarray(cv2.erode(pixels, disc) > 0)
+        case "smoothed":
+            return _wandering(pixels, rng)
+        case "hidden":
+            return _hidden(pixels, rng)
+        case "hole":
+            return _with_disc(pixels, np.argwhere(pixels > 0), 0, rng)
+        case "blob":
+            edge = (pixels > 0) & (cv2.erode(pixels, np.ones((3, 3), np.uint8)) == 0)
+            return _with_disc(pixels, np.argwhere(edge), 1, rng)
+    raise InputError(f"{quote(kind)} is none of {', '.join(DAMAGES)}", where="kind")
+
+
+def _wandering(pixels: npt.NDArray[np.uint8], rng: np.random.Generator) -> BoolArray:
+    inside = cv2.distanceTransform(pixels, cv2.DIST_L2, 5)
+    outside = cv2.distanceTransform(1 - pixels, cv2.DIST_L2, 5)
+    field = cv2.GaussianBlur(rng.normal(size=pixels.shape), (0, 0), _WANDER_LENGTH)
+    return np.asarray(inside - outside + field * (_WANDER / field.std()) > 0)
+
+
+def _hidden(pixels: npt.NDArray[np.uint8], rng: np.random.Generator) -> BoolArray:
+    """The mask without all that lies beyond a line of pixels, at a random side."""
+    turns = int(rng.integers(4))
+    turned = np.rot90(pixels, turns)
+    shares = np.cumsum(turned.sum(axis=1)) / turned.sum()
+    rest = turned.copy()
+    rest[: int(np.searchsorted(shares, _HIDDEN)) + 1] = 0
+    return np.rot90(rest, -turns) > 0
+
+
+def _with_disc(
+    pixels: npt.NDArray[np.uint8],
+    centres: npt.NDArray[np.int64],
+    value: int,
+    rng: np.random.Generator,
+) -> BoolArray:
+    row, column = centres[rng.integers(len(centres))].tolist()
+    drawn = pixels.copy()
+    radius = round(_SIZE * float(np.sqrt(pixels.sum())))
+    cv2.circle(drawn, (column, row), radius, value, thickness=-1)
+    return drawn > 0

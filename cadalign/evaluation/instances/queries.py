@@ -9,7 +9,7 @@ it and all that count as it are taken out. All methods get the same keypoints.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -124,13 +124,11 @@ def observe_model(model: LibraryModel, task: RetrievalTask, *, seed: int) -> Ret
 class RetrievalInstance:
     """A query of a library's file, with the models that count as the true one."""
 
-    library: str
     task: RetrievalTask
     query: RetrievalQuery
     gt: LibraryModel
     alike: frozenset[ModelKey]
     protocol: str
-    options: RetrievalRunOptions
 
 
 @dataclass(frozen=True)
@@ -150,45 +148,60 @@ class RetrievalQueries(Setting):
             LibraryModel("box", str(k), points[:, turn], ids, _UNIT_BOUNDS)
             for k, turn in enumerate(([0, 1, 2], [1, 2, 0], [2, 0, 1]))
         ]
-        Library.from_models(models).retrieve(pixels, np.arange(9), KEYPOINT_CAMERA)
+        Library.from_models(models).retrieve(pixels, ids, KEYPOINT_CAMERA)
         return ()
 
     def failed(self, task: RetrievalTask) -> list[Case]:
         return [Case(task.names(protocol), _NO_MATCH) for protocol in self.options.protocols]
 
     def _cases(self, task: RetrievalTask) -> list[Case]:
-        gt = _opened(self.library)[task.category, task.model_id]
+        gt, cases = _opened(self.library)[task.category, task.model_id], self.failed(task)
         try:
             query = observe_model(gt, task, seed=self.options.seed)
         except DegenerateError as error:
-            return [replace(case, error=error, status=NO_VIEW) for case in self.failed(task)]
-        alike = same_shapes(self.library, gt.key)
+            return [replace(case, error=error, status=NO_VIEW) for case in cases]
+        seen = task, query, gt, same_shapes(self.library, gt.key)
         return [
-            replace(
-                case,
-                instance=RetrievalInstance(
-                    self.library, task, query, gt, alike, protocol, self.options
-                ),
-            )
-            for case, protocol in zip(self.failed(task), self.options.protocols, strict=True)
+            replace(case, instance=RetrievalInstance(*seen, protocol))
+            for case, protocol in zip(cases, self.options.protocols, strict=True)
         ]
 
     def row(self, method: Method, instance: RetrievalInstance, matches: Sequence[Match]) -> Row:
-        best = _opened(instance.library)[matches[0].category, matches[0].model_id]
-        placed = instance.query.gt
-        return match_values(matches, best=best, gt=instance.gt, placed=placed, alike=instance.alike)
+        """Compare matches with the true model; errors are those of the first match."""
+        first, gt, placed = matches[0], instance.gt, instance.query.gt
+        best = _opened(self.library)[first.category, first.model_id]
+        boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, placed)}
+        keys = [(match.category, match.model_id) for match in matches]
+        ranks = (rank for rank, key in enumerate(keys, start=1) if key in instance.alike)
+        return {
+            "alike": len(instance.alike),
+            "rank": next(ranks, None),
+            "matched_category": first.category,
+            "matched_id": first.model_id,
+            "score": first.score,
+            "none_probability": first.none_probability,
+            "shared": first.shared,
+            "rms_px": first.rms,
+            "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
+            "box_iou": overlap(**boxes),
+            "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
+            "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
+        }
 
 
 def retrieval_benchmark(library: str, options: RetrievalRunOptions) -> Benchmark:
     """The methods of the options on queries of a library's file."""
-    methods = tuple(_OWN_METHODS[name] for name in options.methods)
-    return Benchmark(RetrievalQueries(library, options), methods)
+    how: dict[str, Any] = {"library": library, "options": options}
+    methods = (Method(name, partial(_retrieve, method=name, **how)) for name in options.methods)
+    return Benchmark(RetrievalQueries(library, options), tuple(methods))
 
 
-def _retrieve(instance: RetrievalInstance, *, method: str) -> list[Match]:
-    options, task = instance.options, instance.task
+def _retrieve(
+    instance: RetrievalInstance, *, method: str, library: str, options: RetrievalRunOptions
+) -> list[Match]:
+    task = instance.task
     is_exact = instance.protocol == LEAVE_IN and method == "optimal"
-    return _opened(instance.library).retrieve(
+    return _opened(library).retrieve(
         instance.query.points_2d,
         instance.query.ids,
         KEYPOINT_CAMERA,
@@ -200,45 +213,6 @@ def _retrieve(instance: RetrievalInstance, *, method: str) -> list[Match]:
         workers=1,
         **_OPTIONS[method],
     )
-
-
-_OWN_METHODS = {name: Method(name, partial(_retrieve, method=name)) for name in _OPTIONS}
-
-
-def match_values(
-    matches: Sequence[Match],
-    *,
-    best: LibraryModel,
-    gt: LibraryModel,
-    placed: Alignment,
-    alike: Collection[ModelKey],
-) -> Row:
-    """Compare matches with the truth; metrics by column.
-
-    ``best`` is the model of the first match, ``gt`` the true model, ``placed`` its pose and
-    stretch; ``alike`` are the models that count as the true one.
-    """
-    first = matches[0]
-    boxes = {"est": first.box, "gt": Box.from_model(gt.bounds, placed)}
-    ranks = [
-        place
-        for place, match in enumerate(matches, start=1)
-        if (match.category, match.model_id) in alike
-    ]
-    return {
-        "alike": len(alike),
-        "rank": ranks[0] if ranks else None,
-        "matched_category": first.category,
-        "matched_id": first.model_id,
-        "score": first.score,
-        "none_probability": first.none_probability,
-        "shared": first.shared,
-        "rms_px": first.rms,
-        "shape_distance": shape_distance(best, gt) if best.category == gt.category else None,
-        "box_iou": overlap(**boxes),
-        "box_iou_up_to_scale": overlap_up_to_scale(**boxes),
-        "rotation_error_deg": rotation_error(est=first.alignment, gt=placed),
-    }
 
 
 @lru_cache(maxsize=64)
@@ -257,11 +231,9 @@ def _opened(library: str) -> Library:
 
 
 @lru_cache(maxsize=2)
-def _by_keypoints(
-    library: str,
-) -> dict[tuple[str, tuple[int, ...]], tuple[list[ModelKey], FloatArray]]:
-    """Names and keypoints of the models with the same set of keypoints."""
-    groups: dict[tuple[str, tuple[int, ...]], list[LibraryModel]] = {}
+def _by_keypoints(library: str) -> dict[Any, tuple[list[ModelKey], FloatArray]]:
+    """Names and keypoints of the models with the same category and set of keypoints."""
+    groups: dict[Any, list[LibraryModel]] = {}
     for model in _opened(library):
         groups.setdefault((model.category, tuple(model.ids.tolist())), []).append(model)
     return {

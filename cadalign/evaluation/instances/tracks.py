@@ -33,7 +33,7 @@ from cadalign.evaluation.benchmark import VIEW_NAMES, Benchmark, Case, Setting
 from cadalign.evaluation.experiments.tracks import COLUMNS, METHODS, TracksOptions
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import probability_level
-from cadalign.evaluation.metrics.trajectories import (
+from cadalign.evaluation.metrics.errors import (
     absolute_pose_error,
     count_flips,
     relative_pose_error,

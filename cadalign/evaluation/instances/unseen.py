@@ -178,7 +178,7 @@ def _of_mean(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
 def _of_random_model(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
     """The estimate of a random model, among those that share enough keypoints with the image."""
     assert seen.learned is not None
-    library, task = seen.learned.opened_library(), seen.task
+    library, task = seen.learned.library(), seen.task
     keys = [key for key in library.keys if key[0] == task.category]
     names = (task.category, task.model_id, str(task.view), "another model")
     least = min(_LEAST_SHARED, len(seen.ids))
@@ -203,7 +203,7 @@ def _aligned(
 def _nearest(seen: UnseenObject) -> ShapeEstimate:
     """The best match of the library."""
     assert seen.learned is not None
-    library = seen.learned.opened_library()
+    library = seen.learned.library()
     first = library.retrieve(
         seen.points_2d,
         seen.ids,

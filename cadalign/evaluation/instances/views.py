@@ -225,7 +225,6 @@ def _aligned(view: KeypointView, *, shapes: ShapeFiles, sigma: float) -> Aligned
 
     task, instance = view
     shape = shapes.shape(task.category)
-    assert shape is not None
     known = np.isin(instance.ids, shape.ids)
     ids, pixels = instance.ids[known].tolist(), instance.points_2d[known]
     result = align(shape, View(instance.camera, pixels, ids=ids, sigma=sigma))

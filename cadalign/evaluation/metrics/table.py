@@ -190,7 +190,7 @@ KEYPOINTS_IN_95 = rate("keypoints_within_95", "keypoints within 95 %", "95%", **
 COVERED = rate("covered", "truths within the region", **_COVERED)
 NOMINAL = rate("nominal", "stated probability of a region", **_COVERED)
 
-# Of videos: see `cadalign.evaluation.metrics.trajectories`.
+# Of videos: see `cadalign.evaluation.metrics.errors`.
 FOUND_FRAMES = rate("found", "frames with a pose", "found%")
 ABSOLUTE_ROTATION = _like(
     ROTATION, "absolute_rotation_deg", "absolute pose error, rotation", "APE, rotation", "APE R"

@@ -93,8 +93,8 @@ def test_views_drawn_together_are_those_drawn_alone() -> None:
             assert str(found) == str(alone)
             continue
         assert not isinstance(alone, TooFewVisibleError)
-        assert found.cam_from_model == alone.cam_from_model
-        assert np.array_equal(found.visible, alone.visible)
+        assert found[0] == alone[0]
+        assert np.array_equal(found[1], alone[1])
     kinds = [isinstance(found, TooFewVisibleError) for found in together]
     assert kinds == [False, True, False, False, True]
 

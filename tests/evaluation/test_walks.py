@@ -64,7 +64,7 @@ class WrongClicks(PhotoObjects):
 
 def plan(options: WrongClickOptions, folder: RunFolder) -> Plan[PhotoTask]:
     dataset = opened(options.root)
-    setting = WrongClicks(options, (), folder.made_for_pictures())
+    setting = WrongClicks(options, folder.made_for_pictures())
     tasks = PhotoTasks(dataset, options.max_photos)
     benchmark = Benchmark.chosen(setting, options.methods, metrics=options.metrics)
     return benchmark.plan(options, tasks, chunk=4, kind=dataset.kind)

@@ -109,12 +109,8 @@ _STRETCH = (0.5, 2.0)
 _REDRAWS = 100
 
 
-@dataclass(frozen=True, eq=False)
-class SpoiledImage:
-    """An image with a stretched scene and moved points, and the options of searches for inliers."""
-
-    truth: Problem
-    ransac: RansacOptions
+SpoiledImage = tuple[Problem, RansacOptions]
+"""An image with a stretched scene and moved points, and the options of searches for inliers."""
 
 
 @dataclass(frozen=True)
@@ -148,15 +144,15 @@ class SpoiledImages(Setting):
         rng = instance_rng(self.options.seed, *names)
         truth = spoil(task.seen, task.outliers, rng=rng)
         ransac = self.options.ransac(int(rng.integers(2**31)))
-        return replace(case, instance=SpoiledImage(truth, ransac))
+        return replace(case, instance=(truth, ransac))
 
     def given(self, image: SpoiledImage) -> MethodInput:
-        truth = image.truth
+        truth, ransac = image
         given = (truth.points_3d, truth.points_2d, truth.camera)
-        return MethodInput(*given, 1.0, ransac=image.ransac, gt=truth.alignment)
+        return MethodInput(*given, 1.0, ransac=ransac, gt=truth.alignment)
 
     def row(self, method: Method, image: SpoiledImage, estimate: Alignment | Result) -> Row:
-        return errors_of(estimate, image.truth, is_robust=method.is_robust)
+        return errors_of(estimate, image[0], is_robust=method.is_robust)
 
 
 def correspondence_benchmark(options: CorrespondenceOptions) -> Benchmark:

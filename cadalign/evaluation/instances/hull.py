@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -65,11 +64,8 @@ class KeypointHull:
         return planes, depth <= depth.min(axis=1, keepdims=True) + slack
 
 
-class HullView(NamedTuple):
-    """A view: the pose, and a mask (k,) of the keypoints that count as visible."""
-
-    cam_from_model: Alignment
-    visible: BoolArray
+HullView = tuple[Alignment, BoolArray]
+"""A view: the pose, and a mask (k,) of the keypoints that count as visible."""
 
 
 def sample_hull_view(
@@ -108,14 +104,11 @@ def sample_hull_views(
             best[k] = max(best[k], int(np.count_nonzero(visible)))
             if best[k] >= min_visible:
                 pose = Alignment(rotation, translation, np.ones(3), is_valid=True)
-                found[k] = HullView(pose, visible)
+                found[k] = (pose, visible)
         left = [k for k in left if k not in found]
         if not left:
             break
-    return [
-        found[k] if k in found else _too_few(count, best[k], min_visible)
-        for k, count in enumerate(counts)
-    ]
+    return [found.get(k) or _too_few(count, best[k], min_visible) for k, count in enumerate(counts)]
 
 
 def _too_few(count: int, best: int, min_visible: int) -> TooFewVisibleError:

@@ -18,7 +18,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
 from cadalign.datasets.models.annotated_symmetry import rotations_of
 from cadalign.datasets.models.keypoints import Symmetries
 from cadalign.errors import CadalignError, TooFewVisibleError
-from cadalign.evaluation.instances.hull import HullView, KeypointHull, sample_hull_views
+from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -235,18 +235,12 @@ def make_hull_instances(
     hulls = [each.hull for each in views]
     sampled = sample_hull_views(hulls, KEYPOINT_CAMERA, rngs=rngs, min_visible=min_visible)
     seen = [
-        _Seen(
-            found.cam_from_model,
-            each.hull.xyz[found.visible],
-            each.ids[found.visible],
-            each.hull.bounds,
-            rng,
-        )
+        _Seen(found[0], each.hull.xyz[found[1]], each.ids[found[1]], each.hull.bounds, rng)
         for each, rng, found in zip(views, rngs, sampled, strict=True)
-        if isinstance(found, HullView)
+        if not isinstance(found, TooFewVisibleError)
     ]
     instances = iter(_stretched(seen, noise_px=noise_px, scene=None))
-    return [next(instances) if isinstance(each, HullView) else each for each in sampled]
+    return [e if isinstance(e, TooFewVisibleError) else next(instances) for e in sampled]
 
 
 class _Seen(NamedTuple):

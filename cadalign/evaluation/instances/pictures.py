@@ -69,12 +69,10 @@ def draw_instance(
     thumb = draw_overlay(
         small, camera, gt_box=instance.gt_box, est_box=est_box, axes=False, legend=False
     )
-    write_webp(folder.pictures / f"{stem}.webp", plain)
-    write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=_THUMB_QUALITY)
+    write_pictures(folder, stem, plain, thumb, image, quality=_THUMB_QUALITY)
     preview = folder.previews / f"{record_stem(category, model_id)}.json"
     if view == 0 or not preview.exists():
         write_preview(preview, instance.scene.mesh)
-    write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, image))
 
 
 def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage, Camera]:
@@ -84,6 +82,21 @@ def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage,
         cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
     )
     return small, resized_camera(camera, width, height)
+
+
+def write_pictures(
+    folder: RunFolder,
+    stem: str,
+    plain: ByteImage,
+    thumb: ByteImage,
+    overlay: ByteImage,
+    *,
+    quality: int = _QUALITY,
+) -> None:
+    """Write the pictures of an instance, the thumb in a quality, to the folders of a run."""
+    write_webp(folder.pictures / f"{stem}.webp", plain)
+    write_webp(folder.thumbs / f"{stem}.webp", thumb, quality=quality)
+    write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, overlay))
 
 
 def write_webp(path: Path, image: ByteImage, *, quality: int = _QUALITY) -> None:

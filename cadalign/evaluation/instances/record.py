@@ -15,7 +15,6 @@ import msgspec
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import CadalignError
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.summary import Uncertainty
 from cadalign.evaluation.outcome import Outcome
@@ -54,7 +53,7 @@ class AlignedShape:
     relative_likelihood: float = 1.0  # of an alternative
 
 
-Estimate = Result | AlignedShape | Alignment | CadalignError
+Estimate = Result | AlignedShape | Alignment | Exception
 """A fit, the estimate of the object's own shape, the alignment of a method that returns no more, or
 the reason why there is none."""
 
@@ -170,7 +169,7 @@ def record_stem(category: str, model_id: str, view: int = 0) -> str:
 
 def _described(outcome: Outcome, estimate: Estimate) -> dict[str, Any]:
     method = outcome.names["method"]
-    if not outcome.is_ok or isinstance(estimate, CadalignError):
+    if not outcome.is_ok or isinstance(estimate, Exception):
         return {"method": method, "reason": outcome.reason}
     fit = None if isinstance(estimate, Alignment) else estimate
     # The residual of the result table, or else the estimate's own.

@@ -214,7 +214,7 @@ def _online(video: TrackVideo) -> TrackEstimate:
     return _estimate(found, video.shape.mean[-2:].mean(axis=0))
 
 
-_SOLVERS = {
+_SOLVERS: dict[str, Callable[[TrackVideo], TrackEstimate]] = {
     "frames": _frame_by_frame,
     "shared": partial(_aligned, motion=None),
     "smooth": partial(_aligned, motion=Motion()),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
@@ -227,7 +227,7 @@ def _bound(seen: UnseenObject) -> ShapeEstimate:
     return ShapeEstimate(alignment, seen.task.hull.bounds, seen.task.ids, seen.xyz)
 
 
-_SOLVERS = {
+_SOLVERS: dict[str, Callable[[UnseenObject], ShapeEstimate]] = {
     "random-rigid": partial(_of_random_model, stretch="none"),
     "random-stretched": partial(_of_random_model, stretch=None),
     "nearest": _nearest,
@@ -395,9 +395,6 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
         "keypoints_within_68": within_68,
         "keypoints_within_95": within_95,
     }
-
-
-# Records ------------------------------------------------------------------------------------------
 
 
 def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:

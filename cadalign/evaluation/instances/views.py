@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -50,24 +50,19 @@ from cadalign.evaluation.runs.work import fingerprint
 from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles
 from cadalign.geometry.box import Box
 
-if TYPE_CHECKING:
-    from cadalign.evaluation.experiments.evidence import EvidenceRunOptions
-    from cadalign.evaluation.experiments.unseen import UnseenOptions
-
 KeypointView = tuple[KeypointTask, Instance]
 """A view of a model as an instance of the benchmark: its task, and what it shows."""
 
 
 class KeypointTasks(Tasks[KeypointTask]):
-    """All views of all models of a dataset in the order of their names."""
+    """All views of all models of a dataset in the order of their names.
 
-    def __init__(
-        self,
-        dataset: KeypointNet,
-        options: KeypointNetOptions | EvidenceRunOptions | UnseenOptions,
-    ) -> None:
+    ``options`` are an experiment's, with ``visibility``, ``views_per_model`` and ``max_models``.
+    """
+
+    def __init__(self, dataset: KeypointNet, options: Any) -> None:
         self.dataset, self._visibility = dataset, options.visibility
-        self._views = options.views_per_model
+        self._views: int = options.views_per_model
         self.keys = [
             key
             for category in dataset.categories

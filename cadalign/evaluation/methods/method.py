@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -120,14 +120,10 @@ def checked_answer(answer: object) -> Alignment | Result:
         fix = "return a cadalign.Alignment, or the result of cadalign.fit or cadalign.align"
         raise InputError(f"it returned {kind}, no alignment", where="method", fix=fix)
     found = answer if isinstance(answer, Alignment) else answer.alignment
-    rotation, translation, scale = map(np.asarray, vars_of(found))
+    parts = (found.rotation, found.translation, found.scale)  # which may not have been checked
+    rotation, translation, scale = map(np.asarray, parts)
     checked = Alignment(rotation, translation, scale)
     return checked if isinstance(answer, Alignment) else answer
-
-
-def vars_of(alignment: Alignment) -> tuple[Any, Any, Any]:
-    """Rotation, translation and scale of an alignment, which may not have been checked."""
-    return alignment.rotation, alignment.translation, alignment.scale
 
 
 # Names for a method together with options of `cadalign.fit`.
@@ -151,21 +147,19 @@ _INLIER_BOUND = 3.5
 @cache
 def fit_methods() -> dict[str, Method]:
     """The methods by name, the Cramer-Rao bound last."""
-    found = [_fit_method(name) for name in (*METHODS, *_VARIANTS, *_RANSAC)]
-    limit = Method(LIMIT, bound_estimate, is_general=True)
+    found = [
+        Method(
+            name,
+            partial(_fit, name=name),
+            partial(_fit_many, name=name),
+            is_general=True,
+            has_statistics=name == "optimal" or name in _VARIANTS or name in _RANSAC,
+            is_robust=name in _RANSAC,
+        )
+        for name in (*METHODS, *_VARIANTS, *_RANSAC)
+    ]
+    limit = Method(LIMIT, _bound, is_general=True)
     return {method.name: method for method in (*found, limit)}
-
-
-def _fit_method(name: str) -> Method:
-    call = FitCall(name)
-    return Method(
-        name,
-        call,
-        call.many,
-        is_general=True,
-        has_statistics=name == "optimal" or name in _VARIANTS or name in _RANSAC,
-        is_robust=name in _RANSAC,
-    )
 
 
 def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None) -> dict[str, Any]:
@@ -180,37 +174,32 @@ def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None) -> dic
     return {"sigma": sigma, **_VARIANTS.get(name, {"method": name})}
 
 
-@dataclass(frozen=True)
-class FitCall:
-    """The call of `cadalign.fit` of a method; see `fit_options`."""
+def _fit(given: MethodInput, *, name: str) -> Result:
+    """The fit of one instance."""
+    from cadalign.estimation.fit import fit
 
-    name: str
-
-    def __call__(self, given: MethodInput) -> Result:
-        """The fit of one instance."""
-        from cadalign.estimation.fit import fit
-
-        how = fit_options(self.name, sigma=given.sigma, ransac=given.ransac)
-        return fit(given.points_3d, given.points_2d, given.camera, **how)
-
-    def many(self, inputs: Sequence[MethodInput]) -> list[Alignment | CadalignError]:
-        """The alignments of many instances, in batches of one standard deviation."""
-        from cadalign.estimation.fit import fit_batch
-
-        found: list[Alignment | CadalignError] = []
-        for sigma, group in groupby(inputs, key=lambda given: given.sigma):
-            some = list(group)
-            batch = fit_batch(
-                [given.points_3d for given in some],
-                [given.points_2d for given in some],
-                [given.camera for given in some],
-                **fit_options(self.name, sigma=sigma, ransac=None),
-            )
-            found += [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
-        return found
+    how = fit_options(name, sigma=given.sigma, ransac=given.ransac)
+    return fit(given.points_3d, given.points_2d, given.camera, **how)
 
 
-def bound_estimate(given: MethodInput) -> Alignment:
+def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | CadalignError]:
+    """The alignments of many instances, in batches of one standard deviation."""
+    from cadalign.estimation.fit import fit_batch
+
+    found: list[Alignment | CadalignError] = []
+    for sigma, group in groupby(inputs, key=lambda given: given.sigma):
+        some = list(group)
+        batch = fit_batch(
+            [given.points_3d for given in some],
+            [given.points_2d for given in some],
+            [given.camera for given in some],
+            **fit_options(name, sigma=sigma, ransac=None),
+        )
+        found += [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]
+    return found
+
+
+def _bound(given: MethodInput) -> Alignment:
     """The estimate of an ideal estimator that knows the outliers."""
     from cadalign.evaluation.metrics.cramer_rao import limit_estimate
 

@@ -26,7 +26,7 @@ from cadalign.evaluation.benchmark import (
 )
 from cadalign.evaluation.experiments.photos import COLUMNS, PhotosOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, example_view
-from cadalign.evaluation.instances.pictures import write_preview, write_webp
+from cadalign.evaluation.instances.pictures import write_pictures, write_preview
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     Estimate,
@@ -52,8 +52,7 @@ from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
-from cadalign.io.files import write_whole
-from cadalign.io.images import ByteImage, write_image
+from cadalign.io.images import ByteImage
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.raycast.renderer import cast_geometry
 from cadalign.shapes.model import ShapeModel
@@ -70,7 +69,6 @@ class PhotoObjects(Setting):
     record_columns = RECORD_COLUMNS
 
     options: PhotosOptions
-    shapes: tuple[ShapeModel, ...]
     drawn_in: RunFolder  # the folder that pictures go to
 
     def warm_up(self) -> Sequence[PhotoTask]:
@@ -144,13 +142,13 @@ def photos_benchmark(
     options: PhotosOptions, shapes: tuple[ShapeModel, ...], drawn_in: RunFolder
 ) -> Benchmark:
     """The methods of the options on objects in photos."""
-    how = {"shapes": shapes, "similar_sigma": options.similar_sigma}
+    how: dict[str, Any] = {"shapes": shapes, "similar_sigma": options.similar_sigma}
     own = {
         name: Method(name, partial(estimate_object, method=name, **how))
         for name in options.methods
         if is_own(name)
     }
-    setting = PhotoObjects(options, shapes, drawn_in)
+    setting = PhotoObjects(options, drawn_in)
     return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)
 
 
@@ -231,11 +229,9 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
     image = draw_overlay(photo, camera, est_frame=frame, **boxes, **marks)
     crop, near = _around(photo, camera, sighting, observed)
     thumb = draw_overlay(crop, near, axes=False, legend=False, **boxes)
-    write_webp(folder.pictures / f"{stem}.webp", photo)
-    write_webp(folder.thumbs / f"{stem}.webp", thumb)
+    write_pictures(folder, stem, photo, thumb, image)
     if cad is not None and cad.has_mesh:
         write_preview(folder.previews / f"{stem}.json", cad.scene.mesh)
-    write_whole(folder.overlays / f"{stem}.png", lambda path: write_image(path, image))
 
 
 def _photo(sighting: Sighting) -> tuple[ByteImage, Camera]:
@@ -268,7 +264,13 @@ def _around(
     warp = np.array([[across, 0, left], [0, across, top]])
     how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
     crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderValue=(_GREY,) * 3)
-    focal = {"fx": camera.fx / across, "fy": camera.fy / across}
-    centre = {"cx": (camera.cx - left) / across, "cy": (camera.cy - top) / across}
-    near = replace(camera, width=_THUMB[0], height=_THUMB[1], **focal, **centre)
+    near = replace(
+        camera,
+        width=_THUMB[0],
+        height=_THUMB[1],
+        fx=camera.fx / across,
+        fy=camera.fy / across,
+        cx=(camera.cx - left) / across,
+        cy=(camera.cy - top) / across,
+    )
     return np.asarray(crop, dtype=np.uint8), near

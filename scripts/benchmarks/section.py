@@ -18,8 +18,7 @@ import cadalign
 from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
-from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
-from cadalign.evaluation.instances.unseen import UnseenObject
+from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
 from cadalign.evaluation.simulation.problems import Problem
 
 LIMIT_DRAWS = 20

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import AlignResult, FitResult, Result
     from cadalign.estimation.results import BatchResult, Results, to_dataframe
-    from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
+    from cadalign.estimation.scene import AlignedScene, align_scene
+    from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.tracks.motion import Motion, Trajectory
     from cadalign.estimation.tracks.tracker import Tracker
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary

@@ -24,7 +24,8 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.estimation.scene import SceneObject, focal_prior_by_others
+from cadalign.estimation.scene import focal_prior_by_others
+from cadalign.estimation.scene_messages import SceneObject
 from cadalign.estimation.uncertainty.misfit import PlacedRows, Rows, find_outliers
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment

@@ -24,9 +24,16 @@ from cadalign.arrays import IntArray
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
-from cadalign.estimation.observation_fit import refuse_photo
 from cadalign.io.files import open_input, read_bytes
-from cadalign.io.input_kinds import DETECTOR, LINES, OBSERVATION, TABLE, is_pattern, kind_of
+from cadalign.io.input_kinds import (
+    DETECTOR,
+    LINES,
+    OBSERVATION,
+    TABLE,
+    is_pattern,
+    kind_of,
+    refuse_photo,
+)
 
 _DAMAGED = "damaged"
 

@@ -32,14 +32,15 @@ from cadalign.cli.options import (
 )
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.observation_fit import ObservationFit, refuse_photo
+from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import read_json
-from cadalign.io.input_kinds import is_of_many
+from cadalign.io.input_kinds import is_of_many, refuse_photo
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
-    from cadalign.estimation.scene import AlignedScene, SceneObject
+    from cadalign.estimation.scene import AlignedScene
+    from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.view import View
     from cadalign.io.observation import Observation, ObservationChanges
     from cadalign.render import OverlayStyle
@@ -220,7 +221,8 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
     Writes scene.json, which tells what the objects share, and for every object a folder with its
     observation, fit.json and overlay.png.
     """
-    from cadalign.estimation.scene import SceneObject, align_scene
+    from cadalign.estimation.scene import align_scene
+    from cadalign.estimation.scene_messages import SceneObject
 
     with named_as_flags(command, command.fitting, command.ransac):
         seen = _observations(command, path, data)

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.scene import AlignedScene, SceneObject, align_scene
+    from cadalign.estimation.scene import AlignedScene, align_scene
+    from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.tracks.motion import Motion, PoseAt, Trajectory
     from cadalign.estimation.tracks.tracker import Tracker, TrackUpdate
     from cadalign.estimation.uncertainty.advice import Advice, rank_evidence

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import numpy as np
@@ -17,16 +18,7 @@ from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.prepared_views import (
-    check_first,
-    check_sides,
-    facing_inits,
-    facing_view,
-    numbered_without,
-    turned_back,
-    views_without_pose,
-    with_views_left_out,
-)
+from cadalign.estimation.prepared_views import align_facing, align_without, views_without_pose
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
@@ -156,13 +148,10 @@ def align(
     if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
+    align_some = partial(_align_all, model, size, options, ransac, start)
     if needs_facing([view.camera for view in given]):
-        facing = [facing_view(view, number) for number, view in enumerate(given)]
-        if ransac is None:
-            check_sides(facing)
-        inits = facing_inits(inits, facing)
-        return turned_back(_align_all(model, facing, inits, size, options, ransac, start), given)
-    return _align_all(model, given, inits, size, options, ransac, start)
+        return align_facing(given, inits, align_some, may_surround=ransac is not None)
+    return align_some(given, inits)
 
 
 def _align_cropped(
@@ -194,12 +183,12 @@ def _align_cropped(
 
 def _align_all(
     model: Model | ShapeModel,
-    views: Sequence[View],
-    inits: Sequence[Alignment | None],
     size: Size | None,
     options: FitOptions,
     ransac: RansacOptions | None,
     start: float,
+    views: Sequence[View],
+    inits: Sequence[Alignment | None],
 ) -> Result:
     """All stages of an estimate of what was checked, which was begun at ``start`` [s]."""
     lenses = Lenses.of(views, options.focal, options.focal_prior)
@@ -208,12 +197,8 @@ def _align_all(
     prior = prior_of(model)
     left_out = views_without_pose(prior, views, inits)
     if left_out:
-        check_first(left_out)
-        used = [number for number in range(len(views)) if number not in left_out]
-        others, known = [views[number] for number in used], [inits[number] for number in used]
-        with numbered_without(left_out, len(views)):
-            found_by_used = _align_all(model, others, known, size, options, ransac, start)
-        return with_views_left_out(found_by_used, prior, views, left_out)
+        align_some = partial(_align_all, model, size, options, ransac, start)
+        return align_without(left_out, prior, views, inits, align_some)
     problem = JointProblem(prior, views, size, options, lenses)
     if is_mask_alone(model, views, inits):
         from cadalign.estimation.contours.proposals import minima_of_mask  # with OpenCV and embree
@@ -228,25 +213,24 @@ def _align_all(
             where="views",
             fix="give at least 3 keypoints in one view, or `init`, and check which is which",
         )
-    masks = None
+    refined = []
     if any(view.mask is not None for view in views):
         from cadalign.estimation.contours.depth import fit_depths
         from cadalign.estimation.contours.fit import fit_masks  # with OpenCV and embree
 
-        masks = fit_masks(model, prior, views, fit_depths(model, prior, views, minima))
-        minima = masks.minima
-    photos = None
-    if any(view.image is not None for view in views):
+        refined.append(fit_masks(model, prior, views, fit_depths(model, prior, views, minima)))
+        minima = refined[-1].minima
+    if any(view.image is not None and view.mask is None for view in views):
         from cadalign.estimation.contours.photo import fit_photos  # with OpenCV and embree
 
-        photos = fit_photos(model, prior, views, minima)
-        minima = photos.minima
+        refined.append(fit_photos(model, prior, views, minima))
+        minima = refined[-1].minima
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
     result = result_of_minima(model, problem, likely, stats, mistake=mistake)
-    if masks is not None:
-        result = masks.noted_in(result)
-    return result if photos is None else photos.noted_in(result)
+    for each in refined:
+        result = each.noted_in(result)
+    return result
 
 
 def align_batch(

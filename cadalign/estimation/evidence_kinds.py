@@ -101,13 +101,7 @@ class EvidenceKind:
 
 
 def upward(field: str, prior: ShapePrior) -> FloatArray:
-    """The model's up axis (3,).
-
-    Raises
-    ------
-    InputError
-        If it has none; names the ``field`` that asks for it.
-    """
+    """The model's up axis (3,); without one an InputError names the ``field`` that asks for it."""
     if prior.up is None:
         fix = f"learn it with an up axis, or leave `{field}` away"
         raise InputError("the model has no up axis", where=field, fix=fix)
@@ -214,7 +208,7 @@ def known_of(
 
     Raises InputError if the model does not allow one.
     """
-    found = [(0, -1, known) for known in _lengths(size, prior)]
+    found: list[tuple[int, int, Known]] = [(0, -1, known) for known in _lengths(size, prior)]
     for view, given in enumerate(views):
         for number, kind in enumerate(_KINDS, start=1):
             if kind.field not in given:
@@ -225,9 +219,26 @@ def known_of(
                 where = f"views[{view}].{error.where}"
                 raise InputError(error.what, where=where, fix=error.fix) from None
             found.extend((number, view, each) for each in told)
-    seen = [each for each in found if isinstance(each[2], KnownDirection)]
-    far = [each for each in found if isinstance(each[2], KnownDistance)]
-    return _directions(seen), _offsets(far)
+    seen = [(each, kind, view) for kind, view, each in found if isinstance(each, KnownDirection)]
+    far = [(each, kind, view) for kind, view, each in found if isinstance(each, KnownDistance)]
+    directions, offsets = [each for each, _, _ in seen], [each for each, _, _ in far]
+    return (
+        Directions(
+            np.array([each.model for each in directions], dtype=float).reshape(-1, 3),
+            np.array([each.camera for each in directions], dtype=float).reshape(-1, 3),
+            np.array([view for _, _, view in seen], dtype=np.int64),
+            np.array([each.whitening for each in directions]).reshape(-1, 3, 3),
+            np.array([kind for _, kind, _ in seen], dtype=np.int64),
+        ),
+        Offsets(
+            np.array([each.ends for each in offsets], dtype=np.int64).reshape(-1, 2),
+            np.array([view for _, _, view in far], dtype=np.int64),
+            np.array([each.direction for each in offsets], dtype=float).reshape(-1, 3),
+            np.array([each.value for each in offsets], dtype=float),
+            np.array([1.0 / each.sigma for each in offsets], dtype=float),
+            np.array([kind for _, kind, _ in far], dtype=np.int64),
+        ),
+    )
 
 
 def _lengths(size: Size | None, prior: ShapePrior) -> list[Known]:
@@ -245,29 +256,3 @@ def _lengths(size: Size | None, prior: ShapePrior) -> list[Known]:
         ends = (corners, corners + 1)
         found.append(KnownDistance(ends, np.eye(3)[axis], float(size.lengths[axis]), sigma))
     return found
-
-
-_Numbered = tuple[int, int, Any]  # kind, view, what is known
-
-
-def _directions(found: Sequence[_Numbered]) -> Directions:
-    known: list[KnownDirection] = [each for _, _, each in found]
-    return Directions(
-        np.array([each.model for each in known], dtype=float).reshape(-1, 3),
-        np.array([each.camera for each in known], dtype=float).reshape(-1, 3),
-        np.array([view for _, view, _ in found], dtype=np.int64),
-        np.array([each.whitening for each in known]).reshape(-1, 3, 3),
-        np.array([kind for kind, _, _ in found], dtype=np.int64),
-    )
-
-
-def _offsets(found: Sequence[_Numbered]) -> Offsets:
-    known: list[KnownDistance] = [each for _, _, each in found]
-    return Offsets(
-        np.array([each.ends for each in known], dtype=np.int64).reshape(-1, 2),
-        np.array([view for _, view, _ in found], dtype=np.int64),
-        np.array([each.direction for each in known], dtype=float).reshape(-1, 3),
-        np.array([each.value for each in known], dtype=float),
-        np.array([1.0 / each.sigma for each in known], dtype=float),
-        np.array([kind for kind, _, _ in found], dtype=np.int64),
-    )

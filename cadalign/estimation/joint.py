@@ -29,7 +29,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior, is_exact, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.search import JointProblem, Minimum, Track
+from cadalign.estimation.search import JointProblem, Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
     SAME_SQUARES,
@@ -53,11 +53,11 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import Equal, group_of
+from cadalign.geometry.symmetry_group import group_of
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.tails import inflation_with
 from cadalign.solvers.joint.covariance import JointCovariance, joint_covariance
-from cadalign.solvers.joint.evidence import Evidence, State, points_of
+from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 
 _Held = tuple[bool, bool, bool]
@@ -131,7 +131,12 @@ def result_of(
             *(
                 text
                 for number, view in enumerate(views)
-                for text in _outside(view, number, len(views), not warnings)
+                for text in outside_image(
+                    cast(FloatArray, view.points_2d),
+                    view.camera,
+                    agree=not warnings,
+                    where=f"views[{number}]: " if len(views) > 1 else "",
+                )
             ),
             *weaknesses(pose, uncertainty_of(covariances[0])),
             *warnings,
@@ -175,12 +180,6 @@ def result_of(
         ),
         **of_result,
     )
-
-
-def _outside(view: View, number: int, count: int, agree: bool) -> tuple[str, ...]:
-    """Warning about keypoints outside of one of so many views' images."""
-    where = f"views[{number}]: " if count > 1 else ""
-    return outside_image(cast(FloatArray, view.points_2d), view.camera, agree=agree, where=where)
 
 
 def result_of_minima(
@@ -259,7 +258,14 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
     if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         sighted = np.unique(evidence.sightings.point)
         widen_box(stretched, sighted[sighted < keypoints])
-    found = _covariance(evidence, state, minimum.track)
+    track = minimum.track
+    if track is None:
+        found = joint_covariance(evidence, state)
+    else:
+        from cadalign.solvers.joint.tracks import Path, moving_covariance  # kernels of tracks
+
+        moving = moving_covariance(evidence, track.motion, Path(state, track.velocities)).joint
+        found = JointCovariance(*(track.widening * part for part in moving))
     return Estimate(
         stretched / scale,
         scale,
@@ -274,15 +280,6 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
         likelihood,
         tuple(minimum.lenses.cameras_at(state.log_focals)),
     )
-
-
-def _covariance(evidence: Evidence, state: State, track: Track | None) -> JointCovariance:
-    if track is None:
-        return joint_covariance(evidence, state)
-    from cadalign.solvers.joint.tracks import Path, moving_covariance  # kernels of tracks alone
-
-    found = moving_covariance(evidence, track.motion, Path(state, track.velocities)).joint
-    return JointCovariance(*(track.widening * part for part in found))
 
 
 def _in_rig(views: Sequence[View], minimum: Minimum, best: Estimate) -> Alignment | None:
@@ -383,7 +380,11 @@ def _canonical(estimate: Estimate, symmetry: Symmetry, held: _Held) -> Estimate:
         poses.append(equal.alignment)
         covariances.append(without_free_turns(carried(covariance, given, equal), equal))
     points = best.relabelled(estimate.points)
-    points[-2:] = _turned_box(estimate.points[-2:], best)
+    entries = np.abs(turn)
+    if (np.minimum(entries, 1 - entries) > _ALONG_AXES).any():
+        points[-2:] = estimate.points[-2:]  # a box that leaves the axes stays as the symmetric is
+    else:
+        points[-2:] = np.sort(points[-2:], axis=0)
     return estimate._replace(
         points=points,
         scale=scale,
@@ -392,11 +393,3 @@ def _canonical(estimate: Estimate, symmetry: Symmetry, held: _Held) -> Estimate:
         covariances=tuple(covariances),
         of_points=turn.T @ estimate.of_points @ turn,
     )
-
-
-def _turned_box(corners: FloatArray, best: Equal) -> FloatArray:
-    """Corners (2, 3) of the object's box; a box that leaves the axes stays as the symmetric is."""
-    entries = np.abs(best.motion[:3, :3])
-    if (np.minimum(entries, 1 - entries) > _ALONG_AXES).any():
-        return corners
-    return np.sort(best.relabelled(corners), axis=0)

@@ -94,9 +94,25 @@ def _without(
     problem: JointProblem, mistake: Mistake, ransac: RansacOptions | None
 ) -> Minimum | None:
     """The likeliest minimum after a mistake is undone, if there is one."""
-    unknown = [None] * len(problem.views)  # starts are of the data as given
+
+    def undone(points: FloatArray) -> FloatArray:
+        points = mistake.undo_3d(points)
+        if mistake.mirrored:  # the last two stay the box's least and greatest
+            points[..., -2:, 0] = points[..., :-3:-1, 0].copy()
+        return points
+
+    components = tuple(
+        shape._replace(mean=undone(shape.mean), modes=undone(shape.modes))
+        for shape in problem.prior.components
+    )
+    views = [
+        replace(each, points_2d=mistake.undo_2d(cast(FloatArray, each.points_2d), each.camera))
+        for each in problem.views
+    ]
+    prior = replace(problem.prior, components=components)
+    unknown = [None] * len(views)  # starts are of the data as given
     try:
-        minima, _, _ = minima_at_noise(_undone_in(problem, mistake), unknown, ransac)
+        minima, _, _ = minima_at_noise(problem._replace(prior=prior, views=views), unknown, ransac)
     except CadalignError:
         return None
     return minima[0] if minima else None
@@ -119,24 +135,3 @@ def _explained(problem: JointProblem, minimum: Minimum, ransac: RansacOptions) -
     anywhere = 2 * np.log(areas * squares / (2 * math.pi * error**2))
     score = minimum.score + float((anywhere - squares - OUTLIER_COST).sum())
     return Explained(score, int(minimum.inliers.sum()), _up(minimum))
-
-
-def _undone_in(problem: JointProblem, mistake: Mistake) -> JointProblem:
-    """The problem with a mistake in the model or in the keypoints of all views undone."""
-    components = tuple(
-        shape._replace(mean=_undone(mistake, shape.mean), modes=_undone(mistake, shape.modes))
-        for shape in problem.prior.components
-    )
-    views = [
-        replace(each, points_2d=mistake.undo_2d(cast(FloatArray, each.points_2d), each.camera))
-        for each in problem.views
-    ]
-    return problem._replace(prior=replace(problem.prior, components=components), views=views)
-
-
-def _undone(mistake: Mistake, points: FloatArray) -> FloatArray:
-    """Points (..., m, 3) without a mistake; the last two stay the box's least and greatest."""
-    undone = mistake.undo_3d(points)
-    if mistake.mirrored:
-        undone[..., -2:, 0] = undone[..., :-3:-1, 0].copy()
-    return undone

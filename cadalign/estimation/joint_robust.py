@@ -118,9 +118,8 @@ def _settle(
 
 
 def whitened_lengths(evidence: Evidence, state: State) -> FloatArray:
-    """Whitened lengths (N,) of all residuals in the image; infinite behind a camera."""
-    across, down = whitened_residuals(evidence, state).T
-    return np.asarray(np.hypot(across, down))
+    """Lengths (N,) of `whitened_residuals`."""
+    return np.asarray(np.hypot(*whitened_residuals(evidence, state).T))
 
 
 def whitened_residuals(evidence: Evidence, state: State) -> FloatArray:

@@ -120,13 +120,7 @@ class Model:
 
 
 def check_axis(axis: object) -> None:
-    """Refuse what is neither an axis nor None.
-
-    Raises
-    ------
-    InputError
-        If it is that.
-    """
+    """Refuse what is neither an axis nor None."""
     if axis is not None and axis not in ("x", "y", "z"):
         fix = "give x, y, z, or None"
         raise InputError(f"{quote(axis)} is no axis", where="up_axis", fix=fix)

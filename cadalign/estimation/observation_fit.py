@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, cast
 
 from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
@@ -27,20 +27,6 @@ if TYPE_CHECKING:
 _OF_THE_MODEL = ("stretch", "known_axis", "stretch_sigma")  # options that a learned shape lacks
 Note = Callable[[str], object]
 """What is told about an estimate, such as the source of its focal length."""
-
-
-_PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-
-
-def refuse_photo(path: Path) -> None:
-    """Refuse an image in the place of an observation, and say what makes one."""
-    if path.suffix.lower() in _PHOTOS:
-        raise InputError(
-            "a photo, not an observation, which is a JSON file with camera and keypoints",
-            where=str(path),
-            fix=f"mark keypoints with `cadalign annotate {path.name} MODEL`, which writes one, or "
-            "use a detector's with `cadalign observe`",
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,20 +107,17 @@ class ObservationFit:
 
         None is to be estimated.
         """
+        given = "similar" if self.similar else "sigma"
+        noise, own = self.named("noise"), self.named(given)
         if self.noise is not None:
-            if self.sigma is not None or self.similar:
-                other = self.named("similar" if self.similar else "sigma")
-                what = f"{self.named('noise')} has the standard deviations, which {other} gives"
-                raise InputError(what, where=other, fix="give one of the two options")
+            if self.similar or self.sigma is not None:
+                self._refuse_both(f"{noise} has the standard deviations, which {own} gives", given)
             return {}
         if self.similar:
             if self.sigma is not None:
-                similar, sigma = self.named("similar"), self.named("sigma")
-                raise InputError(
-                    f"{similar} estimates the standard deviation, which {sigma} gives",
-                    where=sigma,
-                    fix="give one of the two options",
-                )
+                sigma = self.named("sigma")
+                what = f"{own} estimates the standard deviation, which {sigma} gives"
+                self._refuse_both(what, "sigma")
             return {"sigma": None}
         if self.sigma is not None:
             return {"sigma": self.sigma}
@@ -142,11 +125,8 @@ class ObservationFit:
             return {"sigma": cast("Sigma | None", observation.fit_options["sigma"])}
         return {}
 
-    def sigma_of(self, observation: Observation) -> Sigma:
-        """Standard deviation of the keypoints: the given one, the file's, or 1."""
-        if self.sigma is not None:
-            return self.sigma
-        return 1.0 if observation.sigma is None else observation.sigma
+    def _refuse_both(self, what: str, name: str) -> NoReturn:
+        raise InputError(what, where=self.named(name), fix="give one of the two options")
 
     def options_for(
         self, observation: Observation, where: str, note: Note = lambda text: None
@@ -184,7 +164,8 @@ class ObservationFit:
             )
         else:
             prior = None
-        sigma = self.stated_sigma(observation).get("sigma", self.sigma_of(observation))
+        own = 1.0 if observation.sigma is None else observation.sigma
+        sigma = self.stated_sigma(observation).get("sigma", own)
         changes = {**set_by_flags, "sigma": sigma, "focal": focal, "focal_prior": prior}
         chosen = replace(stored, **changes)
         return self._with_stretch_prior(chosen, is_stored="stretch_sigma" in given)
@@ -208,11 +189,8 @@ class ObservationFit:
         if not self.stretch_prior:
             if self.fitting.stretch_sigma is not None:
                 left_out, given = map(self.named, ("no_stretch_prior", "stretch_sigma"))
-                raise InputError(
-                    f"{left_out} leaves out the prior, which {given} gives",
-                    where=left_out,
-                    fix="give one of the two options",
-                )
+                what = f"{left_out} leaves out the prior, which {given} gives"
+                self._refuse_both(what, "no_stretch_prior")
             return replace(options, stretch_sigma=None)
         chosen = is_stored or options.stretch_sigma is not None
         if chosen or not self.similar or options.method != "optimal" or not options.stretched_axes:
@@ -222,11 +200,8 @@ class ObservationFit:
     def check_for(self, observation: Observation) -> None:
         """Refuse options that have no effect together with a shape or further evidence."""
         if self.shape is not None and self.shape_sigma is not None:
-            raise InputError(
-                f"{self.named('shape')} has learned how far objects of the category differ",
-                where=self.named("shape_sigma"),
-                fix="give one of the two options",
-            )
+            what = f"{self.named('shape')} has learned how far objects of the category differ"
+            self._refuse_both(what, "shape_sigma")
         learned = self.shape_of(observation)
         is_shaped = learned is not None or self.shape_sigma_of(observation) is not None
         refused = {
@@ -234,15 +209,13 @@ class ObservationFit:
             "no_stretch_prior": is_shaped and not self.stretch_prior,
         }
         for name in ("method", *(_OF_THE_MODEL if learned is not None else ())):
-            is_changed = getattr(self.fitting, name) != getattr(FitOptions, name)
-            refused[name] = is_changed
-        for name, is_given in refused.items():
-            if is_given:
-                raise InputError(
-                    f"has no effect together with {self._cause(observation)}",
-                    where=self.named(name),
-                    fix="leave out one of the two",
-                )
+            refused[name] = getattr(self.fitting, name) != getattr(FitOptions, name)
+        for name in [each for each, is_given in refused.items() if is_given]:
+            raise InputError(
+                f"has no effect together with {self._cause(observation)}",
+                where=self.named(name),
+                fix="leave out one of the two",
+            )
 
     def _cause(self, observation: Observation) -> str:
         """Name of what makes the fit more than one of a stretched model to keypoints."""
@@ -256,7 +229,12 @@ class ObservationFit:
             return "the file's shape_sigma"
         if self.image:
             return self.named("image")
-        return f"the file's {_evidence(observation)}"
+        if observation.others:
+            return "the file's views"
+        if observation.depths is not None:
+            return "the file's depth"
+        rest = "size" if observation.size else "init"
+        return f"the file's {next(iter(observation.evidence.given), rest)}"
 
     def read(
         self, data: Any, where: str, *, folder: Path | None, changes: ObservationChanges
@@ -289,92 +267,55 @@ class ObservationFit:
         note: Note = lambda text: None,
         status: AbstractContextManager[Any] | None = None,
     ) -> tuple[Result, tuple[View, ...] | None]:
-        """Align an observation.
+        """Align an observation, ``where`` is its name in messages.
 
-        Parameters
-        ----------
-        observation : Observation
-        where : str
-            Its name in messages.
-        note : callable
-            Is told the source of a focal length.
-        status : context manager, optional
-            Entered while `cadalign.align` works.
-
-        Returns
-        -------
-        Result
-        tuple of View or None
-            What was aligned; None for a stretched model's keypoints in one image.
-
-        Raises
-        ------
-        CadalignError
-            If the options or the observation are invalid, or there is no alignment.
+        ``note`` is called with the source of a focal length, ``status`` entered while
+        `cadalign.align` works. Returns the views that were aligned, too; None for a stretched
+        model's keypoints in one image. Raises CadalignError if options or observation are invalid,
+        or there is no alignment.
         """
         notes: list[str] = []
         is_plain = observation.is_plain and self.shape_of(observation) is None
         is_plain &= not self.uses_photos(observation)
-        found: tuple[Result, tuple[View, ...] | None]
+        ransac = self.ransac if self.robust else None
+        result: Result
+        views: tuple[View, ...] | None = None
         if is_plain and self.shape_sigma_of(observation) is None:
-            found = self._fit(observation, where, notes.append), None
+            from cadalign.estimation.fit import fit
+
+            options = self.options_for(observation, where, notes.append)
+            result = fit(
+                observation.points_3d,
+                observation.points_2d,
+                observation.camera,
+                **vars(options),
+                ransac=ransac,
+                scores=observation.scores if self.robust else None,
+                symmetry=observation.symmetry,
+            )
         else:
-            found = self._align(observation, where, notes.append, status or nullcontext())
+            from cadalign.estimation.align import align
+
+            model, views, options = self.problem(observation, where, notes.append)
+            names = ("loss", "loss_scale", "focal", "focal_prior", "principal_sigma")
+            chosen = {name: getattr(options, name) for name in names}
+            with status or nullcontext(), self._located(where):
+                result = align(
+                    model,
+                    views,
+                    size=observation.size,
+                    init=observation.init,
+                    ransac=ransac,
+                    **chosen,
+                )
         for text in notes:
             note(text)
-        return found
-
-    def _fit(self, observation: Observation, where: str, note: Note) -> Result:
-        """Fit the stretched model to keypoints of one image."""
-        from cadalign.estimation.fit import fit
-
-        options = self.options_for(observation, where, note)
-        return fit(
-            observation.points_3d,
-            observation.points_2d,
-            observation.camera,
-            **vars(options),
-            ransac=self.ransac if self.robust else None,
-            scores=observation.scores if self.robust else None,
-            symmetry=observation.symmetry,
-        )
-
-    def _align(
-        self,
-        observation: Observation,
-        where: str,
-        note: Note,
-        status: AbstractContextManager[Any],
-    ) -> tuple[Result, tuple[View, ...]]:
-        """Align any model to all evidence."""
-        from cadalign.estimation.align import align
-
-        model, views, options = self.problem(observation, where, note)
-        with status, self._located(where):
-            result = align(
-                model,
-                views,
-                size=observation.size,
-                init=observation.init,
-                loss=options.loss,
-                loss_scale=options.loss_scale,
-                ransac=self.ransac if self.robust else None,
-                focal=options.focal,
-                focal_prior=options.focal_prior,
-                principal_sigma=options.principal_sigma,
-            )
         return result, views
 
     def problem(
         self, observation: Observation, where: str, note: Note = lambda text: None
     ) -> tuple[Model | ShapeModel, tuple[View, ...], FitOptions]:
-        """Model, views and options of an observation for `cadalign.align`.
-
-        Raises
-        ------
-        CadalignError
-            If the options or the observation are invalid.
-        """
+        """Model, views and options of an observation for `cadalign.align`, as `fit` takes them."""
         from cadalign.estimation.observed import views_of
 
         self.check_for(observation)
@@ -436,25 +377,14 @@ def _opened(path: Path) -> ShapeModel:
     return ShapeModel.open(path)
 
 
-def _evidence(observation: Observation) -> str:
-    """Name of the first field of a file that `cadalign.fit` does not take."""
-    if observation.others:
-        return "views"
-    if observation.depths is not None:
-        return "depth"
-    return next(iter(observation.evidence.given), "size" if observation.size else "init")
-
-
 def _prior_of_photos(observation: Observation, note: Note) -> FocalPrior | None:
     """The prior of the first photo's EXIF data, unless those of another photo differ from it."""
     if observation.image is None:
         return None
     first = FocalPrior.from_exif(observation.image)
-    for view in observation.others:
-        other = None if first is None or view.image is None else FocalPrior.from_exif(view.image)
-        if first is None or other is None:
-            continue
-        if not first.is_like(other):
+    photos = [view.image for view in observation.others if view.image is not None]
+    for other in map(FocalPrior.from_exif, photos if first is not None else ()):
+        if first is not None and other is not None and not first.is_like(other):
             note(
                 f"The photos' EXIF data differ ({first.focal:.4g} and {other.focal:.4g} px): unused"
             )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import nullcontext
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,8 +13,6 @@ from cadalign.errors import CadalignError, InputError, quote
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import within
 from cadalign.io.evidence import ObservedImage, as_arguments
@@ -105,8 +102,20 @@ def views_of(
     for number, image in enumerate(observation.views):
         with within(f"views[{number}]") if observation.others else nullcontext():
             ids = shape_ids(image, model) if isinstance(model, ShapeModel) else own[number]
-            photo = image.image if with_photos else None
-            views.append(_view(image, ids, sigma, photo))
+            evidence = image.evidence.given
+            if image.depths is not None:
+                evidence["depth"] = image.depths
+            own_sigma = 1.0 if image.sigma is None else image.sigma
+            view = View(
+                image.camera,
+                image.points_2d,
+                ids=ids,
+                sigma=own_sigma if sigma is None else sigma,
+                scores=image.scores,
+                image=image.image if with_photos else None,
+                **as_arguments(evidence),
+            )
+            views.append(view)
     return tuple(views)
 
 
@@ -152,49 +161,17 @@ def own_ids(images: Sequence[ObservedImage]) -> tuple[tuple[Hashable, ...], ...]
     )
 
 
-def _view(
-    image: ObservedImage, ids: Sequence[Hashable], sigma: Sigma | None, photo: Path | None
-) -> View:
-    evidence = image.evidence.given
-    if image.depths is not None:
-        evidence["depth"] = image.depths
-    if sigma is None:
-        sigma = 1.0 if image.sigma is None else image.sigma
-    return View(
-        image.camera,
-        image.points_2d,
-        ids=ids,
-        sigma=sigma,
-        scores=image.scores,
-        image=photo,
-        **as_arguments(evidence),
-    )
-
-
-class PosedPhoto(Protocol):
-    """A photo of a reconstruction, such as `cadalign.datasets.Correspondences`."""
-
-    @property
-    def camera(self) -> Camera:
-        """The calibrated camera."""
-
-    @property
-    def cam_from_world(self) -> Alignment:
-        """Its pose."""
-
-
 class Reconstruction(Protocol):
     """Photos by their names, such as `cadalign.datasets.Colmap`."""
 
-    def __getitem__(self, name: str, /) -> PosedPhoto:
-        """One photo."""
-
-
-ObservedKeypoints = tuple[npt.ArrayLike, Sequence[Hashable] | None]
+    def __getitem__(self, name: str, /) -> Any:
+        """One photo: its ``camera`` and its ``cam_from_world``, an `Alignment`."""
 
 
 def views_from(
-    images: Reconstruction, keypoints: Mapping[str, ObservedKeypoints], **options: Any
+    images: Reconstruction,
+    keypoints: Mapping[str, tuple[npt.ArrayLike, Sequence[Hashable] | None]],
+    **options: Any,
 ) -> list[View]:
     """Views with the cameras and the known poses of a reconstruction's photos.
 

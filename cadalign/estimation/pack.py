@@ -21,7 +21,6 @@ from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import (
-    Directions,
     Evidence,
     Offsets,
     Planes,
@@ -34,7 +33,6 @@ from cadalign.solvers.joint.evidence import (
 )
 from cadalign.solvers.marginal.problem import Seen
 
-_NO_RIG = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
 _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
@@ -68,11 +66,18 @@ def evidence_of(
         for number, view in enumerate(views)
     ]
     for number, view in enumerate(views):
-        if frames is None:
-            _check_view(view, number)
+        if frames is None and not tells_something(view):
+            fix = "give keypoints, a mask or a direction, or leave the view away"
+            raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
     directions, offsets = known_of(prior, [view.given for view in views], size)
     if any(camera.turn for camera in lenses.cameras):
-        directions = _in_turned_frames(directions, lenses.cameras)
+        # What is known in the lenses' frames, in those of cameras that are turned.
+        turns = np.array([lenses.cameras[image].lens_from_camera for image in directions.image])
+        turns = turns.reshape(-1, 3, 3)
+        directions = directions._replace(
+            camera=np.einsum("dij,di->dj", turns, directions.camera),
+            whitening=directions.whitening @ turns,
+        )
     return Evidence(
         prior.components[0],
         _sightings(rows, views, lenses.cameras, noise, loss, loss_scale),
@@ -80,18 +85,8 @@ def evidence_of(
         lenses.focals(),
         directions,
         offsets,
-        sampled_planes(prior.components[0], rows, views),
+        _sampled_planes(prior.components[0], rows, views),
         scale_priors(prior, _is_metric(offsets, views, frames)),
-    )
-
-
-def _in_turned_frames(directions: Directions, cameras: Sequence[Camera]) -> Directions:
-    """Directions that are known in the lenses' frames, in those of cameras that are turned."""
-    turns = np.array([cameras[image].lens_from_camera for image in directions.image])
-    turns = turns.reshape(-1, 3, 3)
-    return directions._replace(
-        camera=np.einsum("dij,di->dj", turns, directions.camera),
-        whitening=directions.whitening @ turns,
     )
 
 
@@ -100,20 +95,14 @@ def _is_metric(offsets: Offsets, views: Sequence[View], frames: Sequence[int] | 
     depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
     if len(offsets.value) or any(np.isfinite(depth).any() for depth in depths):
         return True
-    if frames is not None:  # several cameras at one time
-        return len(set(frames)) < len(frames) and views[0].cam_from_rig is not None
-    return len(views) > 1 and views[0].cam_from_rig is not None
+    times = 1 if frames is None else len(set(frames))  # of several cameras each
+    return len(views) > times and views[0].cam_from_rig is not None
 
 
-def _check_view(view: View, number: int) -> None:
-    if (
-        not len(view.keypoint_ids)
-        and view.mask is None
-        and view.image is None
-        and not is_told(view.given)
-    ):
-        fix = "give keypoints, a mask or a direction, or leave the view away"
-        raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
+def tells_something(view: View) -> bool:
+    """True if a view has any evidence about the object."""
+    has_image = view.mask is not None or view.image is not None
+    return bool(len(view.keypoint_ids)) or has_image or is_told(view.given)
 
 
 def _sightings(
@@ -165,16 +154,15 @@ def _rig(views: Sequence[View], frames: Sequence[int] | None) -> Rig:
             where=f"views[{posed.index(False)}].cam_from_rig",
             fix="give it for all views, or for none",
         )
-    if not all(posed):
-        own = np.arange(len(views)) if frames is None else np.array(frames)
-        return Rig(np.tile(_NO_RIG, (len(views), 1)), own.astype(np.int64))
-    cameras = [cast(FloatArray, view.cam_from_rig) for view in views]
-    rows = [np.concatenate([pose[:3, :3].ravel(), pose[:3, 3]]) for pose in cameras]
-    shared = np.zeros(len(views)) if frames is None else np.array(frames)
-    return Rig(np.array(rows), shared.astype(np.int64))
+    is_rig = all(posed)
+    motions = [view.cam_from_rig if is_rig else np.eye(4) for view in views]
+    rows = [np.append(pose[:3, :3], pose[:3, 3]) for pose in cast("list[FloatArray]", motions)]
+    if frames is None:
+        frames = [0] * len(views) if is_rig else range(len(views))
+    return Rig(np.array(rows), np.array(frames, dtype=np.int64))
 
 
-def sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> Planes:
+def _sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> Planes:
     """Depths of the keypoints ``rows`` of every view that its depth image holds.
 
     They count under Cauchy's loss: a keypoint may be hidden by something nearer.

@@ -7,8 +7,7 @@ determine no pose are left out.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import cast
 
@@ -16,15 +15,14 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.evidence_kinds import is_told
 from cadalign.estimation.facing import (
     faced,
     rays_ahead,
     turned_alignment,
     turned_covariance,
 )
-from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.pack import evidence_of, tells_something
+from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.problems import are_on_a_line
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import ViewResult
@@ -35,6 +33,9 @@ from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.evidence import State
 from cadalign.solvers.joint.search import refine_joint
+
+Align = Callable[[Sequence[View], Sequence[Alignment | None]], Result]
+"""Alignment of some views, with a start or None for each."""
 
 _LEAST_POINTS = 3
 _ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
@@ -61,37 +62,35 @@ def views_without_pose(
         number
         for number, view in enumerate(views)
         if inits[number] is None
-        and (
-            len(view.keypoint_ids)
-            or view.mask is not None
-            or view.image is not None
-            or is_told(view.given)
-        )
+        and tells_something(view)
         and lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
     ]
 
 
-def check_first(without_pose: Sequence[int]) -> None:
-    """Refuse a first view that is left out, for its camera's frame is that of the result.
+def align_without(
+    left_out: Sequence[int],
+    prior: ShapePrior,
+    views: Sequence[View],
+    inits: Sequence[Alignment | None],
+    align_some: Align,
+) -> Result:
+    """Align the views that are not ``left_out``; the result is that of all of them.
 
-    Raises DegenerateError if it is among the numbers.
+    The pose of a view that is left out is one of those that explain its keypoints. Raises
+    DegenerateError if it is the first one, whose camera's frame is that of the result.
     """
-    if 0 in without_pose:
+    if 0 in left_out:
         raise DegenerateError(
             "its keypoints do not determine its pose, and the result is in its camera's frame",
             where="views[0]",
             fix="give at least 3 keypoints, not on one line, or another view first",
         )
-
-
-def with_views_left_out(
-    result: Result, prior: ShapePrior, views: Sequence[View], left_out: Sequence[int]
-) -> Result:
-    """The result of all views from that of the views that are not ``left_out``.
-
-    The pose of a view that is left out is one of those that explain its keypoints.
-    """
     used = [number for number in range(len(views)) if number not in left_out]
+    try:
+        result = align_some([views[n] for n in used], [inits[n] for n in used])
+    except CadalignError as error:  # names views by their numbers among those that are used
+        where = error.where and _renumbered(error.where, used)
+        raise type(error)(_renumbered(error.what, used), where=where, fix=error.fix) from None
     of_views = dict(zip(used, result.views, strict=True))
     masks = dict(zip(used, result.mask_residuals, strict=bool(result.mask_residuals)))
     estimated = dict(zip((views[n].camera for n in used), result.cameras, strict=True))
@@ -130,17 +129,6 @@ def with_views_left_out(
     )
 
 
-@contextmanager
-def numbered_without(left_out: Sequence[int], count: int) -> Iterator[None]:
-    """Let errors about the views that are used name these by their numbers among all views."""
-    used = [number for number in range(count) if number not in left_out]
-    try:
-        yield
-    except CadalignError as error:
-        where = error.where and _renumbered(error.where, used)
-        raise type(error)(_renumbered(error.what, used), where=where, fix=error.fix) from None
-
-
 def _renumbered(text: str, used: Sequence[int]) -> str:
     return re.sub(r"views\[(\d+)\]", lambda found: f"views[{used[int(found[1])]}]", text)
 
@@ -177,11 +165,7 @@ def _explaining(prior: ShapePrior, view: View, camera: Camera, result: Result) -
         return result.alignment
     evidence = evidence_of(prior, [alone], None, loss=LINEAR, loss_scale=1.0)
     points = np.concatenate([result.points_3d, result.bounds])
-    shape = evidence.shape
-    evidence = evidence._replace(
-        shape=shape._replace(mean=points, modes=shape.modes[:0], spread=np.zeros(len(points))),
-        scales=evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3))),
-    )
+    evidence = with_known_shape(evidence, points)
     first = result.alignment
     state = State(
         np.append(first.rotation.ravel(), first.translation)[None],
@@ -197,10 +181,7 @@ def _explaining(prior: ShapePrior, view: View, camera: Camera, result: Result) -
 def facing_view(view: View, number: int = 0) -> View:
     """The view in the frame that faces its keypoints; ``up`` and the like stay in the lens's.
 
-    Raises
-    ------
-    InputError
-        If the view, with a wide lens, has a mask or depths.
+    Raises InputError if the view, with a wide lens, has a mask or depths.
     """
     if not needs_facing([view.camera]):
         return view
@@ -216,38 +197,32 @@ def facing_view(view: View, number: int = 0) -> View:
     return replace(view, camera=camera, cam_from_rig=rig)
 
 
-def check_sides(views: Sequence[View]) -> None:
-    """Refuse keypoints all around a camera, in views that `facing_view` made.
+def align_facing(
+    given: Sequence[View],
+    inits: Sequence[Alignment | None],
+    align_some: Align,
+    *,
+    may_surround: bool,
+) -> Result:
+    """Align views in the frames of `facing_view`; the result is in those that were given.
 
-    Raises
-    ------
-    InputError
-        If a wide lens has them.
+    Raises InputError if keypoints lie all around a wide lens, unless they ``may_surround`` it.
     """
+    views = [facing_view(view, number) for number, view in enumerate(given)]
     for view in views:
-        if view.camera.is_wide:
+        if view.camera.is_wide and not may_surround:
             rays_ahead(cast(FloatArray, view.points_2d), view.camera)
-
-
-def facing_inits(
-    inits: Sequence[Alignment | None], views: Sequence[View]
-) -> list[Alignment | None]:
-    """Starts in the frames of `facing_view`; a start in the rig's frame stays."""
-    if views[0].cam_from_rig is not None:
-        return list(inits)
-    return [
-        None if init is None else turned_alignment(init, view.camera.lens_from_camera.T)
-        for init, view in zip(inits, views, strict=True)
-    ]
-
-
-def turned_back(result: Result, given: Sequence[View]) -> Result:
-    """The result in the frames of the views that were given, from that of their `facing_view`s."""
+    if views[0].cam_from_rig is None:  # a start in the rig's frame stays
+        inits = [
+            None if init is None else turned_alignment(init, view.camera.lens_from_camera.T)
+            for init, view in zip(inits, views, strict=True)
+        ]
+    result = align_some(views, inits)
     statistics = _turned(result.statistics, result.camera.lens_from_camera)
-    views = []
+    turned = []
     for number, (own, view) in enumerate(zip(result.views, given, strict=True)):
         turn = own.camera.lens_from_camera if view.camera.is_wide else np.eye(3)
-        views.append(
+        turned.append(
             replace(
                 own,
                 camera=view.camera if view.camera.is_wide else own.camera,
@@ -257,10 +232,10 @@ def turned_back(result: Result, given: Sequence[View]) -> Result:
         )
     turn = result.camera.lens_from_camera
     others = [
-        replace(each, alignment=turned_alignment(each.alignment, turn), camera=views[0].camera)
+        replace(each, alignment=turned_alignment(each.alignment, turn), camera=given[0].camera)
         for each in result.alternatives
     ]
-    return replace(result, views=tuple(views), statistics=statistics, alternatives=tuple(others))
+    return replace(result, views=tuple(turned), statistics=statistics, alternatives=tuple(others))
 
 
 def _turned(statistics: Statistics, turn: FloatArray) -> Stated:

@@ -169,6 +169,15 @@ def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, 
     return evidence._replace(shape=wide), state._replace(coefficients=state.coefficients / factor)
 
 
+def with_known_shape(evidence: Evidence, points: FloatArray) -> Evidence:
+    """The evidence about known points (m, 3), whose stretch stays."""
+    shape, scales = evidence.shape, evidence.scales
+    return evidence._replace(
+        shape=Shape(points, shape.modes[:0], np.zeros(len(points))),
+        scales=scales._replace(free=np.zeros(3), precision=np.zeros((3, 3))),
+    )
+
+
 def is_exact(evidence: Evidence) -> bool:
     """True if the shape is known but for its scales."""
     return not (len(evidence.shape.modes) or evidence.shape.spread.any())
@@ -205,6 +214,10 @@ class Lenses:
         return max(self.groups, default=-1) + 1
 
     @property
+    def _firsts(self) -> list[Camera]:
+        return [self.cameras[self.groups.index(group)] for group in range(self.count)]
+
+    @property
     def have_distortion(self) -> bool:
         """True if an unknown lens has distortion."""
         return any(
@@ -214,8 +227,7 @@ class Lenses:
 
     def focals(self) -> Focals:
         """Bounds and priors in the form of the kernels."""
-        firsts = [self.cameras[self.groups.index(group)] for group in range(self.count)]
-        ranges = [log_focal_range(camera, self.prior, camera.fx) for camera in firsts]
+        ranges = [log_focal_range(camera, self.prior, camera.fx) for camera in self._firsts]
         columns = np.ascontiguousarray(np.array(ranges).reshape(-1, 4).T)
         return Focals(np.array(self.groups, dtype=np.int64), *columns)
 
@@ -232,8 +244,7 @@ class Lenses:
 
     def grid(self) -> list[FloatArray]:
         """Focal lengths to start from: (F,) logarithms relative to the references, each."""
-        firsts = [self.cameras[self.groups.index(group)] for group in range(self.count)]
-        grids = [np.log(focal_grid(camera, self.prior) / camera.fx) for camera in firsts]
+        grids = [np.log(focal_grid(camera, self.prior) / camera.fx) for camera in self._firsts]
         return list(np.array(grids).T) if grids else [np.zeros(0)]
 
     @staticmethod

@@ -20,59 +20,30 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_positive
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
 from cadalign.estimation.align import align
-from cadalign.estimation.evidence_kinds import lowest_corner, upward
+from cadalign.estimation.evidence_kinds import upward
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
-from cadalign.estimation.model import Model
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.estimation.scene_messages import (
-    NOTHING,
     PARTS,
     UP,
+    Member,
     SceneMessage,
+    SceneObject,
     SharedUnknowns,
     as_prior,
 )
 from cadalign.estimation.uncertainty.residuals import chi_square_tail
 from cadalign.estimation.uncertainty.summary import Uncertainty
-from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.io.evidence import Size
-from cadalign.shapes.model import ShapeModel
 
 SHARED = tuple(PARTS)
 _WORDS = {"focal": "focal length", "gravity": "direction of gravity", "ground": "ground"}
 _ROUNDS = 8
 _SETTLED = 0.02  # change of the shared unknowns that ends the rounds, in standard deviations
 _FALSE_ALARMS = 1e-4  # of objects that agree
-_LOWEST = 1e-6  # height of a camera above the ground
-
-
-@dataclass(frozen=True, eq=False)
-class SceneObject:
-    """An object of a photo: its model, what the photo tells, and what else is known.
-
-    Parameters
-    ----------
-    model : Model or ShapeModel
-    view : View
-        Of the scene's photo; all objects' views have the same camera.
-    size : Size, optional
-        Known lengths of the object.
-    init : Alignment, optional
-        A start, as for `cadalign.align`.
-    name : str, optional
-        Name in messages; by default its number.
-    """
-
-    model: Model | ShapeModel
-    view: View
-    size: Size | None = None
-    init: Alignment | None = None
-    name: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,62 +107,6 @@ class AlignedScene:
         return "\n".join(lines)
 
 
-@dataclass(frozen=True, eq=False)
-class _Member:
-    """An object, what it shares, its result, and the prior that this was given."""
-
-    number: int
-    given: SceneObject
-    shared: tuple[str, ...]
-    had: SharedUnknowns
-    result: Result
-
-    @property
-    def name(self) -> str:
-        return self.given.name or f"objects[{self.number}]"
-
-    @property
-    def tells(self) -> list[int]:
-        """The shared unknowns that it tells of: the height only where its size is known."""
-        parts = list(self.shared)
-        if "ground" in parts and self.given.size is None and self.given.view.depth is None:
-            parts.remove("ground")
-        return [k for part in parts for k in range(4)[PARTS[part]]]
-
-    def values(self, reference: SharedUnknowns) -> SharedUnknowns:
-        """The shared unknowns as the result has them, with their covariance."""
-        pose, covariance = self.result.alignment, self.result.covariance
-        assert covariance is not None
-        up, height, lowest = reference.up, reference.height, np.zeros(3)
-        if "gravity" in self.shared:
-            model_up = upward("share", prior_of(self.given.model))
-            up = pose.rotation @ model_up
-            lowest = model_up * pose.scale * self.result.bounds[lowest_corner(model_up)]
-        rows = np.zeros((4, len(covariance)))
-        if "focal" in self.shared:
-            rows[0, 9] = 1.0
-        if "gravity" in self.shared:
-            turn = np.array([[0, up[2], -up[1]], [-up[2], 0, up[0]], [up[1], -up[0], 0]])
-            rows[UP, :3] = reference.across @ turn
-        if "ground" in self.shared:
-            height = max(float(-up @ pose.translation - lowest.sum()), _LOWEST)
-            rows[3, :3] = -np.cross(up, pose.translation) / height
-            rows[3, 3:6], rows[3, 6:9] = -up / height, -lowest / height
-        return SharedUnknowns(self.result.camera.fx, up, height, rows @ covariance @ rows.T)
-
-    def message(self, reference: SharedUnknowns, tilt: float) -> SceneMessage:
-        """Message of its evidence on the shared unknowns, about a reference."""
-        found, told = self.values(reference), self.tells
-        block = found.covariance[np.ix_(told, told)]
-        if not told or not np.isfinite(block).all():
-            return NOTHING
-        information = np.zeros((4, 4))
-        information[np.ix_(told, told)] = np.linalg.pinv(block, hermitian=True)
-        mean = reference.deviations(found.focal, found.up, found.height)
-        own = SceneMessage.of(mean, information) - as_prior(self.had, reference, told)
-        return own.positive(told).tilted(tilt)
-
-
 def align_scene(
     objects: Sequence[SceneObject],
     *,
@@ -249,8 +164,7 @@ def align_scene(
     >>> bool(abs(scene.camera.fx / 600 - 1) < 2 * scene.focal_std)
     True
     """
-    camera = _checked(objects, share)
-    wanted = _wanted(share, camera)
+    camera, wanted = _checked(objects, share)
     tilt = math.radians(as_positive(tilt_sigma_deg, name="tilt_sigma_deg"))
     known = _known(objects, prior_of_camera(focal_prior, camera))
     if "gravity" in wanted:
@@ -283,7 +197,7 @@ def align_scene(
             found.append(error)
             continue
         found.append(result)
-        members.append(_Member(number, each, wanted, first, result))
+        members.append(Member(number, each, wanted, first, result))
     if not members:
         raise DegenerateError(f"no object can be aligned: {found[0]}", where="objects")
     members, warnings = _agreeing(members, known, tilt)
@@ -292,7 +206,17 @@ def align_scene(
         shared, members = _settled(members, shared, known, tilt, aligned)
     for member in members:
         found[member.number] = member.result
-    return _scene(Results.of(found), camera, shared, wanted, tuple(warnings))
+    scene = AlignedScene(Results.of(found), camera, warnings=tuple(warnings))
+    if "focal" in wanted:
+        focal_std = shared.std("focal")
+        scene = replace(scene, camera=camera.with_focal(shared.focal), focal_std=focal_std)
+    if "gravity" in wanted:
+        up_std = float(np.degrees(shared.std("gravity")))
+        scene = replace(scene, up=shared.up, up_std_deg=up_std)
+    if "ground" in wanted and np.isfinite(shared.covariance[3, 3]):
+        height_std = shared.std("ground")
+        scene = replace(scene, camera_height=shared.height, camera_height_std=height_std)
+    return scene
 
 
 def focal_prior_by_others(
@@ -334,7 +258,7 @@ def focal_prior_by_others(
     """
     given = enumerate(zip(objects, results, priors, strict=True))
     members = [
-        _Member(number, each, ("focal",), _known([], prior), result)
+        Member(number, each, ("focal",), _known([], prior), result)
         for number, (each, result, prior) in given
     ]
     own = members[0]
@@ -348,11 +272,10 @@ def focal_prior_by_others(
     return prior, tuple(warnings)
 
 
-_Aligner = Callable[[SceneObject, SharedUnknowns], Result]
-
-
-def _checked(objects: Sequence[SceneObject], share: Collection[str]) -> Camera:
-    """The objects' camera, where they and what they share are valid."""
+def _checked(
+    objects: Sequence[SceneObject], share: Collection[str]
+) -> tuple[Camera, tuple[str, ...]]:
+    """The camera of valid objects, and the unknowns that they share, in order."""
     if not isinstance(objects, Sequence) or not len(objects):
         fix = "give a list of cadalign.SceneObject"
         raise InputError("expected at least one object", where="objects", fix=fix)
@@ -368,15 +291,12 @@ def _checked(objects: Sequence[SceneObject], share: Collection[str]) -> Camera:
     if isinstance(share, str) or not set(share) <= set(SHARED):
         fix = f"give some of {', '.join(SHARED)}"
         raise InputError(f"{quote(share)} is not what objects share", where="share", fix=fix)
-    return objects[0].view.camera
-
-
-def _wanted(share: Collection[str], camera: Camera) -> tuple[str, ...]:
-    """Names of the shared unknowns, in order: the ground includes gravity."""
-    wanted = set(share) | ({"gravity"} if "ground" in share else set())
+    camera, wanted = objects[0].view.camera, set(share)
+    if "ground" in wanted:  # which includes gravity
+        wanted.add("gravity")
     if camera.focal_known:
         wanted.discard("focal")
-    return tuple(part for part in SHARED if part in wanted)
+    return camera, tuple(part for part in SHARED if part in wanted)
 
 
 def _known(objects: Sequence[SceneObject], focal: FocalPrior | None) -> SharedUnknowns:
@@ -398,14 +318,14 @@ def _known(objects: Sequence[SceneObject], focal: FocalPrior | None) -> SharedUn
     return SharedUnknowns(1.0 if focal is None else focal.focal, up, height, covariance)
 
 
-def _reference(members: Sequence[_Member]) -> SharedUnknowns:
+def _reference(members: Sequence[Member]) -> SharedUnknowns:
     """Values of the object that is most certain of its rotation."""
     best = min(members, key=lambda each: cast(Uncertainty, each.result.std).rotation_deg)
     return best.values(SharedUnknowns(1.0, np.array([0.0, -1.0, 0.0]), 1.0, np.zeros((4, 4))))
 
 
 def _fused(
-    members: Sequence[_Member], reference: SharedUnknowns, known: SharedUnknowns, tilt: float
+    members: Sequence[Member], reference: SharedUnknowns, known: SharedUnknowns, tilt: float
 ) -> SharedUnknowns:
     """The shared unknowns by all objects and what the user knows."""
     messages = [each.message(reference, tilt) for each in members]
@@ -413,8 +333,8 @@ def _fused(
 
 
 def _agreeing(
-    members: list[_Member], known: SharedUnknowns, tilt: float
-) -> tuple[list[_Member], list[str]]:
+    members: list[Member], known: SharedUnknowns, tilt: float
+) -> tuple[list[Member], list[str]]:
     """The objects that agree in what they share; the others are named, the worst first."""
     warnings = []
     while len(members) > 1:
@@ -455,12 +375,12 @@ def _tail(own: SceneMessage, others: SceneMessage, part: slice) -> float:
 
 
 def _settled(
-    members: list[_Member],
+    members: list[Member],
     shared: SharedUnknowns,
     known: SharedUnknowns,
     tilt: float,
-    aligned: _Aligner,
-) -> tuple[SharedUnknowns, list[_Member]]:
+    aligned: Callable[[SceneObject, SharedUnknowns], Result],
+) -> tuple[SharedUnknowns, list[Member]]:
     """The shared unknowns, and the objects aligned with each other as their priors."""
     for _ in range(_ROUNDS):
         prior = as_prior(known, shared)
@@ -483,23 +403,3 @@ def _settled(
         if (change[is_said] ** 2 <= _SETTLED**2 * variances[is_said]).all():
             break
     return shared, members
-
-
-def _scene(
-    results: Results,
-    camera: Camera,
-    shared: SharedUnknowns,
-    wanted: tuple[str, ...],
-    warnings: tuple[str, ...],
-) -> AlignedScene:
-    scene = AlignedScene(results, camera, warnings=warnings)
-    if "focal" in wanted:
-        focal_std = shared.std("focal")
-        scene = replace(scene, camera=camera.with_focal(shared.focal), focal_std=focal_std)
-    if "gravity" in wanted:
-        up_std = float(np.degrees(shared.std("gravity")))
-        scene = replace(scene, up=shared.up, up_std_deg=up_std)
-    if "ground" in wanted and np.isfinite(shared.covariance[3, 3]):
-        height_std = shared.std("ground")
-        scene = replace(scene, camera_height=shared.height, camera_height_std=height_std)
-    return scene

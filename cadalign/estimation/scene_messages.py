@@ -1,4 +1,4 @@
-"""Messages about what the objects of a photo share: Gaussians of focal length, gravity and ground.
+"""Objects of a photo, and messages of each about what they share: focal length, gravity, ground.
 
 The shared unknowns are the logarithm of the focal length, the direction against gravity in the
 camera's frame, by its coordinates along two axes across a reference, and the logarithm of the
@@ -14,11 +14,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cadalign.arrays import FloatArray
+from cadalign.estimation.evidence_kinds import lowest_corner, upward
 from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.model import Model
+from cadalign.estimation.prior import prior_of
+from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.io.evidence import Size
+from cadalign.shapes.model import ShapeModel
 
 UP = slice(1, 3)
 PARTS = {"focal": slice(0, 1), "gravity": UP, "ground": slice(3, 4)}
+_LOWEST = 1e-6  # height of a camera above the ground
 _LEAST_INFORMATION = 1e-9  # below, nothing is said of an unknown
 _WIDEST_UP = 0.5  # standard deviation of a direction that is taken as a prior [rad]
 _OTHERS = "the other objects"
@@ -40,10 +48,6 @@ class SceneMessage:
 
     def __sub__(self, other: SceneMessage) -> SceneMessage:
         return SceneMessage(self.information - other.information, self.weighted - other.weighted)
-
-    @classmethod
-    def of(cls, mean: FloatArray, information: FloatArray) -> SceneMessage:
-        return cls(information, information @ mean)
 
     @property
     def moments(self) -> tuple[FloatArray, FloatArray]:
@@ -146,4 +150,85 @@ def as_prior(
             information[part, part] = np.linalg.inv(block)
     chosen = np.isin(np.arange(4), list(rows))
     mean = reference.deviations(values.focal, values.up, values.height)
-    return SceneMessage.of(mean, np.where(np.outer(chosen, chosen), information, 0.0))
+    said = np.where(np.outer(chosen, chosen), information, 0.0)
+    return SceneMessage(said, said @ mean)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """An object of a photo: its model, what the photo tells, and what else is known.
+
+    Parameters
+    ----------
+    model : Model or ShapeModel
+    view : View
+        Of the scene's photo; all objects' views have the same camera.
+    size : Size, optional
+        Known lengths of the object.
+    init : Alignment, optional
+        A start, as for `cadalign.align`.
+    name : str, optional
+        Name in messages; by default its number.
+    """
+
+    model: Model | ShapeModel
+    view: View
+    size: Size | None = None
+    init: Alignment | None = None
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """An object, what it shares, its result, and the prior that this was given."""
+
+    number: int
+    given: SceneObject
+    shared: tuple[str, ...]
+    had: SharedUnknowns
+    result: Result
+
+    @property
+    def name(self) -> str:
+        return self.given.name or f"objects[{self.number}]"
+
+    @property
+    def tells(self) -> list[int]:
+        """The shared unknowns that it tells of: the height only where its size is known."""
+        parts = list(self.shared)
+        if "ground" in parts and self.given.size is None and self.given.view.depth is None:
+            parts.remove("ground")
+        return [k for part in parts for k in range(4)[PARTS[part]]]
+
+    def values(self, reference: SharedUnknowns) -> SharedUnknowns:
+        """The shared unknowns as the result has them, with their covariance."""
+        pose, covariance = self.result.alignment, self.result.covariance
+        assert covariance is not None
+        up, height, lowest = reference.up, reference.height, np.zeros(3)
+        if "gravity" in self.shared:
+            model_up = upward("share", prior_of(self.given.model))
+            up = pose.rotation @ model_up
+            lowest = model_up * pose.scale * self.result.bounds[lowest_corner(model_up)]
+        rows = np.zeros((4, len(covariance)))
+        if "focal" in self.shared:
+            rows[0, 9] = 1.0
+        if "gravity" in self.shared:
+            turn = np.array([[0, up[2], -up[1]], [-up[2], 0, up[0]], [up[1], -up[0], 0]])
+            rows[UP, :3] = reference.across @ turn
+        if "ground" in self.shared:
+            height = max(float(-up @ pose.translation - lowest.sum()), _LOWEST)
+            rows[3, :3] = -np.cross(up, pose.translation) / height
+            rows[3, 3:6], rows[3, 6:9] = -up / height, -lowest / height
+        return SharedUnknowns(self.result.camera.fx, up, height, rows @ covariance @ rows.T)
+
+    def message(self, reference: SharedUnknowns, tilt: float) -> SceneMessage:
+        """Message of its evidence on the shared unknowns, about a reference."""
+        found, told = self.values(reference), self.tells
+        block = found.covariance[np.ix_(told, told)]
+        if not told or not np.isfinite(block).all():
+            return NOTHING
+        information = np.zeros((4, 4))
+        information[np.ix_(told, told)] = np.linalg.pinv(block, hermitian=True)
+        mean = reference.deviations(found.focal, found.up, found.height)
+        own = SceneMessage(information, information @ mean) - as_prior(self.had, reference, told)
+        return own.positive(told).tilted(tilt)

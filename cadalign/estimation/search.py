@@ -139,7 +139,12 @@ def minima_at_noise(
         if not len(starts.poses):
             continue
         if ransac is None:
-            found, used = _search(evidence, starts)
+            minima_of, used = search_joint(evidence, *starts)
+            every = np.ones(len(evidence.sightings.point), dtype=bool)
+            found = [
+                JointConsensus(every, evidence, state, float(cost), float(score))
+                for state, cost, score in zip(*minima_of, strict=True)
+            ]
         else:
             threshold = thresholds(evidence, problem.lenses, problem.threshold(ransac))
             found, used = robust_minima(
@@ -186,16 +191,6 @@ def _starts(
             starts = Starts(poses, np.tile(log_focals, (len(poses), 1)), log_scales)
         found.append(starts)
     return Starts(*(np.concatenate(column) for column in zip(*found, strict=True)))
-
-
-def _search(evidence: Evidence, starts: Starts) -> tuple[list[JointConsensus], int]:
-    minima, iterations = search_joint(evidence, *starts)
-    all_of_them = np.ones(len(evidence.sightings.point), dtype=bool)
-    found = [
-        JointConsensus(all_of_them, evidence, state, float(cost), float(score))
-        for state, cost, score in zip(*minima, strict=True)
-    ]
-    return found, iterations
 
 
 def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:

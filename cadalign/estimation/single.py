@@ -133,7 +133,7 @@ def align_single(
         Estimate(
             likely.points[k],
             np.ones(3),
-            (_alignment(likely.poses[k]),),
+            (Alignment(pose[:9].reshape(3, 3), pose[9:], np.ones(3), is_valid=True),),
             likely.lengths[k],
             (likely.covariances[k],),
             likely.of_points[k],
@@ -141,7 +141,7 @@ def align_single(
             likelihood,
             (view.camera,),
         )
-        for k, likelihood in enumerate(likelihoods.tolist())
+        for k, (likelihood, pose) in enumerate(zip(likelihoods.tolist(), likely.poses, strict=True))
     ]
     points = estimates[0].points[rows]
     in_camera = estimates[0].poses[0].apply(points)
@@ -217,8 +217,3 @@ def _given(init: Alignment | None) -> FloatArray:
         return np.empty((0, 12))
     translation = init.translation / init.scale.mean()
     return np.concatenate([init.rotation.ravel(), translation])[None]
-
-
-def _alignment(pose: FloatArray) -> Alignment:
-    """A pose (12,) of the unstretched shape."""
-    return Alignment(pose[:9].reshape(3, 3), pose[9:], np.ones(3), is_valid=True)

@@ -2,6 +2,12 @@
 
 Views whose few keypoints leave the stretch open take that of another view. Where a flat object's
 shape leaves open which side is seen, starts half a turn away are added.
+
+An estimate that determines the object's size is linear in all but the rotation. For a camera (C, c)
+of a rig, a point of the model is seen at ``X = C (R diag(s) x + t) + c``. Its ray says
+``X_x = u X_z`` and ``X_y = v X_z``, its depth ``X_z = z``, and known lengths and heights of cameras
+are linear too: all of them hold for ``R diag(s)`` and t, 12 unknowns, and for s and t where R is
+given. None is homogeneous, so that views with one keypoint count.
 """
 
 from __future__ import annotations
@@ -12,8 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.estimation.metric_starts import metric_starts
+from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.evidence import count_equations
+from cadalign.geometry.rotations import spread_rotations
 from cadalign.solvers.joint.evidence import Evidence, distances_of, kept_rows
 from cadalign.solvers.joint.search import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
@@ -22,9 +29,18 @@ from cadalign.solvers.marginal.search import after_motion, half_turns
 _MOST_STARTS = 24
 _MOST_CARRIED = 3  # stretches of the other view
 _MOST_SIZED = 3
-
-ViewStarts = list[tuple[FloatArray, FloatArray]]
 _LEAST_POINTS = 3
+
+_GRID = 400  # rotations
+_SCREENED = 64
+_MOST_METRIC = 16
+_ROUNDS = 3  # of weighting by the depths of the last
+_ROUNDS_GIVEN_ROTATION = 2
+_LEAST_EQUATIONS = 12
+_CONDITION = 1e-7  # least singular value over the largest, of columns of unit length
+_LEAST_SCALE = 1e-6
+
+_Start = tuple[FloatArray, FloatArray]  # a pose (12,), or those (P, 12) of all, and log scales (3,)
 
 
 class Starts(NamedTuple):
@@ -32,6 +48,13 @@ class Starts(NamedTuple):
 
     poses: FloatArray
     log_focals: FloatArray
+    log_scales: FloatArray
+
+
+class Start(NamedTuple):
+    """A given start: a pose (12,) or None for each pose of the evidence, and log scales (3,)."""
+
+    poses: Sequence[FloatArray | None]
     log_scales: FloatArray
 
 
@@ -43,23 +66,26 @@ def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
     the size of its image, widens the keypoints' own. A start that is given comes first, poses half
     a turn away come last.
     """
-    poses, log_scales = _poses_and_scales(evidence, init)
-    return Starts(poses, np.zeros((len(poses), len(evidence.focals.low))), log_scales)
+    found = _proposed(evidence, init)
+    return Starts(
+        np.array([poses for poses, _ in found]).reshape(-1, int(evidence.rig.pose.max()) + 1, 12),
+        np.zeros((len(found), len(evidence.focals.low))),
+        np.array([logs for _, logs in found]).reshape(-1, 3),
+    )
 
 
-def _poses_and_scales(evidence: Evidence, init: Start | None) -> tuple[FloatArray, FloatArray]:
-    """Poses (S, P, 12) and log scales (S, 3)."""
+def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
+    """Poses (P, 12) and log scales (3,) of each start."""
     rig = evidence.rig
     poses = int(rig.pose.max()) + 1
-    per_pose: list[ViewStarts] = [[] for _ in range(poses)]
-    for view in range(len(rig.pose)):
-        camera = rig.cam_from_rig[view]
+    per_pose: list[list[_Start]] = [[] for _ in range(poses)]
+    for view, camera in enumerate(rig.cam_from_rig):
         found, logs = view_starts(evidence, view)
-        turned = half_turned(evidence, view, list(found))
+        turned = _half_turned(evidence, view, found)
         moved = [(in_rig(pose, camera), scales) for pose, scales in zip(found, logs, strict=True)]
         moved += [(in_rig(pose, camera), np.zeros(3)) for pose in turned]
         per_pose[rig.pose[view]].extend(moved)
-    is_metric = bool(evidence.scales.free.all())
+    is_metric = init is None and bool(evidence.scales.free.all())
     if init is not None:
         unknowns = 6 * poses + int(evidence.scales.free.sum())
         is_open = count_equations(evidence) - len(evidence.shape.modes) < unknowns
@@ -70,49 +96,35 @@ def _poses_and_scales(evidence: Evidence, init: Start | None) -> tuple[FloatArra
                 found_of_pose.clear()
             found_of_pose.insert(0, (given, init.log_scales))
     elif is_metric and poses == 1:
-        rotations = np.array([pose[:9] for pose, _ in per_pose[0]]).reshape(-1, 3, 3)
-        placed, logs = metric_starts(evidence, rotations)
-        if len(placed):
-            return _with_sized(evidence, per_pose[0], placed, logs)
-    for view in weakly_determined(evidence):
-        carried = carried_starts(evidence, view, per_pose)
-        per_pose[rig.pose[view]][:0] = carried
+        placed = _metric_starts(evidence, per_pose[0])
+        if placed:
+            # Of points nearly in a plane, the scales that a rotation leaves to linear equations
+            # are noise: the likeliest poses that keypoints alone suggest come after them.
+            first = [(pose[None], logs) for pose, logs in per_pose[0][:_MOST_SIZED]]
+            return placed + [_sized(evidence, *each) for each in first]
+    for view in _weakly_determined(evidence):
+        per_pose[rig.pose[view]][:0] = _carried_starts(evidence, view, per_pose)
     if not all(per_pose):
-        return np.empty((0, poses, 12)), np.empty((0, 3))
-    if is_metric and init is None and (np.bincount(rig.pose) > 1).any():
+        return []
+    if is_metric and (np.bincount(rig.pose) > 1).any():
         return _with_rig(evidence, per_pose)
-    first = [0] * poses
+    likeliest = [found[0] for found in per_pose]
     others = [
-        [*first[:p], rank, *first[p + 1 :]]
+        [*likeliest[:p], per_pose[p][rank], *likeliest[p + 1 :]]
         for rank in range(1, max(len(found) for found in per_pose))
         for p in range(poses)
         if rank < len(per_pose[p])
     ]
-    combinations = [first, *others][:_MOST_STARTS]
-    chosen = [[per_pose[p][k] for p, k in enumerate(ranks)] for ranks in combinations]
-    stacked = np.array([[pose for pose, _ in each] for each in chosen]).reshape(-1, poses, 12)
-    scales = np.array([each[0][1] for each in chosen]).reshape(-1, 3)
-    if is_metric and init is None:
-        return _sized(evidence, stacked, scales)
-    return stacked, scales
+    chosen = [likeliest, *others][:_MOST_STARTS]
+    starts = [(np.array([pose for pose, _ in each]), each[0][1]) for each in chosen]
+    return [_sized(evidence, *each) for each in starts] if is_metric else starts
 
 
-class Start(NamedTuple):
-    """A given start: a pose (12,) or None for each pose of the evidence, and log scales (3,)."""
-
-    poses: Sequence[FloatArray | None]
-    log_scales: FloatArray
-
-
-def _with_rig(
-    evidence: Evidence, per_pose: list[list[tuple[FloatArray, FloatArray]]]
-) -> tuple[FloatArray, FloatArray]:
+def _with_rig(evidence: Evidence, per_pose: list[list[_Start]]) -> list[_Start]:
     """Starts whose scales are those of the rig with the most views; the other poses follow."""
     main = int(np.argmax(np.bincount(evidence.rig.pose)))
-    rotations = np.array([pose[:9] for pose, _ in per_pose[main]]).reshape(-1, 3, 3)
-    placed, log_scales = metric_starts(_of_pose(evidence, main), rotations)
     starts = []
-    for k, (own, logs) in enumerate(zip(placed[:, 0], log_scales, strict=True)):
+    for k, (own, logs) in enumerate(_metric_starts(_of_pose(evidence, main), per_pose[main])):
         for rank in range(MOST_PER_VIEW if k == 0 else 1):
             start = []
             for p, found in enumerate(per_pose):
@@ -120,57 +132,32 @@ def _with_rig(
                 camera = evidence.rig.cam_from_rig[evidence.rig.pose == p][0]
                 centre = -camera[:9].reshape(3, 3).T @ camera[9:]
                 enlarged = centre + (pose[9:] - centre) * np.exp((logs - scales).mean())
-                start.append(own if p == main else np.concatenate([pose[:9], enlarged]))
+                start.append(own[0] if p == main else np.concatenate([pose[:9], enlarged]))
             starts.append((np.array(start), logs))
-    kept = starts[:_MOST_STARTS]
-    poses = np.array([start for start, _ in kept]).reshape(-1, len(per_pose), 12)
-    return poses, np.array([logs for _, logs in kept]).reshape(-1, 3)
-
-
-def _with_sized(
-    evidence: Evidence, own: ViewStarts, placed: FloatArray, log_scales: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Starts of one metric pose, and after them the likeliest that keypoints alone suggest.
-
-    Of points nearly in a plane, the scales that a rotation leaves to linear equations are noise.
-    """
-    first = own[:_MOST_SIZED]
-    poses = np.array([pose for pose, _ in first]).reshape(-1, 1, 12)
-    sized = _sized(evidence, poses, np.array([logs for _, logs in first]).reshape(-1, 3))
-    return np.concatenate([placed, sized[0]]), np.concatenate([log_scales, sized[1]])
+    return starts[:_MOST_STARTS]
 
 
 def _of_pose(evidence: Evidence, pose: int) -> Evidence:
     """The evidence of the views that share a pose."""
     chosen = evidence.rig.pose == pose
-    tables = {
-        name: getattr(evidence, name) for name in ("sightings", "directions", "offsets", "planes")
-    }
-    kept = {
-        name: kept_rows(rows, (rows.image < 0) | chosen[rows.image])
-        for name, rows in tables.items()
-    }
+    kept = {}
+    for name in ("sightings", "directions", "offsets", "planes"):
+        rows = getattr(evidence, name)
+        kept[name] = kept_rows(rows, (rows.image < 0) | chosen[rows.image])
     return evidence._replace(**kept)
 
 
-def _sized(
-    evidence: Evidence, poses: FloatArray, log_scales: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Starts enlarged about each view's camera such that depths and distances agree."""
-    poses, log_scales = poses.copy(), log_scales.copy()
-    for pose, logs in zip(poses, log_scales, strict=True):
-        factor = _size_factor(evidence, pose, np.exp(logs))
-        if np.isfinite(factor) and factor > 0:
-            pose[:, 9:] *= factor
-            logs += np.log(factor)
-    return poses, log_scales
+def _sized(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _Start:
+    """A start enlarged about each view's camera such that depths and distances agree."""
+    factor = _size_factor(evidence, poses, np.exp(log_scales))
+    if not np.isfinite(factor) or not factor > 0:
+        return poses, log_scales
+    larger = np.concatenate([poses[:, :9], factor * poses[:, 9:]], axis=1)
+    return larger, log_scales + np.log(factor)
 
 
 def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
-    """Median of measured over predicted lengths, where every view has a pose of its own.
-
-    NaN where nothing is measured.
-    """
+    """Median of measured over predicted lengths; NaN where nothing is measured."""
     sightings, planes, mean = evidence.sightings, evidence.planes, evidence.shape.mean
     offsets = evidence.offsets
 
@@ -198,27 +185,28 @@ def in_rig(pose: FloatArray, camera: FloatArray) -> FloatArray:
     return np.concatenate([turned.ravel(), rotation.T @ (pose[9:] - translation)])
 
 
-def weakly_determined(evidence: Evidence) -> list[int]:
+def _weakly_determined(evidence: Evidence) -> list[int]:
     """Numbers of the views of unknown motion whose keypoints leave pose and stretch open."""
     unknowns = 6 + int(evidence.scales.free.sum())
     if unknowns == 6:
         return []
-    counts = keypoint_counts(evidence)
+    counts = _keypoint_counts(evidence)
     shared = np.bincount(evidence.rig.pose)[evidence.rig.pose] > 1
     return np.flatnonzero((2 * counts <= unknowns) & ~shared & (len(counts) > 1)).tolist()
 
 
-def carried_starts(evidence: Evidence, view: int, per_pose: Sequence[ViewStarts]) -> ViewStarts:
+def _carried_starts(
+    evidence: Evidence, view: int, per_pose: Sequence[list[_Start]]
+) -> list[_Start]:
     """Poses of a view under the stretches of the view with the most keypoints, and these.
 
     ``per_pose`` are the starts that the views' own keypoints suggest.
     """
-    counts = keypoint_counts(evidence)
+    counts, shape, scales = _keypoint_counts(evidence), evidence.shape, evidence.scales
     others = [v for v in np.argsort(-counts, kind="stable").tolist() if v != view]
-    own: ViewStarts = next((found for v in others if (found := per_pose[evidence.rig.pose[v]])), [])
-    starts: ViewStarts = []
+    own: list[_Start] = next((f for v in others if (f := per_pose[evidence.rig.pose[v]])), [])
+    starts: list[_Start] = []
     for _, logs in own[:_MOST_CARRIED]:
-        shape, scales = evidence.shape, evidence.scales
         stretched = evidence._replace(
             shape=shape._replace(mean=shape.mean * np.exp(logs)),
             scales=scales._replace(free=np.zeros(3), precision=np.zeros((3, 3))),
@@ -228,14 +216,14 @@ def carried_starts(evidence: Evidence, view: int, per_pose: Sequence[ViewStarts]
     return starts
 
 
-def keypoint_counts(evidence: Evidence) -> IntArray:
+def _keypoint_counts(evidence: Evidence) -> IntArray:
     """Number of keypoints of every view (V,)."""
     sightings = evidence.sightings
     is_keypoint = sightings.whitening[:, 2] > 0
     return np.bincount(sightings.image[is_keypoint], minlength=len(evidence.rig.pose))
 
 
-def half_turned(evidence: Evidence, view: int, poses: Sequence[FloatArray]) -> list[FloatArray]:
+def _half_turned(evidence: Evidence, view: int, poses: FloatArray) -> list[FloatArray]:
     """Turn poses (12,) of the mean by half a turn, about each axis that its shape allows."""
     sightings, shape = evidence.sightings, evidence.shape
     names = np.unique(sightings.point[(sightings.image == view) & (sightings.whitening[:, 2] > 0)])
@@ -245,3 +233,188 @@ def half_turned(evidence: Evidence, view: int, poses: Sequence[FloatArray]) -> l
     covariance = modes.T @ modes + np.diag(np.repeat(shape.spread[names] ** 2, 3))
     motions = half_turns(GaussianTarget(shape.mean[names], covariance))
     return [after_motion(pose, motion) for motion in motions for pose in poses]
+
+
+class _Rows(NamedTuple):
+    """Equations in points of the rig: ``normals`` (N, 3), ``right`` (N,), inverse deviations.
+
+    They are of the model's ``points`` (N, 3), seen from a camera with ``turns`` and ``shifts``;
+    ``is_ray`` (N,) is 1 where the deviation is that of a ray: it grows with the depth.
+    """
+
+    points: FloatArray
+    turns: FloatArray
+    shifts: FloatArray
+    normals: FloatArray
+    right: FloatArray
+    weights: FloatArray
+    is_ray: FloatArray
+
+    def depths(self, matrix: FloatArray, translation: FloatArray) -> FloatArray:
+        """Depths (N,) in the cameras of points at a pose."""
+        in_rig = self.points @ matrix.T + translation
+        return np.asarray((np.einsum("nij,nj->ni", self.turns, in_rig) + self.shifts)[:, 2])
+
+    def weights_at(self, depths: FloatArray) -> FloatArray:
+        """Weights (N,) of the equations at depths."""
+        return np.asarray(self.weights / np.where(self.is_ray > 0, np.maximum(depths, 1e-3), 1.0))
+
+
+def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
+    """Poses (1, 12) and log scales (3,) of evidence with one pose, the likeliest first.
+
+    The rotations of its ``own`` starts are proposals; that of the linear solution and, where there
+    are none, those of a grid join them.
+    """
+    rows, is_tied = _rows_of(evidence), has_scale_prior(evidence.scales)
+    basis = np.ones((3, 1)) if is_tied else np.eye(3)  # of scales that a prior holds together
+    linear = _linear_rotation(rows)
+    rotations = [] if linear is None else [linear]
+    rotations.extend(pose[:9].reshape(3, 3) for pose, _ in own)
+    if not own:
+        rotations.extend(_screened(evidence, rows, spread_rotations(_GRID), basis))
+    placed = [_given_rotation(evidence, rows, rotation, basis) for rotation in rotations]
+    found = sorted((each for each in placed if each is not None), key=lambda each: each[0])
+    return [(pose[None], logs) for _, pose, logs in found[:_MOST_METRIC]]
+
+
+def _rows_of(evidence: Evidence) -> _Rows:
+    sightings, planes, shape = evidence.sightings, evidence.planes, evidence.shape
+    u, v = sightings.rays.T
+    zeros, ones = np.zeros_like(u), np.ones_like(u)
+    a, b, c = sightings.whitening.T
+    normals = [
+        np.stack([a, b, -(a * u + b * v)], axis=1),
+        np.stack([zeros, c, -c * v], axis=1),
+        np.stack([zeros, zeros, ones], axis=1),
+        planes.normal,
+    ]
+    right = [zeros, zeros, sightings.depths[:, 0], planes.depth]
+    weights = [(c > 0).astype(float), (c > 0).astype(float), sightings.depths[:, 1], planes.weight]
+    point = np.concatenate([np.tile(sightings.point, 3), planes.point])
+    image = np.concatenate([np.tile(sightings.image, 3), planes.image])
+    is_ray = np.concatenate([np.ones(2 * len(u)), np.zeros(len(u) + len(planes.point))])
+    weight, normal = np.concatenate(weights), np.concatenate(normals)
+    kept = weight > 0
+    cameras, normal = evidence.rig.cam_from_rig[image[kept]], normal[kept]
+    turns, shifts = cameras[:, :9].reshape(-1, 3, 3), cameras[:, 9:]
+    return _Rows(
+        shape.mean[point[kept]],
+        turns,
+        shifts,
+        np.einsum("ni,nij->nj", normal, turns),
+        np.concatenate(right)[kept] - (normal * shifts).sum(axis=1),
+        weight[kept],
+        is_ray[kept],
+    )
+
+
+def _linear_rotation(rows: _Rows) -> FloatArray | None:
+    """The rotation nearest to the linear solution; None where it is not determined."""
+    if len(rows.right) < _LEAST_EQUATIONS:
+        return None
+    by_matrix = (rows.normals[:, :, None] * rows.points[:, None]).reshape(-1, 9)
+    left, weights = np.concatenate([by_matrix, rows.normals], axis=1), rows.weights
+    found = np.zeros(12)
+    for _ in range(_ROUNDS):
+        weighted = left * weights[:, None]
+        sizes = np.linalg.norm(weighted, axis=0)
+        if not (sizes > 0).all():
+            return None
+        solved, _, _, singular = np.linalg.lstsq(weighted / sizes, rows.right * weights, rcond=None)
+        if singular[-1] < _CONDITION * singular[0]:
+            return None
+        found = solved / sizes
+        weights = rows.weights_at(rows.depths(found[:9].reshape(3, 3), found[9:]))
+    matrix = found[:9].reshape(3, 3)
+    lengths = np.linalg.norm(matrix, axis=0)
+    if np.linalg.det(matrix) <= 0 or not (lengths > 0).all():
+        return None
+    rotation = np.eye(3)
+    for _ in range(_ROUNDS):  # nearest rotation and column lengths in turn
+        left_vectors, _, right_vectors = np.linalg.svd(matrix * lengths)
+        rotation = left_vectors @ right_vectors
+        lengths = np.maximum((rotation * matrix).sum(axis=0), 1e-3 * lengths.max())
+    return np.asarray(rotation) if np.linalg.det(rotation) > 0 else None
+
+
+def _given_rotation(
+    evidence: Evidence, rows: _Rows, rotation: FloatArray, basis: FloatArray
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Translation and scales from the equations that are linear once the rotation is given.
+
+    Scales are sums of the columns of the ``basis`` (3, k). Returns cost, pose (12,) and log scales.
+    """
+    by_scale = (rows.normals @ rotation) * rows.points
+    left = np.concatenate([rows.normals, by_scale @ basis], axis=1)
+    extra_left, extra_right = _other_rows(evidence, rotation, basis)
+    weights, cost = rows.weights, np.inf
+    found = np.zeros(left.shape[1])
+    for _ in range(_ROUNDS_GIVEN_ROTATION):
+        weighted = np.concatenate([left * weights[:, None], extra_left])
+        target = np.concatenate([rows.right * weights, extra_right])
+        sizes = np.linalg.norm(weighted, axis=0)
+        if not (sizes > 0).all():
+            return None
+        normal = (weighted / sizes).T @ (weighted / sizes)
+        try:
+            found = np.linalg.solve(normal, (weighted / sizes).T @ target) / sizes
+        except np.linalg.LinAlgError:
+            return None
+        error = weighted @ found - target
+        cost = float(error @ error)
+        scales = basis @ found[3:]
+        depths = rows.depths(rotation * scales, found[:3])
+        weights = rows.weights_at(depths)
+    if not (scales > _LEAST_SCALE).all() or not (depths > 0).all() or not np.isfinite(cost):
+        return None
+    pose = np.concatenate([rotation.ravel(), found[:3]])
+    return cost + _cost_of_up(evidence, rotation), pose, np.log(scales)
+
+
+def _screened(
+    evidence: Evidence, rows: _Rows, rotations: FloatArray, basis: FloatArray
+) -> FloatArray:
+    """The rotations (S, 3, 3) with the least algebraic error, unweighted by depth."""
+    by_scale = (rows.normals @ rotations) * rows.points
+    same = np.broadcast_to(rows.normals, by_scale.shape)
+    left = np.concatenate([same, by_scale @ basis], axis=2) * rows.weights[:, None]
+    right = rows.right * rows.weights
+    normal = left.swapaxes(1, 2) @ left
+    ridge = _CONDITION**2 * np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    normal = normal + ridge * np.eye(left.shape[2])
+    projected = (left.swapaxes(1, 2) @ right)[:, :, None]
+    try:
+        found = np.linalg.solve(normal, projected)
+    except np.linalg.LinAlgError:  # of one rotation, where the ridge is lost in rounding
+        found = np.linalg.pinv(normal, hermitian=True) @ projected
+    errors = (((left @ found)[:, :, 0] - right) ** 2).sum(axis=1)
+    costs = errors + [_cost_of_up(evidence, rotation) for rotation in rotations]
+    return np.asarray(rotations[np.argsort(costs)[:_SCREENED]])
+
+
+def _other_rows(
+    evidence: Evidence, rotation: FloatArray, basis: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Whitened equations of known distances, in translation and scales."""
+    offsets, mean = evidence.offsets, evidence.shape.mean
+    left, right = np.zeros((len(offsets.value), 6)), offsets.value.copy()
+    for k, (image, direction) in enumerate(zip(offsets.image, offsets.direction, strict=True)):
+        for point, sign in zip(offsets.ends[k], (-1.0, 1.0), strict=True):
+            if point >= 0:
+                left[k, 3:] += sign * direction * mean[point]
+            else:
+                camera, turned = evidence.rig.cam_from_rig[image], rotation @ direction
+                left[k, :3] -= sign * turned
+                right[k] += sign * turned @ (camera[:9].reshape(3, 3).T @ camera[9:])
+    left = np.concatenate([left[:, :3], left[:, 3:] @ basis], axis=1)
+    return offsets.weight[:, None] * left, offsets.weight * right
+
+
+def _cost_of_up(evidence: Evidence, rotation: FloatArray) -> float:
+    """Squared whitened differences of known directions."""
+    directions = evidence.directions
+    turns = evidence.rig.cam_from_rig[directions.image][:, :9].reshape(-1, 3, 3)
+    seen = np.einsum("dij,dj->di", turns, directions.model @ rotation.T) - directions.camera
+    whitened = np.einsum("dij,dj->di", directions.whitening, seen)
+    return float((whitened * whitened).sum())

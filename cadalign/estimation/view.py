@@ -129,11 +129,14 @@ class View(DeclaredEvidence):
         for name, value in _DEFAULTS.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
-        _check_camera(self.camera)
+        camera: object = self.camera
+        if not isinstance(camera, Camera):
+            what = f"expected a cadalign.Camera, got {type(camera).__name__}"
+            raise InputError(what, where="camera")
         points = np.empty((0, 2)) if np.size(self.points_2d) == 0 else self.points_2d
         points = as_points(points, name="points_2d", dimension=2)
-        check_pixels(points, self.camera.width, self.camera.height, where="points_2d")
-        object.__setattr__(self, "points_2d", read_only(points))
+        check_pixels(points, camera.width, camera.height, where="points_2d")
+        self._keep("points_2d", points)
         object.__setattr__(self, "is_numbered", self.ids is None)
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
         if noise is not None:
@@ -143,23 +146,26 @@ class View(DeclaredEvidence):
         if self.time is not None and not (is_number(self.time) and np.isfinite(self.time)):
             raise InputError(f"{quote(self.time)} is not a finite number", where="time")
         if self.depth is not None:
-            depth = checked_depth(self.depth, self.camera, len(points), self.depth_scale)
-            object.__setattr__(self, "depth", read_only(depth))
-        checked_depth_sigma(cast(float, self.depth_sigma), self.depth, len(points))
-        self._check_up()
-        if self.camera_height is not None:
-            height = as_positive(self.camera_height, name="camera_height")
-            object.__setattr__(self, "camera_height", height)
-        as_positive(self.camera_height_sigma, name="camera_height_sigma")
+            self._keep("depth", _depths(self.depth, camera, len(points), self.depth_scale))
+        if self.up is not None:
+            self._keep("up", _upwards(self.up, self.up_sigma_deg))
         if self.cam_from_rig is not None:
-            motion = nearest_rigid(self.cam_from_rig, where="cam_from_rig")
-            object.__setattr__(self, "cam_from_rig", read_only(motion))
+            self._keep("cam_from_rig", nearest_rigid(self.cam_from_rig, where="cam_from_rig"))
         if self.mask is not None:
-            object.__setattr__(self, "mask", read_only(checked_mask(self.mask, self.camera)))
+            self._keep("mask", _mask(self.mask, camera))
         if self.image is not None:
-            object.__setattr__(self, "image", read_only(checked_image(self.image, self.camera)))
-        if self.mask_sigma is not None:
-            as_positive(self.mask_sigma, name="mask_sigma")
+            self._keep("image", _photo(self.image, camera))
+        relative = np.asarray(self.depth_sigma, dtype=np.float64)
+        shapes = [()] if self.depth_image is not None else [(), (len(points),)]
+        if relative.shape not in shapes or not (relative > 0).all():
+            raise InputError("must be positive, one or one per keypoint", where="depth_sigma")
+        for name in ("camera_height", "camera_height_sigma", "mask_sigma"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_positive(getattr(self, name), name=name))
+
+    def _keep(self, name: str, value: npt.NDArray[Any]) -> None:
+        """Set a field to what was checked."""
+        object.__setattr__(self, name, read_only(value))
 
     def __repr__(self) -> str:
         return f"View({', '.join([f'{np.shape(self.points_2d)[0]} keypoints', *self.sources])})"
@@ -185,27 +191,9 @@ class View(DeclaredEvidence):
         """The mask (h, w), bool or probabilities."""
         return cast("FloatArray | BoolArray | None", self.mask)
 
-    def _check_up(self) -> None:
-        if self.up is None:
-            return
-        up = as_floats(self.up, name="up", shape=(3,))
-        length = float(np.linalg.norm(up))
-        if not length > 0:
-            raise InputError("a direction must not be zero", where="up")
-        checked_up_sigma(self.up_sigma_deg)
-        object.__setattr__(self, "up", read_only(up / length))
 
-
-def _check_camera(camera: object) -> None:
-    if not isinstance(camera, Camera):
-        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
-
-
-def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:
-    """Depths of the keypoints (n,), or a depth image (h, w); NaN where unknown.
-
-    Raises InputError if it has neither shape, or a depth is negative.
-    """
+def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:
+    """Depths of the keypoints (n,), or a depth image (h, w); NaN where unknown."""
     factor = None if scale is None else as_positive(scale, name="depth_scale")
     if isinstance(given, str | os.PathLike):
         depth = read_grey(Path(given)).astype(np.float64)
@@ -223,33 +211,16 @@ def checked_depth(given: Any, camera: Camera, count: int, scale: float | None) -
         fix = "give a depth per keypoint, or a depth image of the camera's size"
         raise InputError(what, where="depth", fix=fix)
     known = np.isfinite(depth)
-    if depth.ndim == 1:
-        bad = (depth[known] <= 0).any()
-    else:
+    if depth.ndim == 2:
         known &= depth != 0
-        bad = (depth[known] < 0).any()
-    if bad:
+    if (depth[known] <= 0).any():
         fix = "give NaN where it is unknown"
         raise InputError("has values that are not positive", where="depth", fix=fix)
     return np.where(known, depth * (1.0 if factor is None else factor), np.nan)
 
 
-def checked_depth_sigma(sigma: npt.ArrayLike, depth: object, count: int) -> None:
-    """Check the relative standard deviation of depths.
-
-    Raises InputError if it is not positive, or neither one nor one per depth.
-    """
-    relative = np.asarray(sigma, dtype=np.float64)
-    shapes = [()] if isinstance(depth, np.ndarray) and depth.ndim == 2 else [(), (count,)]
-    if relative.shape not in shapes or not (relative > 0).all():
-        raise InputError("must be positive, one or one per keypoint", where="depth_sigma")
-
-
-def checked_mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
-    """A mask (h, w): bool, or probabilities.
-
-    Raises InputError if it has another size than the camera, or holds other values.
-    """
+def _mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
+    """A mask (h, w): bool, or probabilities."""
     is_file = isinstance(given, str | os.PathLike)
     mask = read_grey(Path(given)) != 0 if is_file else np.asarray(given)
     if mask.shape != (camera.height, camera.width):
@@ -265,11 +236,8 @@ def checked_mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
     return probabilities
 
 
-def checked_image(given: Any, camera: Camera) -> ByteImage:
-    """A photo (h, w, 3) uint8 in RGB.
-
-    Raises InputError if it has another size than the camera, or other values than bytes.
-    """
+def _photo(given: Any, camera: Camera) -> ByteImage:
+    """A photo (h, w, 3) uint8 in RGB."""
     if isinstance(given, str | os.PathLike):
         given = read_photo(given)
     pixels = np.asarray(given)
@@ -283,15 +251,16 @@ def checked_image(given: Any, camera: Camera) -> ByteImage:
     return pixels
 
 
-def checked_up_sigma(sigma: Any) -> None:
-    """Check the standard deviation of a direction, or its covariance (3, 3).
-
-    Raises InputError if it is neither positive nor a covariance.
-    """
+def _upwards(given: Any, sigma: Any) -> FloatArray:
+    """The unit vector (3,) of a direction with a standard deviation, or a covariance (3, 3)."""
+    up = as_floats(given, name="up", shape=(3,))
+    length = float(np.linalg.norm(up))
+    if not length > 0:
+        raise InputError("a direction must not be zero", where="up")
     if np.ndim(sigma) == 0:
         if not is_number(sigma) or not sigma > 0:
             raise InputError(f"{quote(sigma)} is not positive", where="up_sigma_deg")
-        return
+        return up / length
     covariance = as_floats(sigma, name="up_sigma_deg", shape=(3, 3))
     size = np.abs(covariance).max()
     values = np.linalg.eigvalsh(covariance)
@@ -300,3 +269,4 @@ def checked_up_sigma(sigma: Any) -> None:
         what = "not a covariance of rank 2 or more"
         fix = "give a positive number [degrees], or the covariance of the direction"
         raise InputError(what, where="up_sigma_deg", fix=fix)
+    return up / length

@@ -190,3 +190,18 @@ def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
 def quat_wxyz_from_rotation(rotation: FloatArray) -> FloatArray:
     """The quaternion (4,) of a rotation matrix (3, 3), scalar first and not negative."""
     return np.array(_quaternion(np.asarray(rotation)))
+
+
+def spread_rotations(count: int) -> FloatArray:
+    """Rotations (count, 3, 3) spread evenly.
+
+    Alexa, "Super-Fibonacci Spirals: Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022.
+    """
+    from scipy.spatial.transform import Rotation  # takes longer to import than all that is here
+
+    psi = 1.533751168755204288118041
+    place = np.arange(count) + 0.5
+    r, q = np.sqrt(place / count), np.sqrt(1 - place / count)
+    alpha, beta = 2 * np.pi * place / np.sqrt(2), 2 * np.pi * place / psi
+    quats = np.stack([r * np.sin(alpha), r * np.cos(alpha), q * np.sin(beta), q * np.cos(beta)], 1)
+    return np.asarray(Rotation.from_quat(quats).as_matrix())

@@ -8,11 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from cadalign.errors import InputError
+
 LINES = (".jsonl", ".ndjson")
 """Endings of files with an observation in every line."""
 TABLE = ".csv"
 OBSERVATION, DETECTOR, OTHER = "observation", "detector", "other"
 _WILD = frozenset("*?[")
+_PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,3 +56,14 @@ def kind_of(data: object) -> str:
         return DETECTOR
     is_meant = "views" in data or ("keypoints" in data and "format" not in data)
     return OBSERVATION if is_meant else OTHER
+
+
+def refuse_photo(path: Path) -> None:
+    """Refuse an image in the place of an observation, and say what makes one."""
+    if path.suffix.lower() in _PHOTOS:
+        raise InputError(
+            "a photo, not an observation, which is a JSON file with camera and keypoints",
+            where=str(path),
+            fix=f"mark keypoints with `cadalign annotate {path.name} MODEL`, which writes one, or "
+            "use a detector's with `cadalign observe`",
+        )

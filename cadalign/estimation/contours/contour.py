@@ -1,4 +1,9 @@
-"""Contours of masks: samples with sub-pixel places and normals, accuracy of their residuals."""
+"""Contours of masks, and rims: where a model's silhouette ends on a contour's normals.
+
+Smoothing rounds corners off, and pixels quantise a contour. The silhouette that the model has in
+the same pixels, extracted as the mask's contour was, is displaced in the same way, so that the
+difference of the two contours is free of both.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +15,9 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
+from cadalign.geometry.alignment import Alignment, model_rays
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.raycaster import RayCaster
 
 SPACING = 2.0
 """Distance of neighbouring samples along the contour [px]."""
@@ -19,15 +27,19 @@ _NORMAL_SMOOTHING = 2.0  # [px], of the image whose gradient is the normal
 _BORDER = 3.0  # [px], within which the image's border shapes the contour
 _LEAST_AREA = 0.003  # of a piece or hole, relative to the largest piece
 _LEAST_PIXELS = 12
-_REACH = 2.0  # [px], between a boundary pixel and the level line
+REACH = 2.0
+"""Farthest that a level line is sought from a boundary pixel, or from a rim [px]."""
 _STEP = 0.25
 
 
 Image = npt.NDArray[np.float32]
-_TO_SIGMA = 1.4826  # from the median of absolute values to the deviation of a Gaussian
-_OUTLYING = 3.5  # in deviations
-_MOST_LAGS = 100
-_LEAST_PAIRS = 20
+_LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
+_MOST_STEPS = 24  # to either side
+_PRECISION = 0.01  # [px], of a rim
+_STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
+_BAND = 7  # [px], about the rims, that smoothing depends on
+_MARGIN = 8  # [px], about the rims: their reach, and that of smoothing
+_LEAST_COSINE = 0.3  # between rim and contour
 
 
 class Contour(NamedTuple):
@@ -47,6 +59,15 @@ class Contour(NamedTuple):
         """Geometric mean of the extents [px]."""
         return float(np.sqrt(np.prod(np.ptp(self.points, axis=0))))
 
+    def at(self, places: FloatArray) -> FloatArray:
+        """Pixels (..., S, 2) at ``places`` (..., S) on the samples' normals."""
+        return np.asarray(self.points + places[..., None] * self.normals)
+
+    def neighbours(self, kept: BoolArray, lag: int = 1) -> BoolArray:
+        """True (S - lag,) where a sample and the one ``lag`` before it on its curve are kept."""
+        same = self.curve[lag:] == self.curve[:-lag]
+        return np.asarray(kept[lag:] & kept[:-lag] & same)
+
     def taken(self, chosen: BoolArray | IntArray) -> Contour:
         """The samples that a mask or numbers choose."""
         return Contour(self.points[chosen], self.normals[chosen], self.curve[chosen])
@@ -61,7 +82,7 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
     """
     image = np.ascontiguousarray(probability, dtype=np.float32)
     level = smoothed(image)
-    soft = _blurred(image, _NORMAL_SMOOTHING)
+    soft = smoothed(image, _NORMAL_SMOOTHING)
     slope_x: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 1, 0, ksize=3), dtype=np.float32)
     slope_y: Image = np.asarray(cv2.Sobel(soft, cv2.CV_32F, 0, 1, ksize=3), dtype=np.float32)
     points, normals, curves = [np.empty((0, 2))], [np.empty((0, 2))], [np.empty(0, dtype=int)]
@@ -76,12 +97,8 @@ def contour_of(probability: FloatArray | BoolArray) -> Contour:
     return Contour(np.concatenate(points), np.concatenate(normals), np.concatenate(curves))
 
 
-def smoothed(image: Image) -> Image:
+def smoothed(image: Image, sigma: float = _SMOOTHING) -> Image:
     """The image (h, w) whose level line 0.5 is the contour of a mask."""
-    return _blurred(image, _SMOOTHING)
-
-
-def _blurred(image: Image, sigma: float) -> Image:
     return np.asarray(
         cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE), dtype=np.float32
     )
@@ -111,18 +128,36 @@ def _on_level(
     length = np.linalg.norm(normals, axis=1)
     kept = length > 1e-6
     chain, normals = chain[kept], normals[kept] / length[kept, None]
-    steps = np.arange(-_STEP, _REACH + _STEP / 2, _STEP)
-    along = chain[:, None] + steps[:, None] * normals[:, None]
-    values = sampled(level, along.reshape(-1, 2)).reshape(len(chain), len(steps))
-    falls = (values[:, :-1] >= 0.5) & (values[:, 1:] < 0.5)
-    first = falls.argmax(axis=1)
-    rows = np.flatnonzero(falls.any(axis=1))
-    before, after = values[rows, first[rows]], values[rows, first[rows] + 1]
-    places = steps[first[rows]] + _STEP * (before - 0.5) / (before - after)
-    points = chain[rows] + places[:, None] * normals[rows]
+    places = crossings(level, chain, normals, np.zeros(len(chain)), -_STEP)
+    known = np.isfinite(places)
+    points = chain[known] + places[known, None] * normals[known]
     outwards = -np.column_stack([sampled(slope_x, points), sampled(slope_y, points)])
     outwards /= np.maximum(np.linalg.norm(outwards, axis=1, keepdims=True), 1e-12)
     return points, outwards
+
+
+def crossings(
+    level: Image,
+    points: FloatArray,
+    normals: FloatArray,
+    offsets: FloatArray,
+    first: float = -REACH,
+) -> FloatArray:
+    """Places (S,) on normals where a level line is left, nearest to ``offsets`` (S,); or NaN.
+
+    They are sought from ``first`` to `REACH` beside the offsets [px].
+    """
+    steps = np.arange(first, REACH + _STEP / 2, _STEP)
+    places = offsets + steps[:, None]
+    along = points + places[..., None] * normals
+    values = sampled(level, along.reshape(-1, 2)).reshape(places.shape)
+    falls = (values[:-1] >= 0.5) & (values[1:] < 0.5)
+    distance = np.where(falls, np.abs(steps[:-1] + _STEP / 2)[:, None], np.inf)
+    nearest, every = distance.argmin(axis=0), np.arange(len(offsets))
+    before, after = values[nearest, every], values[nearest + 1, every]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found = places[nearest, every] + _STEP * (before - 0.5) / (before - after)
+    return np.where(np.isfinite(distance[nearest, every]), found, np.nan)
 
 
 def sampled(image: Image, points: FloatArray) -> FloatArray:
@@ -203,41 +238,145 @@ def mask_contour(mask: FloatArray | BoolArray, where: str) -> Contour:
     return contour
 
 
-def robust_deviation(residuals: FloatArray) -> float:
-    """Deviation of residuals (n,) about 0, outliers among them; 0 for none."""
-    return _TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else 0.0
+class Rims(NamedTuple):
+    """Rims on the normals of a contour's samples, for each of S samples.
 
-
-def trimmed_deviation(residuals: FloatArray, least: float) -> float:
-    """Root mean square of residuals (n,) about 0 without outliers, which exceed ``least``.
-
-    It is 0 for none.
+    ``found`` (S,), the ``offset`` (S,) of the rim outwards from the contour [px], the ``points``
+    (S, 3) of the surface in the model's frame before its stretch and their triangles ``face`` (S,).
     """
-    if not len(residuals):
-        return 0.0
-    kept = residuals[np.abs(residuals) < max(_OUTLYING * robust_deviation(residuals), least)]
-    return float(np.sqrt((kept**2).mean()))
+
+    found: BoolArray
+    offset: FloatArray
+    points: FloatArray
+    face: IntArray
 
 
-def correlation_length(contour: Contour, residuals: FloatArray, kept: BoolArray) -> float:
-    """Number of neighbouring samples that count as one, at least 1.
+class Sight(NamedTuple):
+    """A posed surface as a camera sees it."""
 
-    The integrated autocorrelation ``1 + 2 sum of rho`` of the residuals (S,) that are ``kept``, up
-    to the first lag without positive correlation (Geyer, "Practical Markov chain Monte Carlo",
-    1992).
+    caster: RayCaster
+    camera: Camera
+    pose: Alignment
+
+    def covers(self, pixels: FloatArray) -> BoolArray:
+        """Tell if the object is seen at pixels (..., 2)."""
+        origin, directions, valid = self._rays(pixels)
+        covered = self.caster.covered(origin, directions) & valid
+        return np.asarray(covered.reshape(pixels.shape[:-1]))
+
+    def hits(self, pixels: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Triangles (S,), -1 for none, and points (S, 3) that are seen at pixels (S, 2)."""
+        origin, directions, valid = self._rays(pixels)
+        face, depth = self.caster.first_hits(origin, directions)
+        seen = valid & (face >= 0)
+        return np.where(seen, face, -1), origin + np.where(seen, depth, 0.0)[:, None] * directions
+
+    def _rays(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        rays, valid = self.camera.normalize_where_valid(pixels.reshape(-1, 2).astype(float))
+        origin, model_from_ray = model_rays(self.pose)
+        return origin, rays @ model_from_ray[:, :2].T + model_from_ray[:, 2], valid
+
+
+def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
+    """Find the rims that are nearest to a contour, at most ``reach`` [px] away.
+
+    A rim is a change from the object to the background in the contour's outward direction. Where
+    the rim runs at a steep angle to the contour, the two don't match.
     """
-    values = np.where(kept, residuals, 0.0)
-    variance = float((values**2).sum() / max(kept.sum(), 1))
-    if not variance > 0:
-        return 1.0
-    total = 1.0
-    for lag in range(1, _MOST_LAGS):
-        pairs = kept[lag:] & kept[:-lag] & (contour.curve[lag:] == contour.curve[:-lag])
-        count = int(pairs.sum())
-        if count < _LEAST_PAIRS:
-            break
-        rho = float((values[lag:] * values[:-lag])[pairs].sum() / count / variance)
-        if rho <= 0:
-            break
-        total += 2 * rho
-    return total
+    count = len(contour.points)
+    intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
+    steps = np.linspace(-reach, reach, intervals + 1)
+    covered = sight.covers(contour.at(steps[:, None] + np.zeros(count)))
+    leaves = covered[:-1] & ~covered[1:]
+    middle = (steps[:-1] + steps[1:]) / 2
+    distance = np.where(leaves, np.abs(middle)[:, None], np.inf)
+    nearest = distance.argmin(axis=0)
+    found = np.isfinite(distance[nearest, np.arange(count)])
+    rows = np.flatnonzero(found)
+    some = contour.taken(rows)
+    inner, outer = steps[nearest[rows]], steps[nearest[rows] + 1]
+    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
+        half = (inner + outer) / 2
+        inside = sight.covers(some.at(half))
+        inner, outer = np.where(inside, half, inner), np.where(inside, outer, half)
+    face, points = sight.hits(some.at(inner))
+    hit = face >= 0  # a ray beside the bisection's may slip through
+    found[rows[~hit]] = False
+    rows = rows[hit]
+    offset, surface = np.zeros(count), np.zeros((count, 3))
+    faces = np.full(count, -1)
+    offset[rows] = ((inner + outer) / 2)[hit]
+    surface[rows] = points[hit]
+    faces[rows] = face[hit]
+    jump = contour.neighbours(found) & (np.abs(np.diff(offset)) > _STEEPEST * SPACING)
+    found[1:] &= ~jump
+    found[:-1] &= ~jump
+    return Rims(found, offset, surface, faces)
+
+
+def across_rims(contour: Contour, rims: Rims) -> FloatArray:
+    """Directions (S, 2) across the rims, of length 1 along the contour's normals.
+
+    A point of the rim that moves along it does not change the rim's distance from the contour.
+    They are the normals where no neighbour has a rim.
+    """
+    places = contour.at(rims.offset)
+    gaps = np.diff(places, axis=0)
+    gaps[~contour.neighbours(rims.found)] = 0.0
+    along = np.zeros_like(places)
+    along[1:] += gaps
+    along[:-1] += gaps
+    across = np.column_stack([along[:, 1], -along[:, 0]])
+    projected = (across * contour.normals).sum(axis=1)
+    usable = np.abs(projected) > _LEAST_COSINE * np.linalg.norm(across, axis=1)
+    scale = np.where(usable, projected, 1.0)[:, None]
+    return np.where(usable[:, None], across / scale, contour.normals)
+
+
+class MaskImage(NamedTuple):
+    """A mask (h, w) of probabilities, and where each sample of its contour lies on it, (S,) [px].
+
+    These ``crossings`` are distances along the samples' normals, NaN where there is none.
+    """
+
+    inside: Image
+    crossings: FloatArray
+
+
+def mask_image(mask: FloatArray | BoolArray, contour: Contour) -> MaskImage:
+    """A mask with the places of its contour's samples."""
+    inside = np.ascontiguousarray(mask, dtype=np.float32)
+    none = np.zeros(len(contour.points))
+    return MaskImage(inside, crossings(smoothed(inside), contour.points, contour.normals, none))
+
+
+def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims) -> FloatArray:
+    """Distances (S,) [px] by which rims lie outside of the contour that extraction makes of them.
+
+    Zero where there is no rim, or no such contour near it.
+    """
+    rows = np.flatnonzero(rims.found)
+    bias = np.zeros(len(rims.found))
+    if not len(rows):
+        return bias
+    some, offsets = contour.taken(rows), rims.offset[rows]
+    corner, rendered = _rendered(sight, mask, some.at(offsets))
+    own = crossings(smoothed(rendered), some.points - corner, some.normals, offsets)
+    bias[rows] = np.nan_to_num(offsets - (own - mask.crossings[rows]))
+    return np.where(np.abs(bias) < REACH, bias, 0.0)
+
+
+def _rendered(sight: Sight, mask: MaskImage, rims: FloatArray) -> tuple[IntArray, Image]:
+    """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it."""
+    height, width = mask.inside.shape
+    places = np.clip(np.rint(rims).astype(int), 0, [width - 1, height - 1])
+    corner = np.maximum(places.min(axis=0) - _MARGIN, 0)
+    right, bottom = places.max(axis=0) + _MARGIN + 1
+    rendered = mask.inside[corner[1] : bottom, corner[0] : right].copy()
+    columns, rows = (places - corner).T
+    near = np.zeros(rendered.shape, dtype=np.uint8)
+    near[rows, columns] = 1
+    near = np.asarray(cv2.dilate(near, np.ones((_BAND, _BAND), np.uint8)), dtype=np.uint8)
+    columns, rows = cv2.findNonZero(near).reshape(-1, 2).T  # five times as fast as NumPy
+    rendered[rows, columns] = sight.covers(np.stack([columns, rows], axis=1) + corner)
+    return corner, rendered

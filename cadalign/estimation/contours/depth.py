@@ -13,18 +13,9 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.contours.contour import robust_deviation
-from cadalign.estimation.contours.surface import (
-    Measured,
-    PosedSurface,
-    Surface,
-    count_of,
-    state_with_points,
-    state_without_points,
-    surfaces_of,
-    with_measured,
-)
-from cadalign.estimation.estimates import poses_of
+from cadalign.estimation.contours.measured import Measured, Place, Sought
+from cadalign.estimation.contours.surface import PosedSurface, surfaces_of
+from cadalign.estimation.contours.view_contour import robust_deviation
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import Minimum
@@ -33,8 +24,8 @@ from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.evidence import Evidence, Planes, kept_rows, log_focals_of
-from cadalign.solvers.joint.search import refine_joint, score_state
+from cadalign.solvers.joint.evidence import Planes, kept_rows, log_focals_of
+from cadalign.solvers.joint.search import score_state
 
 _MARGIN = 3  # [px], to the mask's border
 _LEAST_SPACING = 8  # [px], of samples that count as independent
@@ -77,7 +68,12 @@ def fit_depths(
     where = f"views[{samples[0].image}].depth"
     surface = surfaces_of(model, first.points[:keypoints], where).surfaces[0]
     likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
-    found = [_settled(each, keypoints, samples, surface) for each in likely[:_MOST_STARTS]]
+    found = []
+    for each in likely[:_MOST_STARTS]:
+        planes = each.evidence.planes  # depths at keypoints, which may be hidden
+        kept = ~np.isin(planes.image, [own.image for own in samples])
+        bare = each.evidence._replace(planes=kept_rows(planes, kept))
+        found.append(_settled(each, Sought(bare, keypoints, samples, surface)))
     found.sort(key=lambda minimum: minimum.score)
     return found
 
@@ -102,44 +98,29 @@ def _samples(number: int, view: View, camera: Camera) -> _Samples:
     return _Samples(number, rays[valid], depth[rows, columns][valid], sigma)
 
 
-def _settled(
-    start: Minimum, keypoints: int, samples: Sequence[_Samples], surface: Surface
-) -> Minimum:
+def _settled(start: Minimum, depths: Sought[_Samples]) -> Minimum:
     """Rounds from one minimum until the cost changes little."""
-    state, last = start.state, np.inf
-    result, bare = start, _without_keypoints(start.evidence, samples)
-    prior_score = start.prior_score
+    place, last, result, prior_score = Place.of(start.state), np.inf, start, start.prior_score
     for _ in range(_ROUNDS):
-        posed = surface.at(start.evidence.shape, state)
-        poses, ratios = poses_of(bare, state), np.exp(log_focals_of(bare, state))
+        posed, poses = depths.at(place.state)
+        ratios = np.exp(log_focals_of(depths.evidence, place.state))
+        is_exact = depths.surface.is_exact
         rows = [
             _rows(
-                posed,
-                poses[each.image],
-                each,
-                ratio=float(ratios[each.image]),
-                is_exact=surface.is_exact,
+                posed, poses[each.image], each, ratio=float(ratios[each.image]), is_exact=is_exact
             )
-            for each in samples
+            for each in depths.views
         ]
-        full, total = with_measured(bare, keypoints, rows), count_of(rows)
-        room = state_with_points(state, keypoints, total)
-        cost, room, _, _ = refine_joint(full, _ITERATIONS, room)
-        if not cost < np.inf:
+        refined = depths.joined(place, rows).refined(_ITERATIONS)
+        if refined is None:
             return start
-        score = score_state(full, room)
-        result = start._replace(evidence=full, state=room, cost=cost, score=score + prior_score)
-        state, _ = state_without_points(room, keypoints, total)
+        cost, (evidence, state, place, *_) = refined
+        score = score_state(evidence, state) + prior_score
+        result = start._replace(evidence=evidence, state=state, cost=cost, score=score)
         if abs(last - cost) < _SETTLED:
             break
         last = cost
     return result
-
-
-def _without_keypoints(evidence: Evidence, samples: Sequence[_Samples]) -> Evidence:
-    """The evidence without depths at keypoints, which may be hidden, where the surface has them."""
-    kept = ~np.isin(evidence.planes.image, [each.image for each in samples])
-    return evidence._replace(planes=kept_rows(evidence.planes, kept))
 
 
 def _rows(
@@ -161,7 +142,7 @@ def _rows(
     if not is_exact:
         sigma = _sigma_of_similar(depth[hit] / measured - 1, sigma)
     return Measured(
-        surface.rows(points, face[hit]),
+        *surface.rows(points, face[hit]),
         Planes(
             hit,
             np.full(count, samples.image),

@@ -15,17 +15,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.contours.rims import Rims, extraction_bias, find_rims
-from cadalign.estimation.contours.surface import (
-    PosedSurface,
-    Surface,
-    count_of,
-    state_with_points,
-    state_without_points,
-    with_measured,
-)
+from cadalign.estimation.contours.contour import Rims, Sight, extraction_bias, find_rims
+from cadalign.estimation.contours.measured import Joined, Place, Sought, cost_of, weakest_steps
+from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.estimation.contours.view_contour import (
-    OWN_MODES,
     Noise,
     ViewContour,
     first_noise,
@@ -33,13 +26,9 @@ from cadalign.estimation.contours.view_contour import (
     noise_of_similar,
     with_learned_offsets,
 )
-from cadalign.estimation.estimates import poses_of
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.solvers.joint.covariance import information_of
-from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.search import objective_of, reduced, refine_joint, score_state
+from cadalign.solvers.joint.evidence import State
+from cadalign.solvers.joint.search import objective_of, score_state
 
 _ITERATIONS = 12
 _MOST_STEPS = 20
@@ -48,7 +37,6 @@ _SHARES = (0.4, 0.1)  # of a step, until one lowers the cost
 _SHARES_OF_OTHERS = (0.5, 0.25)  # of the way to another estimate
 _LEAST_GAIN = 0.1  # of the cost, -2 log likelihood
 _WEAKEST = 2  # directions that are tried before a descent ends
-_LEAST_INFORMATION = 1e-12  # about a direction of the unknowns, relative
 _FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
 _RELATIVE_REACH = 0.04
 _WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
@@ -59,57 +47,15 @@ _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
 _SETTLED = 0.02  # [px], median change of the offsets from round to round, or in deviations
 _MOST_NOISES = 3  # that are learned, each where the cost at the last is least
 
-
-class Masked(NamedTuple):
-    """Evidence with the contours of masks, and the surface whose rims are to meet these."""
-
-    evidence: Evidence
-    keypoints: int
-    views: list[ViewContour]
-    surface: Surface
-
-
-class Place(NamedTuple):
-    """A state of the evidence, and the coefficients (V, 3) of the contours' own modes."""
-
-    state: State
-    own: FloatArray
-
-    def towards(self, other: Place, share: float) -> Place:
-        """The place a share of the way to another one."""
-        a, b = self.state, other.state
-        poses = a.poses + share * (b.poses - a.poses)
-        for pose, start, end in zip(poses, a.poses, b.poses, strict=True):
-            turn = end[:9].reshape(3, 3) @ start[:9].reshape(3, 3).T
-            part = rotation_from_vector(share * vector_from_rotation(turn))
-            pose[:9] = (part @ start[:9].reshape(3, 3)).ravel()
-        rest = [x + share * (y - x) for x, y in zip(a[1:], b[1:], strict=True)]
-        return Place(State(poses, *rest), self.own + share * (other.own - self.own))
-
-    def moved(self, step: FloatArray) -> Place:
-        """The place after a step (U,) of poses, focal lengths, scales and own modes."""
-        state, count = self.state, len(self.state.poses)
-        poses = state.poses.copy()
-        steps, focals, scales, own = np.split(
-            step, np.cumsum([6 * count, len(state.log_focals), 3])
-        )
-        for pose, part in zip(poses, steps.reshape(-1, 6), strict=True):
-            pose[:9] = (rotation_from_vector(part[:3]) @ pose[:9].reshape(3, 3)).ravel()
-            pose[9:] += part[3:]
-        moved = state._replace(
-            poses=poses,
-            log_focals=state.log_focals + focals,
-            log_scales=state.log_scales + scales,
-        )
-        return Place(moved, self.own + own.reshape(self.own.shape))
+Masked = Sought[ViewContour]
+"""Evidence with the contours of masks, and the surface whose rims are to meet these."""
 
 
 class PlacedRims(NamedTuple):
-    """Rims at a place: of every contour, with its camera and the bias of its extraction."""
+    """Rims at a place: of every contour, as its view sees them, with the extraction's bias."""
 
     posed: PosedSurface
-    poses: list[Alignment]
-    cameras: list[Camera]
+    sights: list[Sight]
     rims: list[Rims]
     biases: list[FloatArray]
 
@@ -118,38 +64,35 @@ class Stacked(NamedTuple):
     """A place with its rims as evidence.
 
     The ``cost`` is that of all evidence at the place, and of the samples without a rim, which is
-    ``unmatched``; ``rows`` are the numbers of keypoints and of the rims' points that follow these.
+    ``unmatched``.
     """
 
-    place: Place
+    joined: Joined
     look: PlacedRims
-    evidence: Evidence
-    state: State
     cost: float
     unmatched: float
-    rows: tuple[int, int]
 
-    def at(self, place: Place) -> State:
-        """Another place as a state of the evidence."""
-        keypoints, total = self.rows
-        return state_with_points(place.state, keypoints, total, place.own.ravel())
+    @property
+    def place(self) -> Place:
+        """The place, without the rims."""
+        return self.joined.place
 
 
 def rims_at(masked: Masked, place: Place, reach: float, *, is_fine: bool) -> PlacedRims:
     """Find the rims at a place; ``is_fine`` measures the bias of their extraction, too."""
-    evidence, (state, own) = masked.evidence, place
-    posed, poses = masked.surface.at(evidence.shape, state), poses_of(evidence, state)
-    cameras, rims, biases = [], [], []
-    for view, coefficients in zip(masked.views, own, strict=True):
-        camera, pose = view.camera_at(evidence, state, coefficients), poses[view.image]
-        found = find_rims(posed.caster, camera, pose, view.contour, reach)
+    posed, poses = masked.at(place.state)
+    sights, rims, biases = [], [], []
+    for view, own in zip(masked.views, place.own, strict=True):
+        camera = view.registered(masked.camera_at(view.image, view.camera, place.state), own)
+        sight = Sight(posed.caster, camera, poses[view.image])
+        found = find_rims(sight, view.contour, reach)
         bias = np.zeros(len(found.found))
         if is_fine:
-            bias = extraction_bias(posed.caster, camera, pose, view.mask, view.contour, found)
-        cameras.append(camera)
+            bias = extraction_bias(sight, view.mask, view.contour, found)
+        sights.append(sight)
         rims.append(found)
         biases.append(bias)
-    return PlacedRims(posed, poses, cameras, rims, biases)
+    return PlacedRims(posed, sights, rims, biases)
 
 
 def stack(
@@ -157,31 +100,19 @@ def stack(
 ) -> Stacked | None:
     """The rims of a place as evidence; None where there are none."""
     rows = [
-        view.evidence_of(rims, noise, look.posed, look.poses[view.image], camera=camera, bias=bias)
-        for view, noise, camera, rims, bias in zip(
-            masked.views, noises, look.cameras, look.rims, look.biases, strict=True
+        view.evidence_of(rims, noise, look.posed, sight, bias)
+        for view, noise, sight, rims, bias in zip(
+            masked.views, noises, look.sights, look.rims, look.biases, strict=True
         )
     ]
-    total = count_of(rows)
-    if not total:
+    if not any(len(each.mean) for each in rows):
         return None
-    full = with_measured(masked.evidence, masked.keypoints, rows)
-    state = state_with_points(place.state, masked.keypoints, total, place.own.ravel())
+    joined = masked.joined(place, rows)
     unmatched = sum(
         noise.cost(reach) * int((~rims.found).sum())
         for rims, noise in zip(look.rims, noises, strict=True)
     )
-    cost = objective_of(full, state) + unmatched
-    return Stacked(place, look, full, state, cost, unmatched, (masked.keypoints, total))
-
-
-def step_of(masked: Masked, here: Stacked, iterations: int = _ITERATIONS) -> Place | None:
-    """The place where all evidence agrees best if every rim's point stays, or None."""
-    cost, state, _, _ = refine_joint(here.evidence, iterations, here.state)
-    if not cost < np.inf:
-        return None
-    bare, own = state_without_points(state, *here.rows, OWN_MODES * len(masked.views))
-    return Place(bare, own.reshape(-1, OWN_MODES))
+    return Stacked(joined, look, objective_of(joined.evidence, joined.state) + unmatched, unmatched)
 
 
 class Descent(NamedTuple):
@@ -206,8 +137,8 @@ class Descent(NamedTuple):
         best, steps, since = here, 0, 0
         while steps < _MOST_STEPS:
             steps += 1
-            goal = step_of(self.masked, here)
-            there = None if goal is None else self.at(goal)
+            step = here.joined.refined(_ITERATIONS)
+            there = None if step is None else self.at(step[1].place)
             if there is not None and there.cost < best.cost - _LEAST_GAIN:
                 here = best = there
                 since = 0
@@ -225,11 +156,11 @@ class Descent(NamedTuple):
 
     def _shorter(self, here: Stacked) -> Stacked | None:
         """The first place on the way to the goal of a step that costs less."""
-        goal = step_of(self.masked, here)
-        if goal is None:
+        step = here.joined.refined(_ITERATIONS)
+        if step is None:
             return None
         for share in _SHARES:
-            there = self.at(here.place.towards(goal, share))
+            there = self.at(here.place.towards(step[1].place, share))
             if there is not None and there.cost < here.cost - _LEAST_GAIN:
                 return there
         return None
@@ -238,9 +169,9 @@ class Descent(NamedTuple):
         """A place that costs less along the directions of which least is known, or to others."""
         if not self.masked.surface.is_exact:
             return None
-        goals = [
-            here.place.moved(sign * step) for step in _weakest_steps(here) for sign in (1.0, -1.0)
-        ]
+        _, information = information_of(here.joined.evidence, here.joined.state)
+        steps = weakest_steps(information, _WEAKEST)
+        goals = [here.place.moved(sign * step) for step in steps for sign in (1.0, -1.0)]
         goals.extend(
             here.place.towards(other, share) for other in self.others for share in _SHARES_OF_OTHERS
         )
@@ -249,34 +180,21 @@ class Descent(NamedTuple):
         return best if best.cost < here.cost - _LEAST_GAIN else None
 
 
-def _weakest_steps(here: Stacked) -> list[FloatArray]:
-    """Steps (U,) of one standard deviation along the directions of which least is known."""
-    _, information = information_of(here.evidence, here.state)
-    sizes = np.sqrt(np.maximum(information.diagonal(), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(sizes, sizes))
-    roots = np.sqrt(np.maximum(values[:_WEAKEST], _LEAST_INFORMATION))
-    return list((vectors[:, :_WEAKEST] / roots / sizes[:, None]).T)
-
-
 class ContourFit(NamedTuple):
-    """A view's contour at an estimate: rims, residuals (S,) [px] with the offset removed, noise."""
+    """A view's contour at an estimate: residuals (S,) [px] with the offset removed, noise."""
 
-    rims: Rims
     residuals: FloatArray
     noise: Noise
     offset: float
 
 
 class Settled(NamedTuple):
-    """An estimate; its ``evidence`` and ``state`` hold the rims, ``place`` does not."""
+    """An estimate, with its rims as evidence."""
 
-    evidence: Evidence
-    state: State
-    place: Place
+    joined: Joined
     fits: tuple[ContourFit, ...]
     cost: float
     score: float
-    rounds: int
 
     @property
     def noises(self) -> list[Noise]:
@@ -290,18 +208,17 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
     ``is_wide`` says that the start may be far off.
     """
     first_reach = _first_reach(masked, _WIDE_REACH if is_wide else _RELATIVE_REACH)
-    approached = _approach(
-        masked, Place(state, np.zeros((len(masked.views), OWN_MODES))), first_reach
-    )
-    if approached is None:
+    found = _approach(masked, Place.of(state, len(masked.views)), first_reach)
+    if found is None:
         return None
-    place, noises, reach, rounds = approached
+    place, noises, reach = found
     is_exact, here = masked.surface.is_exact, None
     for _ in range(_MOST_NOISES):
         look = rims_at(masked, place, reach, is_fine=is_exact) if here is None else here.look
         learned = _learned(masked, place, look, noises, reach, correlated=True)
         if here is not None and is_exact:
-            learned, own = with_learned_offsets(here.evidence, here.state, learned, place.own)
+            joined = here.joined
+            learned, own = with_learned_offsets(joined.evidence, joined.state, learned, place.own)
             place = place._replace(own=own)
         if here is not None and (not is_exact or all(map(Noise.is_like, noises, learned))):
             break  # a similar surface's noise is learned on the way
@@ -309,37 +226,28 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
         here = stack(masked, place, look, noises, reach)
         if here is None:
             return None
-        here, steps = Descent(masked, noises, reach).run(here)
-        place, rounds = here.place, rounds + steps
-    return None if here is None else _settled(here, noises, rounds)
+        here, _ = Descent(masked, noises, reach).run(here)
+        place = here.place
+    return None if here is None else _settled(here, noises)
 
 
-class Approached(NamedTuple):
-    """Place after the first steps from a start.
+def approached(masked: Masked, state: State) -> tuple[State, FloatArray, float] | None:
+    """Take the first steps of `settle` from a start that may be far off.
 
-    ``residuals`` (S,) are the contours' distances from the rims there [px], without the offset that
-    all of a contour has in common, and at most ``reach``.
+    Returns the state there, the contours' distances (S,) from the rims [px], without the offset
+    that all of a contour has in common, and the reach that these are at most.
     """
-
-    state: State
-    residuals: FloatArray
-    reach: float
-
-
-def approached(masked: Masked, state: State) -> Approached | None:
-    """Take the first steps of `settle` from a start that may be far off."""
     reach = _first_reach(masked, _WIDE_REACH)
-    own = np.zeros((len(masked.views), OWN_MODES))
-    found = _approach(masked, Place(state, own), reach)
+    found = _approach(masked, Place.of(state, len(masked.views)), reach)
     if found is None:
         return None
-    place, noises = found[:2]
+    place, noises, _ = found
     look = rims_at(masked, place, reach, is_fine=False)
     residuals = [
         np.where(rims.found, np.abs(rims.offset + own_offset * noise.offset), reach)
         for rims, own_offset, noise in zip(look.rims, place.own[:, 0], noises, strict=True)
     ]
-    return Approached(place.state, np.minimum(np.concatenate(residuals), reach), reach)
+    return place.state, np.minimum(np.concatenate(residuals), reach), reach
 
 
 def settle_with(
@@ -352,10 +260,7 @@ def settle_with(
     reach = min(_first_reach(masked, _RELATIVE_REACH), _reach_of(noises))
     descent = Descent(masked, noises, reach, others)
     here = descent.at(place)
-    if here is None:
-        return None
-    here, steps = descent.run(here)
-    return _settled(here, noises, steps)
+    return None if here is None else _settled(descent.run(here)[0], noises)
 
 
 def _first_reach(masked: Masked, share: float) -> float:
@@ -368,13 +273,12 @@ def _reach_of(noises: list[Noise]) -> float:
 
 def _approach(
     masked: Masked, place: Place, reach: float
-) -> tuple[Place, list[Noise], float, int] | None:
+) -> tuple[Place, list[Noise], float] | None:
     """Steps that learn the noise from the residuals, until the rims change little."""
     is_exact = masked.surface.is_exact
     noises = [first_noise(view.sigma, reach, is_exact=is_exact) for view in masked.views]
     last: list[Rims] = []
-    rounds = 0
-    while rounds < _MOST_ROUNDS:
+    for _ in range(_MOST_ROUNDS):
         look = rims_at(masked, place, reach, is_fine=False)
         widest = max(noise.sigma for noise in noises)
         if _change(last, look.rims) < _SETTLED * max(1.0, widest):
@@ -383,14 +287,15 @@ def _approach(
         if is_exact:
             reach = min(reach, _reach_of(noises))
         here = stack(masked, place, look, noises, reach)
-        step = None if here is None else step_of(masked, here, _FEW_ITERATIONS)
-        if here is None or step is None:
+        step = None if here is None else here.joined.refined(_FEW_ITERATIONS)
+        if step is None:
             return None
-        place, last, rounds = step, look.rims, rounds + 1
+        _, joined = step
+        place, last = joined.place, look.rims
         if is_exact:
-            noises, own = with_learned_offsets(here.evidence, here.at(step), noises, step.own)
-            place = step._replace(own=own)
-    return place, noises, reach, rounds
+            noises, own = with_learned_offsets(joined.evidence, joined.state, noises, place.own)
+            place = place._replace(own=own)
+    return place, noises, reach
 
 
 def _change(last: list[Rims], rims: list[Rims]) -> float:
@@ -428,12 +333,12 @@ def _learned(
     return found
 
 
-def _settled(here: Stacked, noises: list[Noise], rounds: int) -> Settled:
-    offsets = [own[0] * noise.offset for own, noise in zip(here.place.own, noises, strict=True)]
-    fits = tuple(
-        ContourFit(rims, np.where(rims.found, rims.offset + offset, np.nan), noise, offset)
-        for rims, noise, offset in zip(here.look.rims, noises, offsets, strict=True)
-    )
-    cost, _ = information_of(*reduced(here.evidence, here.state))
-    score = score_state(here.evidence, here.state) + here.unmatched
-    return Settled(here.evidence, here.state, here.place, fits, cost, score, rounds)
+def _settled(here: Stacked, noises: list[Noise]) -> Settled:
+    joined = here.joined
+    fits = []
+    for own, rims, noise in zip(here.place.own, here.look.rims, noises, strict=True):
+        offset = own[0] * noise.offset
+        residuals = np.where(rims.found, rims.offset + offset, np.nan)
+        fits.append(ContourFit(residuals, noise, offset))
+    score = score_state(joined.evidence, joined.state) + here.unmatched
+    return Settled(joined, tuple(fits), cost_of(joined.evidence, joined.state), score)

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from cadalign.arrays import BoolArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.descent import ContourFit, Masked, Settled, settle, settle_with
-from cadalign.estimation.contours.surface import Surface, surfaces_of, with_displacement_modes
+from cadalign.estimation.contours.measured import cost_of, scaled, with_displacement_modes
+from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import ViewContour, contour_view
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
@@ -43,30 +43,31 @@ _OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
 
 
-class MaskFit(NamedTuple):
-    """Minima with the masks, the residuals of every view's mask, and what contradicts."""
+class Refined(NamedTuple):
+    """Minima with masks or photos, and what is to be noted of these in the result."""
 
     minima: list[Minimum]
-    residuals: tuple[MaskResiduals | None, ...]
-    warnings: tuple[str, ...]
+    summaries: list[EvidenceSummary]
+    warnings: list[str]
+    residuals: tuple[MaskResiduals | None, ...] = ()
+    """Those of every view's mask."""
+    photos: frozenset[int] = frozenset()
+    """Views whose photos count."""
 
     def noted_in(self, result: Result) -> Result:
-        """The result with what is known of the masks."""
-        if not self.residuals:
-            return result
-        summaries = [
-            EvidenceSummary(
-                "mask", number, int(each.inliers.sum()), each.rms / each.sigma, each.rms, "px"
-            )
-            for number, each in enumerate(self.residuals)
-            if each is not None
-        ]
+        """The result with what is known of the masks or photos."""
+        stated = Stated.of(result.statistics)
+        basis = stated.basis
+        if self.photos and basis is not None:
+            basis = replace(basis, photos=self.photos)
         statistics = replace(
-            Stated.of(result.statistics),
-            evidence=(*result.evidence, *summaries),
+            stated,
+            evidence=(*result.evidence, *self.summaries),
             warnings=(*result.warnings, *self.warnings),
+            basis=basis,
         )
-        return replace(result, mask_residuals=self.residuals, statistics=statistics)
+        residuals = self.residuals or result.mask_residuals
+        return replace(result, mask_residuals=residuals, statistics=statistics)
 
 
 class _Candidate(NamedTuple):
@@ -84,12 +85,9 @@ class _Candidate(NamedTuple):
     @property
     def minimum(self) -> Minimum:
         """The minimum that the rounds led to."""
-        settled = self.settled
+        evidence, state, *_ = self.settled.joined
         return self.start._replace(
-            evidence=settled.evidence,
-            state=settled.state,
-            cost=settled.cost,
-            score=self.score,
+            evidence=evidence, state=state, cost=self.settled.cost, score=self.score
         )
 
 
@@ -98,11 +96,11 @@ def fit_masks(
     prior: ShapePrior,
     views: Sequence[View],
     minima: Sequence[Minimum],
-) -> MaskFit:
+) -> Refined:
     """Refine the likely minima of the other evidence with the views' masks.
 
-    The ``minima`` without masks, the likeliest first, are starts where these leave something open;
-    they stay as they are where no view has a mask. Raises InputError if a mask has no contour, or
+    The ``minima`` without masks, the likeliest first, are starts where these leave something open.
+    Raises InputError if a mask has no contour, or
     the model has no mesh; DegenerateError if there is no estimate without the masks and no rim near
     them.
     """
@@ -111,8 +109,6 @@ def fit_masks(
         for number, view in enumerate(views)
         if view.mask_image is not None
     ]
-    if not contours:
-        return MaskFit(list(minima), (), ())
     keypoints = len(prior.ids)
     first = minima[0]
     choice = surfaces_of(model, first.points[:keypoints], f"views[{contours[0].image}].mask")
@@ -124,7 +120,7 @@ def fit_masks(
     best: list[_Candidate] = []
     while used:
         best = explore(used, choice.surfaces)
-        hulls = [hull_contour(each, views[each.image]) for each in used] if choice.hulls else []
+        hulls = [_hull_contour(each, views[each.image]) for each in used] if choice.hulls else []
         known = [each for each in hulls if each is not None]
         if known and len(known) == len(used):
             by_hulls = explore(known, choice.hulls)
@@ -156,18 +152,23 @@ def fit_masks(
     residuals: list[MaskResiduals | None] = [None] * len(views)
     for contour, fit in [*zip(used, fits, strict=True), *((each, None) for each in left_out)]:
         residuals[contour.image] = _residuals(contour, fit)
+    summaries = [
+        EvidenceSummary(
+            "mask", number, int(each.inliers.sum()), each.rms / each.sigma, each.rms, "px"
+        )
+        for number, each in enumerate(residuals)
+        if each is not None
+    ]
     found = [each.minimum for each in best] if used else list(minima)
-    return MaskFit(found, tuple(residuals), tuple(warnings))
+    return Refined(found, summaries, warnings, tuple(residuals))
 
 
 def _is_determined(minimum: Minimum) -> bool:
     """True if the evidence without masks determines all unknowns."""
     _, information = information_of(*reduced(minimum.evidence, minimum.state))
-    sizes = np.sqrt(information.diagonal())
-    if not np.isfinite(sizes).all() or not (sizes > 0).all():
+    if not np.isfinite(information.diagonal()).all() or not (information.diagonal() > 0).all():
         return False
-    values = np.linalg.eigvalsh(information / np.outer(sizes, sizes))
-    return bool(values[0] > _LEAST_INFORMATION)
+    return bool(np.linalg.eigvalsh(scaled(information)[0])[0] > _LEAST_INFORMATION)
 
 
 def _explored(
@@ -210,10 +211,12 @@ def _finished(candidates: list[_Candidate]) -> list[_Candidate]:
         return candidates
     noises, found = candidates[0].settled.noises, []
     for each in candidates:
-        evidence, state = with_displacement_modes(each.masked.evidence, each.settled.place.state)
+        evidence, state = with_displacement_modes(
+            each.masked.evidence, each.settled.joined.place.state
+        )
         masked = each.masked._replace(evidence=evidence)
-        others = [other.settled.place for other in candidates if other is not each]
-        place = each.settled.place._replace(state=state)
+        others = [other.settled.joined.place for other in candidates if other is not each]
+        place = each.settled.joined.place._replace(state=state)
         settled = settle_with(masked, place, noises, others)
         if settled is not None:
             found.append(each._replace(masked=masked, settled=settled))
@@ -244,34 +247,31 @@ def _contradicting(
     if supports[worst] < _LEAST_SUPPORT:
         share = f"{100 * supports[worst]:.0f} % of its contour"
         return contours[worst], f"only {share} can be the model's outline"
-    tension = _tension(best)
-    if tension is not None:
-        return contours[worst], tension
-    return None
+    reason = tension(
+        best.start, best.masked.evidence, best.settled.joined.place.state, _LEAST_PROBABILITY
+    )
+    return None if reason is None else (contours[worst], reason)
 
 
-def _tension(candidate: _Candidate) -> str | None:
-    """Report other residuals that rise more than the masks' information explains."""
+def tension(
+    start: Minimum, evidence: Evidence, state: State, least_probability: float
+) -> str | None:
+    """Report other residuals that rise from a start's more than chance and noise explain."""
     from scipy.special import chdtri  # takes longer to import than all that is compiled
 
-    start, evidence = candidate.start, candidate.masked.evidence
-    alone = _cost(*with_displacement_modes(start.evidence, start.state))
-    joint = _cost(evidence, candidate.settled.place.state)
-    equations = 2 * len(evidence.sightings.point)
-    free = 6 * len(start.state.poses) + int(evidence.scales.free.sum())
+    equations = 2 * int((evidence.sightings.whitening[:, 2] > 0).sum())
     if not equations:
         return None
+    alone = cost_of(*with_displacement_modes(start.evidence, start.state))
+    joint = cost_of(evidence, state)
+    free = 6 * len(start.state.poses) + int(evidence.scales.free.sum())
     redundancy = equations - free
     scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
     unknowns = min(free + len(evidence.shape.modes), equations)
-    if joint - alone <= scale * chdtri(unknowns, _LEAST_PROBABILITY):
+    if joint - alone <= scale * chdtri(unknowns, least_probability):
         return None
     times = np.sqrt(joint / max(alone, float(max(redundancy, 1))))
     return f"with it the other residuals are {times:.2g} times as large"
-
-
-def _cost(evidence: Evidence, state: State) -> float:
-    return information_of(*reduced(evidence, state))[0]
 
 
 def _residuals(contour: ViewContour, fit: ContourFit | None) -> MaskResiduals:
@@ -287,16 +287,11 @@ def _residuals(contour: ViewContour, fit: ContourFit | None) -> MaskResiduals:
     return MaskResiduals(points, normals, fit.residuals, near, sigma, correlation, fit.offset)
 
 
-def hull_contour(contour: ViewContour, view: View) -> ViewContour | None:
+def _hull_contour(contour: ViewContour, view: View) -> ViewContour | None:
     """The contour of the convex hull of a view's mask; None where the mask leaves the image."""
     inside = np.asarray(view.mask_image) >= 0.5
     if inside.sum() > inside[_OPEN_BORDER:-_OPEN_BORDER, _OPEN_BORDER:-_OPEN_BORDER].sum():
         return None
-    hull = replace(view, mask=_hull_of(inside))
-    return contour_view(contour.image, hull, f"views[{contour.image}].mask", contour.camera)
-
-
-def _hull_of(inside: BoolArray) -> BoolArray:
     pieces, _ = cv2.findContours(
         inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
     )
@@ -304,4 +299,5 @@ def _hull_of(inside: BoolArray) -> BoolArray:
     kept = [piece for piece in pieces if cv2.contourArea(piece) >= _LEAST_PIECE * largest]
     filled = np.zeros(inside.shape, dtype=np.uint8)
     cv2.fillConvexPoly(filled, cv2.convexHull(np.concatenate(kept)), 1)
-    return filled > 0
+    hull = replace(view, mask=filled > 0)
+    return contour_view(contour.image, hull, f"views[{contour.image}].mask", contour.camera)

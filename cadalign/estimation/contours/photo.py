@@ -1,36 +1,50 @@
-"""Minima of the other evidence, refined with photos; photos that lack the outline are left out."""
+"""Minima of the other evidence, refined with photos; photos that lack the outline are left out.
+
+Each round predicts the outline at the present estimate, learns the colours on both sides of it, and
+takes the places where lines across it leave the object as rows of the evidence (`photo_lines.py`).
+Rounds begin with long lines of blurred colours and end with short ones at full resolution; the last
+ones count with the noise that the residuals show.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.estimation.contours.descent import Place
-from cadalign.estimation.contours.photo_descent import (
-    COARSE,
-    OWN_SIGMAS,
-    Approach,
-    LineNoise,
-    OutlineSupport,
-    Pictured,
-    approach,
-    cost_of_rest,
-    finish,
-    support_of,
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.contours.fit import Refined, tension
+from cadalign.estimation.contours.measured import (
+    Joined,
+    Measured,
+    Place,
+    Sought,
+    cost_of,
+    solved,
+    weakest_steps,
+    with_displacement_modes,
 )
-from cadalign.estimation.contours.photo_lines import PhotoPyramid, photo_of
-from cadalign.estimation.contours.surface import Surface, surfaces_of, with_displacement_modes
+from cadalign.estimation.contours.photo_lines import (
+    Outline,
+    PhotoPyramid,
+    outline_of,
+    photo_of,
+    silhouette_of,
+)
+from cadalign.estimation.contours.surface import PosedSurface, Surface, surfaces_of
+from cadalign.estimation.contours.view_contour import (
+    contour_rows,
+    correlation_length,
+    trimmed_deviation,
+)
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
-from cadalign.estimation.result import Result
 from cadalign.estimation.search import Minimum
-from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import EvidenceSummary
 from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.io.images import ByteImage
 from cadalign.shapes.model import ShapeModel
@@ -38,13 +52,31 @@ from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import reduced, score_state
 
+_COARSE, _FINE = (0.16, 0.08), (0.04, 0.02)  # reaches of lines, relative to the silhouette's size
+_LEAST_REACH = 5.0  # [px]
+_ROUNDS = 3  # of every reach
+_LAST_ROUNDS = 3  # with the noise that is learned
+_ITERATIONS = 4  # of a round, whose outline is not that of its end
+# Standard deviations [px] of what all of an outline has in common: an offset outwards, and, where
+# light and blur differ from side to side, shifts to the right and down.
+_OWN_SIGMAS = (0.4, 0.3, 0.3)
+_FIRST_CORRELATION = 4.0  # lines
+_LEAST_CORRELATION = 12.0  # lines: pixels and blur displace neighbours alike
+_LEAST_FACTOR = 0.7
+_LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
+_LOSS_SCALE = 2.4  # in standard deviations
+_LEAST_OUTLIER = 2.0  # in standard deviations
+_TOLERANCE = 2.0  # [px], of a line that agrees, and the same relative to the silhouette's size
+_RELATIVE_TOLERANCE = 0.01
+_SIMILAR_TOLERANCE = 0.04  # where the model is only similar to the object
+_STRAY = 0.2  # share of the lines whose places are of other things
+_LINES_OF_PATCH = 5.0  # of which the colours count as independent
 _MOST_MINIMA = 3  # that are starts
 _MOST_FINISHED = 2
 _UNLIKELY = 30.0  # excess score of a minimum that is still a start
 _WEAKEST = 2  # directions of the pose along which further starts lie
 _SIDEWAYS = 1.5  # standard deviations of these
-_LEAST_TURN = np.radians(2.0)  # of a further start
-_MOST_TURN = np.radians(40.0)
+_LEAST_TURN, _MOST_TURN = np.radians(2.0), np.radians(40.0)  # of a further start
 _SAME_TURN = np.radians(1.0)
 _LEAST_SUPPORT = 0.5  # share of the outline that must be found
 _GOOD_SUPPORT = 0.75  # below which a warning says so
@@ -52,37 +84,191 @@ _MOST_RMS = 1.75  # of the lines found, in standard deviations, above which a wa
 _LEAST_PROBABILITY = 1e-3  # of such a rise of the other residuals by chance
 
 
-class PhotoFit(NamedTuple):
-    """Minima with the photos, what each photo supports, and what is left out.
+class LineNoise(NamedTuple):
+    """Factor of the standard deviations of a photo's lines, and neighbours that count as one."""
 
-    ``found`` has the `OutlineSupport` of each view by its number, None where no outline was found.
+    factor: float = 1.0
+    correlation: float = _FIRST_CORRELATION
+
+
+Pictured = Sought[PhotoPyramid]
+"""Evidence with photos, and the surface whose outline is sought in these."""
+
+
+class Approach(NamedTuple):
+    """A place, and the outlines from which the last step led there.
+
+    An outline is None where a photo shows none; ``joined`` is the evidence with them.
     """
 
-    minima: list[Minimum]
-    found: dict[int, OutlineSupport | None]
-    warnings: tuple[str, ...]
+    place: Place
+    outlines: tuple[Outline | None, ...] = ()
+    joined: Joined | None = None
 
-    def noted_in(self, result: Result) -> Result:
-        """The result with what is known of the photos."""
-        if not self.found:
-            return result
-        lacking = OutlineSupport(0.0, 0, 0.0, 0.0, 0.0, 0.0)
-        summaries = []
-        for view, support in self.found.items():
-            share, lines, rms, rms_sigmas, *_ = support or lacking
-            summaries.append(EvidenceSummary("photo", view, lines, rms_sigmas, rms, "px", share))
-        used = frozenset(view for view, support in self.found.items() if support is not None)
-        stated = Stated.of(result.statistics)
-        basis = stated.basis
-        if used and basis is not None:
-            basis = replace(basis, photos=used)
-        statistics = replace(
-            stated,
-            evidence=(*result.evidence, *summaries),
-            warnings=(*result.warnings, *self.warnings),
-            basis=basis,
-        )
-        return replace(result, statistics=statistics)
+
+def _approach(
+    pictured: Pictured, start: Approach, reaches: Sequence[float] = _COARSE
+) -> Approach | None:
+    """Rounds with lines of the given reaches; None where no photo shows an outline."""
+    here: Approach | None = start
+    for share in reaches:
+        for _ in range(_ROUNDS):
+            noises = [LineNoise()] * len(pictured.views)
+            here = None if here is None else _round(pictured, here.place, share, noises)
+    return here
+
+
+def _finish(pictured: Pictured, start: Approach) -> Approach | None:
+    """Rounds with short lines, the last ones at the noise that the residuals show."""
+    here, noises = _approach(pictured, start, _FINE), [LineNoise()] * len(pictured.views)
+    for _ in range(_LAST_ROUNDS):
+        if here is None:
+            return None
+        noises = [*map(_noise_of, here.outlines, here.place.own)]
+        here = _round(pictured, here.place, _FINE[-1], noises)
+    return None if here is None else _widened(pictured, here, noises)
+
+
+def _round(
+    pictured: Pictured, place: Place, share: float, noises: list[LineNoise]
+) -> Approach | None:
+    """One step, with the outline that the present state has."""
+    posed, poses = pictured.at(place.state)
+    outlines: list[Outline | None] = []
+    rows = []
+    for photo, noise in zip(pictured.views, noises, strict=True):
+        camera = pictured.camera_at(photo.image, photo.camera, place.state)
+        pose, outline = poses[photo.image], None
+        silhouette = silhouette_of(posed, camera, pose)
+        if silhouette is not None:
+            outline = outline_of(photo, silhouette, max(share * silhouette.size, _LEAST_REACH))
+        if outline is not None and outline.is_told.any():
+            rows.append(_rows(photo, outline, noise, posed, pose, camera))
+            outlines.append(outline)
+        else:
+            outlines.append(None)
+    if not rows:
+        return None
+    shown = np.array([outline is not None for outline in outlines])
+    refined = pictured.joined(place._replace(own=place.own[shown]), rows).refined(_ITERATIONS)
+    if refined is None:
+        return None
+    own, (_, joined) = np.zeros_like(place.own), refined
+    own[shown] = joined.place.own
+    return Approach(Place(joined.place.state, own), tuple(outlines), joined)
+
+
+def _rows(
+    photo: PhotoPyramid,
+    outline: Outline,
+    noise: LineNoise,
+    surface: PosedSurface,
+    pose: Alignment,
+    camera: Camera,
+) -> Measured:
+    """The lines that tell a place, in the form of the evidence."""
+    told, silhouette, given = outline.is_told, outline.silhouette, photo.camera
+    rays, _ = given.normalize_where_valid(silhouette.contour.points[told])
+    slopes = np.array([[given.fx], [given.fy]]) * given.distortion_jacobian(rays)
+    root = np.sqrt(noise.correlation)
+    return contour_rows(
+        photo.image,
+        surface,
+        pose,
+        silhouette.points[told],
+        silhouette.face[told],
+        across=np.einsum("ni,nij->nj", silhouette.across[told], slopes),
+        places=outline.places[told],
+        weights=1 / (noise.factor * outline.sigmas[told] * root),
+        loss_scale=_LOSS_SCALE / root,
+        own=_OWN_SIGMAS,
+        cameras=(given, camera),
+    )
+
+
+def _noise_of(outline: Outline | None, own: FloatArray) -> LineNoise:
+    """The noise that the residuals of an outline show, beside what all of it has in common."""
+    if outline is None:
+        return LineNoise()
+    residuals, told = outline.in_sigmas(_common(outline, own)), outline.is_told
+    factor = max(trimmed_deviation(residuals[told], _LEAST_OUTLIER), _LEAST_FACTOR)
+    influence = residuals / (1 + (residuals / (_LOSS_SCALE * factor)) ** 2)
+    length = correlation_length(outline.silhouette.contour, influence, told)
+    return LineNoise(factor, max(length, _LEAST_CORRELATION))
+
+
+def _widened(pictured: Pictured, here: Approach, noises: list[LineNoise]) -> Approach:
+    """The same, with the noise of lines as large as it is if unknowns fitted a part of it.
+
+    Their residuals have as many degrees of freedom less as the lines determine unknowns.
+    """
+    joined = cast(Joined, here.joined)
+    sightings, state = joined.evidence.sightings, joined.state
+    is_line = np.arange(len(sightings.point)) >= len(pictured.evidence.sightings.point)
+
+    def weighted(factor: float) -> Evidence:
+        whitening = np.where(is_line[:, None], factor, 1.0) * sightings.whitening
+        return joined.evidence._replace(sightings=sightings._replace(whitening=whitening))
+
+    (_, whole), (_, rest) = (information_of(weighted(lines), state) for lines in (1.0, 0.0))
+    fitted = float(np.trace(solved(whole, whole - rest)))
+    count = sum(
+        float(outline.is_told.sum()) / noise.correlation
+        for outline, noise in zip(here.outlines, noises, strict=True)
+        if outline is not None
+    )
+    factor = np.sqrt(max(1 - fitted / max(count, 1.0), _LEAST_FREEDOM))
+    return here._replace(joined=joined._replace(evidence=weighted(factor)))
+
+
+def _common(outline: Outline, own: FloatArray) -> FloatArray:
+    """Places (S,) [px] outwards to which the coefficients ``own`` (3,) take an outline."""
+    offset, *shift = own * _OWN_SIGMAS
+    return np.asarray(offset + outline.silhouette.contour.normals @ shift)
+
+
+class OutlineSupport(NamedTuple):
+    """Agreement of a photo with an outline.
+
+    The ``share`` of it that was found within the tolerance, the number of ``lines``, their
+    root mean square distance ``rms`` [px] and ``rms_sigmas``. The log likelihoods [nats] are those
+    that the colours give the silhouette, ``contrast``, over one anywhere, and that the lines'
+    places give the outline, ``agreement``, over places anywhere on the lines.
+    """
+
+    share: float
+    lines: int
+    rms: float
+    rms_sigmas: float
+    contrast: float
+    agreement: float
+
+
+_NO_SUPPORT = OutlineSupport(0.0, 0, 0.0, 0.0, 0.0, 0.0)
+
+
+def _support_of(outline: Outline | None, own: FloatArray, *, is_exact: bool) -> OutlineSupport:
+    """The support of an outline beside what all of it has in common, ``own`` (3,) as `Approach`."""
+    if outline is None:
+        return _NO_SUPPORT
+    relative = _RELATIVE_TOLERANCE if is_exact else _SIMILAR_TOLERANCE
+    tolerance = max(_TOLERANCE, relative * outline.silhouette.size)
+    common = _common(outline, own)
+    distances = outline.places - common
+    near: BoolArray = outline.is_told & (np.abs(distances) < tolerance)
+    count = int(near.sum())
+    contrast = 2 * len(near) / _LINES_OF_PATCH * outline.contrast
+    factor, correlation = _noise_of(outline, own)
+    residuals, told = outline.in_sigmas(common) / factor, outline.is_told
+    sigmas = factor * np.where(told, outline.sigmas, 1.0)
+    density = np.exp(-(residuals**2) / 2) / np.sqrt(2 * np.pi) / sigmas
+    gains = np.log((1 - _STRAY) * density * 2 * outline.reach + _STRAY)  # some are other things'
+    agreement = float(gains[told].sum() / correlation)
+    if not count:
+        return OutlineSupport(0.0, 0, 0.0, 0.0, contrast, agreement)
+    rms = float(np.sqrt((distances[near] ** 2).mean()))
+    rms_sigmas = float(np.sqrt((outline.in_sigmas(common)[near] ** 2).mean()))
+    return OutlineSupport(count / len(near), count, rms, rms_sigmas, contrast, agreement)
 
 
 class _Candidate(NamedTuple):
@@ -97,24 +283,23 @@ class _Candidate(NamedTuple):
         """OutlineSupport of the outline by each photo."""
         is_exact = self.pictured.surface.is_exact
         return [
-            support_of(outline, own, is_exact=is_exact)
-            for outline, own in zip(self.reached.outlines, self.reached.own, strict=True)
+            _support_of(outline, own, is_exact=is_exact)
+            for outline, own in zip(self.reached.outlines, self.reached.place.own, strict=True)
         ]
 
     @property
     def rank(self) -> float:
         """-2 log of its probability, by the other evidence and by the photos."""
-        rest = cost_of_rest(self.pictured, self.reached.state) + self.start.prior_score
+        rest = cost_of(self.pictured.evidence, self.reached.place.state) + self.start.prior_score
         return rest - 2 * sum(each.contrast + each.agreement for each in self.supports)
 
     @property
     def minimum(self) -> Minimum:
         """The minimum, which lines count in by the colours that they separate."""
-        full = cast(Evidence, self.reached.full)
-        room = cast(State, self.reached.room)
-        cost, _ = information_of(*reduced(full, room))
-        score = score_state(full, room) - cost + self.rank
-        return self.start._replace(evidence=full, state=room, cost=cost, score=score)
+        evidence, state, *_ = cast(Joined, self.reached.joined)
+        cost = cost_of(evidence, state)
+        score = score_state(evidence, state) - cost + self.rank
+        return self.start._replace(evidence=evidence, state=state, cost=cost, score=score)
 
 
 def fit_photos(
@@ -122,39 +307,43 @@ def fit_photos(
     prior: ShapePrior,
     views: Sequence[View],
     minima: Sequence[Minimum],
-) -> PhotoFit:
+) -> Refined:
     """Refine the likely minima of the other evidence with the views' photos.
 
-    A photo counts where its view has no mask, which is the better outline. Raises InputError if the
-    model has no mesh.
+    A photo counts where its view has no mask, which is the better outline: at least one must.
+    Raises InputError if the model has no mesh.
     """
-    lenses = minima[0].lenses
+    cameras = minima[0].lenses.cameras
     photos = [
-        photo_of(number, lenses.cameras[number], cast(ByteImage, view.image))
+        photo_of(number, cameras[number], cast(ByteImage, view.image))
         for number, view in enumerate(views)
         if view.image is not None and view.mask is None
     ]
-    if not photos:
-        return PhotoFit(list(minima), {}, ())
     keypoints = len(prior.ids)
     where = f"views[{photos[0].image}].image"
     surface = surfaces_of(model, minima[0].points[:keypoints], where).surfaces[0]
-    left_out: dict[int, OutlineSupport | None] = {}
-    warnings = []
+    warnings: list[str] = []
+    found: dict[int, OutlineSupport] = {}
+    left_out: dict[int, OutlineSupport] = {}
+    refined = list(minima)
     while photos:
         best = _explored(minima, keypoints, photos, surface)
         wrong = _lacking(best, photos)
         if wrong is None:
             supports = best[0].supports
-            known = {p.image: each for p, each in zip(photos, supports, strict=True)}
-            warnings.extend(_weak(known))
-            found = {**known, **left_out}
-            return PhotoFit([each.minimum for each in best], found, tuple(warnings))
+            found = {photo.image: each for photo, each in zip(photos, supports, strict=True)}
+            warnings.extend(_weak(found))
+            refined = [each.minimum for each in best]
+            break
         photo, reason = wrong
         warnings.append(f"views[{photo.image}].image is left out: {reason}")
-        left_out[photo.image] = None
+        left_out[photo.image] = _NO_SUPPORT
         photos.remove(photo)
-    return PhotoFit(list(minima), left_out, tuple(warnings))
+    summaries = [
+        EvidenceSummary("photo", view, own.lines, own.rms_sigmas, own.rms, "px", own.share)
+        for view, own in {**found, **left_out}.items()
+    ]
+    return Refined(refined, summaries, warnings, photos=frozenset(found))
 
 
 def _weak(found: dict[int, OutlineSupport]) -> list[str]:
@@ -175,18 +364,15 @@ def _explored(
 ) -> list[_Candidate]:
     """The distinct best of all starts, the likeliest first."""
     near: list[_Candidate] = []
-    noises = [LineNoise()] * len(photos)
     for start, state in _starts(minima):
         evidence, state = with_displacement_modes(start.evidence, state)
         pictured = Pictured(evidence, keypoints, list(photos), surface)
-        reached = approach(
-            pictured, Approach(state, np.zeros((len(photos), len(OWN_SIGMAS)))), COARSE, noises
-        )
+        reached = _approach(pictured, Approach(Place.of(state, len(photos))))
         if reached is not None:
             near.append(_Candidate(start, pictured, reached))
     finished = []
     for each in _distinct(near)[:_MOST_FINISHED]:
-        reached = finish(each.pictured, each.reached)
+        reached = _finish(each.pictured, each.reached)
         if reached is not None:
             finished.append(each._replace(reached=reached))
     return _distinct(finished)
@@ -195,44 +381,28 @@ def _explored(
 def _distinct(candidates: list[_Candidate]) -> list[_Candidate]:
     """Candidates without those that equal a likelier one, the likeliest first."""
     kept: list[_Candidate] = []
+    turns: list[FloatArray] = []
     for each in sorted(candidates, key=lambda candidate: candidate.rank):
-        if all(_turn_between(each, other) > _SAME_TURN for other in kept):
+        turn = each.reached.place.state.poses[0, :9].reshape(3, 3)
+        gaps = [np.linalg.norm(vector_from_rotation(turn @ other.T)) for other in turns]
+        if all(gap > _SAME_TURN for gap in gaps):
             kept.append(each)
+            turns.append(turn)
     return kept
-
-
-def _turn_between(one: _Candidate, other: _Candidate) -> float:
-    """Angle between the first poses [rad]."""
-    first, second = (each.reached.state.poses[0, :9].reshape(3, 3) for each in (one, other))
-    return float(np.linalg.norm(vector_from_rotation(first @ second.T)))
 
 
 def _starts(minima: Sequence[Minimum]) -> list[tuple[Minimum, State]]:
     """The likely minima, and states beside the best one where its pose is known least."""
     best = minima[0]
-    likely = [each for each in minima[:_MOST_MINIMA] if each.score <= best.score + _UNLIKELY]
-    starts = [(each, each.state) for each in likely]
-    for step in _sideways(best):
-        for sign in (1.0, -1.0):
-            starts.append((best, Place(best.state, np.zeros((0, 3))).moved(sign * step).state))
+    first = minima[:_MOST_MINIMA]
+    starts = [(each, each.state) for each in first if each.score <= best.score + _UNLIKELY]
+    _, information = information_of(*reduced(best.evidence, best.state))
+    others = 6 * (len(best.state.poses) - 1) + len(best.state.log_focals) + 3
+    for own in weakest_steps(information[:6, :6], _WEAKEST):
+        step = np.concatenate([_SIDEWAYS * own, np.zeros(others)])
+        if _LEAST_TURN < np.linalg.norm(step[:3]) < _MOST_TURN:
+            starts.extend((best, Place.of(best.state).moved(sign * step).state) for sign in (1, -1))
     return starts
-
-
-def _sideways(minimum: Minimum) -> list[FloatArray]:
-    """Steps (U,) of the first pose along the directions of which least is known."""
-    _, information = information_of(*reduced(minimum.evidence, minimum.state))
-    own = information[:6, :6]
-    sizes = np.sqrt(np.maximum(own.diagonal(), 1e-300))
-    values, vectors = np.linalg.eigh(own / np.outer(sizes, sizes))
-    steps = []
-    length = 6 * len(minimum.state.poses) + len(minimum.state.log_focals) + 3
-    for value, vector in zip(values[:_WEAKEST], vectors.T, strict=False):
-        step = np.zeros(length)
-        step[:6] = _SIDEWAYS * vector / sizes / np.sqrt(max(float(value), 1e-12))
-        turn = float(np.linalg.norm(step[:3]))
-        if _LEAST_TURN < turn < _MOST_TURN:
-            steps.append(step)
-    return steps
 
 
 def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> tuple[PhotoPyramid, str] | None:
@@ -244,24 +414,6 @@ def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> tuple[PhotoP
     if supports[worst].share < _LEAST_SUPPORT:
         share = f"{100 * supports[worst].share:.0f} % of the model's outline"
         return photos[worst], f"it shows only {share}"
-    tension = _tension(best[0])
-    return None if tension is None else (photos[worst], tension)
-
-
-def _tension(candidate: _Candidate) -> str | None:
-    """Report other residuals that rise more than chance and noise explain."""
-    from scipy.special import chdtri  # takes longer to import than all that is compiled
-
-    pictured, start = candidate.pictured, candidate.start
-    equations = 2 * int((pictured.evidence.sightings.whitening[:, 2] > 0).sum())
-    if not equations:
-        return None
-    alone = cost_of_rest(pictured, with_displacement_modes(start.evidence, start.state)[1])
-    joint = cost_of_rest(pictured, candidate.reached.state)
-    free = 6 * len(start.state.poses) + int(pictured.evidence.scales.free.sum())
-    redundancy = equations - free
-    scale = max(1.0, alone / redundancy) if redundancy > 0 else 1.0
-    unknowns = min(free + len(pictured.evidence.shape.modes), equations)
-    if joint - alone <= scale * chdtri(unknowns, _LEAST_PROBABILITY):
-        return None
-    return f"with it the other residuals are {np.sqrt(joint / max(alone, 1.0)):.2g} times as large"
+    start, pictured, reached = best[0]
+    reason = tension(start, pictured.evidence, reached.place.state, _LEAST_PROBABILITY)
+    return None if reason is None else (photos[worst], reason)

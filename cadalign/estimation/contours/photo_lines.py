@@ -16,10 +16,17 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.estimation.contours.contour import Contour, Image, contour_of, interpolated
-from cadalign.estimation.contours.rims import across_rims, find_rims
+from cadalign.estimation.contours.contour import (
+    Contour,
+    Image,
+    Sight,
+    across_rims,
+    contour_of,
+    find_rims,
+    interpolated,
+)
 from cadalign.estimation.contours.surface import PosedSurface
-from cadalign.geometry.alignment import Alignment, model_rays
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 from cadalign.io.images import ByteImage
@@ -213,17 +220,15 @@ def silhouette_of(surface: PosedSurface, camera: Camera, pose: Alignment) -> Sil
     # Room for the contour's smoothing, and for colours of the background.
     corner = low - 4 * cell
     width, height = (np.ceil((high - low) / cell).astype(int) + 9).tolist()
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).reshape(-1, 2)
-    rays, valid = camera.normalize_where_valid(corner + cell * grid)
-    origin, model_from_ray = model_rays(pose)
-    directions = rays @ model_from_ray[:, :2].T + model_from_ray[:, 2]
-    inside = (surface.caster.covered(origin, directions) & valid).reshape(height, width)
+    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    sight = Sight(surface.caster, camera, pose)
+    inside = sight.covers(corner + cell * grid)
     rough = contour_of(inside)
     if not len(rough.points):
         return None
     contour = rough._replace(points=corner + cell * rough.points)
-    rims = find_rims(surface.caster, camera, pose, contour, _RIM_REACH * cell)
-    on_rim = contour._replace(points=contour.points + rims.offset[:, None] * contour.normals)
+    rims = find_rims(sight, contour, _RIM_REACH * cell)
+    on_rim = contour._replace(points=contour.at(rims.offset))
     across = across_rims(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
     within = (on_rim.points > _BORDER) & (on_rim.points < [camera.width - 3, camera.height - 3])
     kept = rims.found & within.all(axis=1)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
-from pathlib import Path
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -12,14 +10,13 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.descent import Masked, approached
-from cadalign.estimation.contours.silhouettes import Resembling, differ, resembling_poses
+from cadalign.estimation.contours.silhouettes import differ, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import ViewContour, contour_view, cost_of_contour
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
-from cadalign.geometry.mesh import Mesh
-from cadalign.io.meshes.load import load_mesh
+from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import TrainingShapes
 
@@ -48,24 +45,12 @@ class _Proposal(NamedTuple):
     cost: float
 
 
-class MaskProposals(NamedTuple):
-    """Minima near a mask, the best first; numbers of iterations and of starts, and a mistake."""
-
-    minima: list[Minimum]
-    iterations: int
-    starts: int
-    mistake: str | None
-
-
-class _Silhouetted(NamedTuple):
-    """An alignment whose silhouette resembles the mask, and the surface that it is of."""
-
-    resembling: Resembling
-    surface: Surface
-
-
-def minima_of_mask(problem: JointProblem, model: Model | ShapeModel) -> MaskProposals:
+def minima_of_mask(
+    problem: JointProblem, model: Model | ShapeModel
+) -> tuple[list[Minimum], int, int, str | None]:
     """Minima of the evidence beside the mask of the only view, at alignments that resemble it.
+
+    The best is the first; then numbers of iterations and of starts, and a mistake to warn of.
 
     Of a model that is only similar, and of a learned shape, they are proposals: another shape in
     another pose has an outline alike.
@@ -84,8 +69,8 @@ def minima_of_mask(problem: JointProblem, model: Model | ShapeModel) -> MaskProp
     proposals: list[_Proposal] = []
     steps, starts = 0, 0
     for is_cut, count in _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR:
-        for each in _silhouetted(problem, model, count, is_cut=is_cut):
-            found, iterations = _approached(problem, each, contour)
+        for alignment, surface in _resembling(problem, model, count, is_cut=is_cut):
+            found, iterations = _approached(problem, alignment, surface, contour)
             starts, steps = starts + 1, steps + iterations
             if found is not None:
                 proposals.append(found)
@@ -105,7 +90,7 @@ def minima_of_mask(problem: JointProblem, model: Model | ShapeModel) -> MaskProp
             "average: the object may be partly hidden, the model another, or the pose wrong"
         )
     chosen = [each.minimum for each in _chosen(proposals)]
-    return MaskProposals(chosen, steps, starts, mistake)
+    return chosen, steps, starts, mistake
 
 
 def _is_met(proposals: Sequence[_Proposal], contour: ViewContour) -> bool:
@@ -115,51 +100,52 @@ def _is_met(proposals: Sequence[_Proposal], contour: ViewContour) -> bool:
     return bool(cost < np.log(sigma) + (1 + np.log(2 * np.pi)) / 2)
 
 
-def _silhouetted(
+def _resembling(
     problem: JointProblem, model: Model | ShapeModel, count: int, *, is_cut: bool
-) -> list[_Silhouetted]:
-    """Alignments whose silhouettes resemble the mask, of all meshes, the best first."""
+) -> list[tuple[Alignment, Surface]]:
+    """Alignments of all meshes whose silhouettes resemble the mask, the best first."""
     (view,), camera = problem.views, problem.lenses.cameras[0]
     free = np.asarray(problem.prior.scales.free > 0)
     mask = cast(FloatArray, view.mask_image)
     found = [
-        _Silhouetted(each, surface)
-        for mesh, surface in _meshes_of(model)
-        for each in resembling_poses(mesh, mask, camera, free=free, count=count, is_cut=is_cut)
+        (each, surface)
+        for surface in _surfaces_of(model)
+        for each in resembling_poses(
+            surface.mesh, mask, camera, free=free, count=count, is_cut=is_cut
+        )
     ]
-    return sorted(found, key=lambda each: -each.resembling.iou)[:count]
+    best = sorted(found, key=lambda pair: -pair[0].iou)[:count]
+    return [(each.alignment, surface) for each, surface in best]
 
 
 def _approached(
-    problem: JointProblem, start: _Silhouetted, contour: ViewContour
+    problem: JointProblem, start: Alignment, surface: Surface, contour: ViewContour
 ) -> tuple[_Proposal | None, int]:
     """The minimum near a start, its outline brought to the mask's; and the iterations."""
-    _, minima, iterations, _ = find_minima(problem, [start.resembling.alignment], None)
+    _, minima, iterations, _ = find_minima(problem, [start], None)
     if not minima:
         return None, iterations
     best = minima[0]
-    masked = Masked(best.evidence, len(problem.prior.ids), [contour], start.surface)
+    masked = Masked(best.evidence, len(problem.prior.ids), [contour], surface)
     found = approached(masked, best.state)
     if found is None:
         return None, iterations
-    misfit, cost = float(found.residuals.mean()), cost_of_contour(found.residuals, found.reach)
-    return _Proposal(best._replace(state=found.state), misfit, cost), iterations
+    state, residuals, reach = found
+    misfit, cost = float(residuals.mean()), cost_of_contour(residuals, reach)
+    return _Proposal(best._replace(state=state), misfit, cost), iterations
 
 
-def _meshes_of(model: Model | ShapeModel) -> list[tuple[Mesh, Surface]]:
-    """Meshes with their surfaces: the model's, or those of varied training models."""
+def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:
+    """Surfaces of the model's mesh, or of varied training models'."""
     if isinstance(model, Model):
-        points = cast(FloatArray, model.points_3d)
-        return [(cast(Mesh, model.mesh), surfaces_of(model, points, _WHERE).surfaces[0])]
-    mean = model.components[0].mean[: len(model.ids)]
-    surfaces_of(model, mean, _WHERE)  # refuses a model without meshes
-    training = cast(TrainingShapes, model.training)
-    found = []
-    for row in _varied(training, mean):
-        points = training.points_3d[row].astype(np.float64)
-        surface = surfaces_of(model, points, _WHERE).surfaces[0]
-        found.append((_mesh_at(cast(Path, training.mesh_paths[row])), surface))
-    return found
+        shapes = [cast(FloatArray, model.points_3d)]
+    else:
+        mean = model.components[0].mean[: len(model.ids)]
+        surfaces_of(model, mean, _WHERE)  # refuses a model without meshes
+        training = cast(TrainingShapes, model.training)
+        rows = _varied(training, mean)
+        shapes = list(training.points_3d[rows].astype(np.float64))
+    return [surfaces_of(model, points, _WHERE).surfaces[0] for points in shapes]
 
 
 def _varied(training: TrainingShapes, mean: FloatArray) -> list[int]:
@@ -173,11 +159,6 @@ def _varied(training: TrainingShapes, mean: FloatArray) -> list[int]:
     while len(chosen) < min(_MOST_MESHES, len(rows)):
         chosen.append(int(gaps[:, chosen].min(axis=1).argmax()))
     return [rows[k] for k in chosen]
-
-
-@lru_cache(maxsize=16)
-def _mesh_at(path: Path) -> Mesh:
-    return load_mesh(path)  # one object, for which silhouettes are rendered once
 
 
 def _chosen(proposals: list[_Proposal]) -> list[_Proposal]:

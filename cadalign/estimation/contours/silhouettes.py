@@ -23,13 +23,14 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import Image, sampled
 from cadalign.estimation.contours.surface import caster_of, corners_of
+from cadalign.estimation.facing import turned_alignment
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
 
 _DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
-_CELLS = 80  # of a silhouette's image
+_CELLS = 80  # of a silhouette's or a mask's image
 _TURNS = 64
 _RINGS = 24
 _OUTERMOST = 3.0  # [standard deviations], of the rings
@@ -40,7 +41,6 @@ _CUT_SHARES = (0.15, 0.3)  # of the area that lies beyond a line
 _CUT_ANGLES = 12
 _OUTLINE_CELLS = 40
 _OUTLINE_EVERY = 2  # directions, and rings and turns
-_QUERY_CELLS = 80  # of a mask's image
 _LINE_ANGLES = 16  # of what hides a part
 _HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
 _LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
@@ -110,16 +110,10 @@ def _radii(count: int) -> FloatArray:
     return np.asarray(_OUTERMOST * (np.arange(count) + 0.5) / count)
 
 
-@lru_cache(maxsize=16)
-def atlas_of(mesh: Mesh) -> Atlas:
-    """The whole silhouettes of a mesh, rendered once."""
-    return _atlas(mesh, 1, _uncut)
-
-
-@lru_cache(maxsize=16)
-def cut_atlas_of(mesh: Mesh) -> Atlas:
-    """Parts of a mesh's silhouettes that straight lines leave, rendered once."""
-    return _atlas(mesh, _CUT_EVERY, _cuts)
+@lru_cache(maxsize=32)
+def atlas_of(mesh: Mesh, *, is_cut: bool = False) -> Atlas:
+    """The silhouettes of a mesh, whole or the parts that lines leave, rendered once."""
+    return _atlas(mesh, _CUT_EVERY, _cuts) if is_cut else _atlas(mesh, 1, _uncut)
 
 
 def outline_of(mesh: Mesh) -> Whitened:
@@ -254,7 +248,7 @@ def resembling_poses(
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
     lies beyond a line.
     """
-    atlas, view = cut_atlas_of(mesh) if is_cut else atlas_of(mesh), _facing(mask, camera)
+    atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
     query = whitened(view.image, view.corner, view.cell)
     poses = [_pose_of(*each, atlas, free) for each in _affine_cameras(atlas, query)]
     found = [Resembling(pose, _overlap(atlas, view, pose, is_cut=is_cut)) for pose in poses]
@@ -263,9 +257,8 @@ def resembling_poses(
     for each in found:
         if len(kept) < count and all(differ(each.alignment, other.alignment) for other in kept):
             kept.append(each)
-    return [
-        each._replace(alignment=_turned(each.alignment, view.camera_from_facing)) for each in kept
-    ]
+    turn = view.camera_from_facing
+    return [each._replace(alignment=turned_alignment(each.alignment, turn)) for each in kept]
 
 
 def outline_of_mask(mask: FloatArray | BoolArray, camera: Camera) -> Whitened:
@@ -277,22 +270,16 @@ def outline_of_mask(mask: FloatArray | BoolArray, camera: Camera) -> Whitened:
 class _Facing(NamedTuple):
     """A mask as a camera sees it that looks at its middle.
 
-    Cells of ``image`` (n, n) lie on the plane at depth 1, from ``corner`` (2,) on; those that
-    ``is_seen`` (n * n,) marks lie in the photo.
+    Cells of ``image`` (n, n) lie on the plane at depth 1, from ``corner`` (2,) on, with ``rays``
+    (n * n, 3) through them; those that ``is_seen`` (n * n,) marks lie in the photo.
     """
 
     image: Image
     is_seen: BoolArray
+    rays: FloatArray
     corner: FloatArray
     cell: float
     camera_from_facing: FloatArray
-
-    @property
-    def rays(self) -> FloatArray:
-        """Rays (n * n, 3) through the cells."""
-        places = self.cell * np.arange(len(self.image))
-        x, y = np.meshgrid(self.corner[0] + places, self.corner[1] + places)
-        return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
 
 
 def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
@@ -310,13 +297,13 @@ def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
     flat = turned[:, :2] / turned[:, 2:]
     low, high = flat.min(axis=0), flat.max(axis=0)
     middle, width = (low + high) / 2, _MARGIN * float((high - low).max())
-    cell = width / (_QUERY_CELLS - 1)
-    everywhere = np.ones(_QUERY_CELLS * _QUERY_CELLS, dtype=bool)
-    blank = np.zeros((_QUERY_CELLS, _QUERY_CELLS), np.float32)
-    empty = _Facing(blank, everywhere, middle - width / 2, cell, turn)
-    in_camera = empty.rays @ turn.T
+    cell, corner = width / (_CELLS - 1), middle - width / 2
+    places = cell * np.arange(_CELLS)
+    x, y = np.meshgrid(corner[0] + places, corner[1] + places)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    in_camera = rays @ turn.T
     pixels = camera.project(np.where(in_camera[:, 2:] > 1e-6, in_camera, [0, 0, 1]))
-    single = np.clip(pixels, -1e6, 1e6).astype(np.float32).reshape(_QUERY_CELLS, _QUERY_CELLS, 2)
+    single = np.clip(pixels, -1e6, 1e6).astype(np.float32).reshape(_CELLS, _CELLS, 2)
     # Averages over a cell, where it holds several pixels.
     blur = max(cell * camera.fx / 3, 0.3)
     soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur)
@@ -327,9 +314,8 @@ def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_CONSTANT,
     )
-    return empty._replace(
-        image=np.asarray(image, dtype=np.float32), is_seen=camera.contains(pixels)
-    )
+    seen_cells = np.asarray(image, dtype=np.float32)
+    return _Facing(seen_cells, camera.contains(pixels), rays, corner, cell, turn)
 
 
 def _affine_cameras(atlas: Atlas, query: Whitened) -> list[tuple[FloatArray, FloatArray]]:
@@ -387,10 +373,10 @@ def _stretch_of(matrix: FloatArray, free: BoolArray) -> FloatArray:
 def _line_bins() -> IntArray:
     """Numbers (`_LINE_ANGLES`, n * n) of the cells' places along directions, all around."""
     angles = 2 * np.pi * np.arange(_LINE_ANGLES) / _LINE_ANGLES
-    places = np.arange(_QUERY_CELLS) - (_QUERY_CELLS - 1) / 2
+    places = np.arange(_CELLS) - (_CELLS - 1) / 2
     x, y = np.meshgrid(places, places)
     along = np.cos(angles)[:, None] * x.ravel() + np.sin(angles)[:, None] * y.ravel()
-    return np.asarray(np.rint(along + _QUERY_CELLS), dtype=np.int64)
+    return np.asarray(np.rint(along + _CELLS), dtype=np.int64)
 
 
 def _overlap(atlas: Atlas, view: _Facing, pose: Alignment, *, is_cut: bool) -> float:
@@ -419,7 +405,3 @@ def differ(one: Alignment, other: Alignment) -> bool:
     turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     stretch = np.abs(np.log(one.scale / other.scale)).max()
     return bool(turn > _DISTINCT_DEG or stretch > _DISTINCT_STRETCH)
-
-
-def _turned(pose: Alignment, turn: FloatArray) -> Alignment:
-    return Alignment(turn @ pose.rotation, turn @ pose.translation, pose.scale)

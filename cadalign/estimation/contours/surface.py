@@ -4,18 +4,15 @@ For a mesh that is only similar to the object, there is its convex hull, too. Wh
 legs, or a hole, differs from object to object more than the outermost points do, which keypoints
 and the box describe. The silhouette of a convex hull is the convex hull of the silhouette, so that
 masks and meshes compare by their hulls as they do by themselves.
-
-What rims and depth images measure at points of surfaces is evidence as any other: these points
-stand between the keypoints and the box's corners.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -28,135 +25,13 @@ from cadalign.io.meshes.load import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.warp import LinearWarp, linear_warp
 from cadalign.solvers.joint.evidence import (
-    Evidence,
-    Planes,
     Shape,
-    Sightings,
     State,
     points_of,
-    stacked,
 )
 
 _QHULL = "QJ Pp"  # joggled, for a flat mesh has a hull, too
 _MOST_MESHES = 3  # training models that are tried, the nearest ones
-
-
-class PointRows(NamedTuple):
-    """Mean (n, 3) and modes (K, n, 3) of points of a surface, as in `Shape`."""
-
-    mean: FloatArray
-    modes: FloatArray
-
-
-class Measured(NamedTuple):
-    """Points of a surface in one view, and what was measured at each.
-
-    ``table`` has a row for each point, whose number follows. ``own`` (k, n, 3) are further modes of
-    the shape, that move these points alone.
-    """
-
-    points: PointRows
-    table: Sightings | Planes
-    own: FloatArray | None = None
-
-
-def count_of(measured: Sequence[Measured]) -> int:
-    """Number of points of all views."""
-    return sum(len(each.points.mean) for each in measured)
-
-
-def with_measured(evidence: Evidence, keypoints: int, measured: Sequence[Measured]) -> Evidence:
-    """The evidence with what was measured at points of surfaces.
-
-    Modes that move the points of one view alone are the last ones, in the order of the views.
-    """
-    shape, total = evidence.shape, count_of(measured)
-    last = len(shape.modes)
-    further = sum(len(each.own) for each in measured if each.own is not None)
-    end = keypoints + total
-    mean = np.concatenate([shape.mean[:keypoints], np.zeros((total, 3)), shape.mean[keypoints:]])
-    modes = np.zeros((last + further, len(mean), 3))
-    modes[:last, :keypoints] = shape.modes[:, :keypoints]
-    modes[:last, end:] = shape.modes[:, keypoints:]
-
-    def moved(points: IntArray) -> IntArray:
-        return np.where(points >= keypoints, points + total, points)
-
-    tables: dict[str, list[Any]] = {
-        name: [table._replace(point=moved(table.point))]
-        for name, table in (("sightings", evidence.sightings), ("planes", evidence.planes))
-    }
-    first = keypoints
-    for points, table, own in measured:
-        there = slice(first, first + len(points.mean))
-        mean[there] = points.mean
-        modes[: len(points.modes), there] = points.modes  # none for a rigid surface
-        if own is not None:
-            modes[last : last + len(own), there] = own
-            last += len(own)
-        name = "sightings" if isinstance(table, Sightings) else "planes"
-        tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
-        first = there.stop
-    spread = np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]])
-    return evidence._replace(
-        shape=Shape(mean, modes, spread),
-        offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
-        **{name: stacked(parts) for name, parts in tables.items()},
-    )
-
-
-def state_with_points(
-    state: State, keypoints: int, total: int, more: FloatArray | None = None
-) -> State:
-    """A copy of a state for evidence with ``total`` more points, see `with_measured`.
-
-    ``more`` are the coefficients of modes that move these alone.
-    """
-    still = state.displacements
-    coefficients = [state.coefficients, np.empty(0) if more is None else more]
-    return State(
-        state.poses.copy(),
-        state.log_focals.copy(),
-        state.log_scales.copy(),
-        np.concatenate(coefficients),
-        np.concatenate([still[:keypoints], np.zeros((total, 3)), still[keypoints:]]),
-    )
-
-
-def state_without_points(
-    state: State, keypoints: int, total: int, modes: int = 0
-) -> tuple[State, FloatArray]:
-    """Invert `state_with_points`: the state without ``total`` points, and the ``modes`` of these.
-
-    The coefficients of modes that move them alone are (modes,).
-    """
-    still, own = state.displacements, len(state.coefficients) - modes
-    bare = state._replace(
-        coefficients=state.coefficients[:own].copy(),
-        displacements=np.concatenate([still[:keypoints], still[keypoints + total :]]),
-    )
-    return bare, state.coefficients[own:].copy()
-
-
-def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
-    """The same with the points' own displacements as modes, which a warped surface follows."""
-    shape = evidence.shape
-    rows = np.repeat(np.flatnonzero(shape.spread > 0), 3)
-    if not len(rows):
-        return evidence, state
-    axes = np.tile(np.arange(3), len(rows) // 3)
-    own = np.zeros((len(rows), *shape.mean.shape))
-    own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
-    moved = state.displacements[rows, axes] / shape.spread[rows]
-    return (
-        evidence._replace(
-            shape=Shape(shape.mean, np.concatenate([shape.modes, own]), np.zeros_like(shape.spread))
-        ),
-        state._replace(
-            coefficients=np.concatenate([state.coefficients, moved]),
-            displacements=np.zeros_like(state.displacements),
-        ),
-    )
 
 
 class RigidSurface:
@@ -168,6 +43,7 @@ class RigidSurface:
     is_exact = True
 
     def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
         self.caster = caster_of(mesh)
         self.corners = corners_of(mesh)
 
@@ -175,9 +51,9 @@ class RigidSurface:
         """The mesh at a state."""
         return self
 
-    def rows(self, points: FloatArray, face: IntArray) -> PointRows:
-        """Rows of ``points`` (n, 3) on the triangles ``face`` (n,)."""
-        return PointRows(points, np.zeros((0, len(points), 3)))
+    def rows(self, points: FloatArray, face: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (n, 3) and modes (K, n, 3) of ``points`` (n, 3) on the triangles ``face`` (n,)."""
+        return points, np.zeros((0, len(points), 3))
 
 
 class WarpedSurface:
@@ -191,6 +67,7 @@ class WarpedSurface:
     def __init__(
         self, mesh: Mesh, source: FloatArray, rows: IntArray, *, is_hull: bool = False
     ) -> None:
+        self.mesh = mesh
         self._rows, self._faces = rows, None if is_hull else mesh.faces
         used = np.unique(_hull_faces(mesh.vertices)) if is_hull else slice(None)
         self._warp = linear_warp(mesh.vertices[used], mesh.bounds, source)
@@ -225,7 +102,7 @@ class Warped:
         """Corners (8, 3) of the box."""
         return corners_of(self.mesh)
 
-    def rows(self, points: FloatArray, face: IntArray) -> PointRows:
+    def rows(self, points: FloatArray, face: IntArray) -> tuple[FloatArray, FloatArray]:
         """See `RigidSurface`."""
         corners = self.mesh.faces[face]
         shares = _barycentric(self.mesh.vertices[corners], points)[:, :, None]
@@ -234,7 +111,7 @@ class Warped:
         for k, mode in enumerate(self.modes):
             modes[k] = here.derivative(mode[self.keypoints], mode[-2:])
         # What the keypoints' own displacements move is part of the mean.
-        return PointRows(points - np.tensordot(self.coefficients, modes, axes=1), modes)
+        return points - np.tensordot(self.coefficients, modes, axes=1), modes
 
 
 PosedSurface = RigidSurface | Warped
@@ -328,5 +205,10 @@ def _nearest_with_mesh(
     for row in (rows[k] for k in order):
         source = training.points_3d[row].astype(np.float64)
         known = np.flatnonzero(np.isfinite(source).all(axis=1))
-        found.append((load_mesh(cast(Path, training.mesh_paths[row])), source[known], known))
+        found.append((_mesh_at(cast(Path, training.mesh_paths[row])), source[known], known))
     return found
+
+
+@lru_cache(maxsize=16)
+def _mesh_at(path: Path) -> Mesh:
+    return load_mesh(path)  # one object, for which silhouettes are rendered once

@@ -17,27 +17,17 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import (
     Contour,
-    correlation_length,
-    mask_contour,
-    robust_deviation,
-    trimmed_deviation,
-)
-from cadalign.estimation.contours.rims import (
     MaskImage,
     Rims,
+    Sight,
     across_rims,
     extraction_bias,
     find_rims,
+    mask_contour,
     mask_image,
 )
-from cadalign.estimation.contours.surface import (
-    Measured,
-    PosedSurface,
-    count_of,
-    state_with_points,
-    surfaces_of,
-    with_measured,
-)
+from cadalign.estimation.contours.measured import OWN_MODES, Joined, Measured, Place, solved
+from cadalign.estimation.contours.surface import PosedSurface, surfaces_of
 from cadalign.estimation.estimates import pose_and_border, pose_and_lengths, poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
@@ -47,10 +37,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import CAUCHY, LINEAR
 from cadalign.solvers.joint.covariance import information_of, joint_covariance
-from cadalign.solvers.joint.evidence import Evidence, Sightings, State, log_focals_of
+from cadalign.solvers.joint.evidence import Evidence, Sightings, State
 
-OWN_MODES = 3
-"""Unknowns of a contour: its offset outwards, its registration along x and along y."""
 REGISTRATION = 0.3
 """Standard deviation of a contour's registration along x and y [px]."""
 
@@ -63,14 +51,57 @@ _UNEVEN = 0.05  # share of the offset by which it differs from edge to edge
 _EDGE = 30.0  # samples of an edge
 _OF_PIXELS = 3.0  # samples that count as one where pixels alone displace them
 _FIRST_CORRELATION = 10.0  # samples, of a surface that is only similar
-_LEAST_INFORMATION = 1e-12  # about an unknown, relative
 _LEAST_OWN = 0.3  # [px], standard deviation of the part that is the model's
 _FIRST_SHARE, _LARGEST_SHARE = 0.8, 0.99  # of a contour, that is the model's
 _ROUNDS = 30
+_TO_SIGMA = 1.4826  # from the median of absolute values to the deviation of a Gaussian
+_OUTLYING = 3.5  # in deviations
+_MOST_LAGS = 100
+_LEAST_PAIRS = 20
 _ALIKE = 0.2  # change of a variance's logarithm
 _INLIER = 3.5  # in deviations
 _BOUND_REACH = 8.0  # [px]
 _LEAST_COMMON_OFFSET = 0.1  # [px], that the whole contour may have in common
+
+
+def robust_deviation(residuals: FloatArray) -> float:
+    """Deviation of residuals (n,) about 0, outliers among them; 0 for none."""
+    return _TO_SIGMA * float(np.median(np.abs(residuals))) if len(residuals) else 0.0
+
+
+def trimmed_deviation(residuals: FloatArray, least: float) -> float:
+    """Root mean square of residuals (n,) about 0 without outliers, which exceed ``least``.
+
+    It is 0 for none.
+    """
+    if not len(residuals):
+        return 0.0
+    kept = residuals[np.abs(residuals) < max(_OUTLYING * robust_deviation(residuals), least)]
+    return float(np.sqrt((kept**2).mean()))
+
+
+def correlation_length(contour: Contour, residuals: FloatArray, kept: BoolArray) -> float:
+    """Number of neighbouring samples that count as one, at least 1.
+
+    The integrated autocorrelation ``1 + 2 sum of rho`` of the residuals (S,) that are ``kept``, up
+    to the first lag without positive correlation (Geyer, "Practical Markov chain Monte Carlo",
+    1992).
+    """
+    values = np.where(kept, residuals, 0.0)
+    variance = float((values**2).sum() / max(kept.sum(), 1))
+    if not variance > 0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, _MOST_LAGS):
+        pairs = contour.neighbours(kept, lag)
+        count = int(pairs.sum())
+        if count < _LEAST_PAIRS:
+            break
+        rho = float((values[lag:] * values[:-lag])[pairs].sum() / count / variance)
+        if rho <= 0:
+            break
+        total += 2 * rho
+    return total
 
 
 def cost_of_contour(residuals: FloatArray, reach: float) -> float:
@@ -179,10 +210,7 @@ def with_learned_offsets(
     _, information = information_of(evidence, state)
     size = len(information)
     rows = np.arange(size - own.size, size, OWN_MODES)
-    sizes = np.sqrt(np.maximum(information.diagonal(), 1e-300))
-    scaled = information / np.outer(sizes, sizes) + _LEAST_INFORMATION * np.eye(size)
-    columns = np.linalg.solve(scaled, np.eye(size)[:, rows])
-    variances = columns[rows].diagonal() / sizes[rows] ** 2
+    variances = solved(information, np.eye(size)[:, rows])[rows].diagonal()
     learned = []
     for noise, coefficient, variance in zip(noises, own[:, 0], variances, strict=True):
         without_prior = 1 / max(1 / min(variance, 1.0) - 1, 1e-6)  # in squares of noise.offset
@@ -208,31 +236,17 @@ class ViewContour:
     sigma: float | None
     mask: MaskImage
 
-    def camera_at(self, evidence: Evidence, state: State, own: FloatArray) -> Camera:
-        """The camera with the focal length of a state, registered to the mask.
-
-        ``own`` (3,) are the contour's own coefficients.
-        """
-        camera = self.camera
-        if evidence.focals.group[self.image] >= 0:
-            ratio = np.exp(log_focals_of(evidence, state)[self.image])
-            camera = camera.with_focal(camera.fx * float(ratio))
+    def registered(self, camera: Camera, own: FloatArray) -> Camera:
+        """A camera registered to the mask by the contour's own coefficients (3,)."""
         right, down = (REGISTRATION * own[1:]).tolist()
         return replace(camera, cx=camera.cx + right, cy=camera.cy + down)
 
     def evidence_of(
-        self,
-        rims: Rims,
-        noise: Noise,
-        surface: PosedSurface,
-        pose: Alignment,
-        *,
-        camera: Camera,
-        bias: FloatArray,
+        self, rims: Rims, noise: Noise, surface: PosedSurface, sight: Sight, bias: FloatArray
     ) -> Measured:
         """The rims that were found, in the form of the evidence.
 
-        The ``camera`` is that of `camera_at`. Rims are to lie outside of the contour by the
+        The camera of ``sight`` is `registered`. Rims are to lie outside of the contour by the
         ``bias`` (S,) of its extraction [px]. The contour's own modes move every rim outwards, to
         the right and down, by one standard deviation.
         """
@@ -242,7 +256,7 @@ class ViewContour:
         return contour_rows(
             self.image,
             surface,
-            pose,
+            sight.pose,
             rims.points[kept],
             rims.face[kept],
             across=across,
@@ -250,7 +264,7 @@ class ViewContour:
             weights=np.full(len(kept), weight),
             loss_scale=noise.loss_scale / np.sqrt(noise.correlation),
             own=(noise.offset, REGISTRATION, REGISTRATION),
-            cameras=(self.camera, camera),
+            cameras=(self.camera, sight.camera),
         )
 
 
@@ -289,7 +303,7 @@ def contour_rows(
         moved[1 + axis, :, axis] = shift / focal[axis]
     moved *= seen[:, 2:] / ratio
     return Measured(
-        surface.rows(points, face),
+        *surface.rows(points, face),
         Sightings(
             np.arange(count),
             np.full(count, image),
@@ -359,21 +373,18 @@ def with_contours(
         _contour_rows(contour_view(n, views[n], f"views[{n}].mask"), posed, poses[n])
         for n in masked
     ]
-    full = with_measured(evidence, keypoints, rows)
-    return full, state_with_points(
-        state, keypoints, count_of(rows), np.zeros(OWN_MODES * len(rows))
-    )
+    joined = Joined.of(evidence, keypoints, rows, Place.of(state, len(rows)))
+    return joined.evidence, joined.state
 
 
 def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> Measured:
-    rims = find_rims(posed.caster, seen.camera, gt, seen.contour, _BOUND_REACH)
+    sight = Sight(posed.caster, seen.camera, gt)
+    rims = find_rims(sight, seen.contour, _BOUND_REACH)
     offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
     centred = np.where(rims.found, rims.offset - offset, np.nan)
     known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
-    bias = extraction_bias(posed.caster, seen.camera, gt, seen.mask, seen.contour, rims)
+    bias = extraction_bias(sight, seen.mask, seen.contour, rims)
     noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
     agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
-    rows = seen.evidence_of(
-        rims._replace(found=agreeing), noise, posed, gt, camera=seen.camera, bias=bias
-    )
+    rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)
     return rows._replace(table=rows.table._replace(loss=np.full_like(rows.table.loss, LINEAR)))

@@ -23,12 +23,12 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.joint_robust import whitened_lengths, whitened_residuals
 from cadalign.estimation.prepared_views import lie_on_a_line
-from cadalign.estimation.prior import ShapePrior
+from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.starts import in_rig
 from cadalign.estimation.tracks.motion import moved_by
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import needs_facing
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, kept_rows
+from cadalign.solvers.joint.evidence import Evidence, State, kept_rows
 from cadalign.solvers.joint.motion import twist_between
 from cadalign.solvers.joint.search import view_starts
 
@@ -53,11 +53,8 @@ class Frames(NamedTuple):
     def of(cls, views: Sequence[View]) -> Frames:
         """The frames of views; successive views are a second apart where none has a time.
 
-        Raises
-        ------
-        InputError
-            If only some views have a time, all have the same one, or a view has evidence that a
-            motion cannot be estimated with.
+        Raises InputError if only some views have a time, all have the same one, or a view has
+        evidence that a motion cannot be estimated with.
         """
         lacking = [view.time is None for view in views]
         if any(lacking) != all(lacking):
@@ -109,10 +106,7 @@ class PoseCandidates(NamedTuple):
 
 def candidates_of(evidence: Evidence, shape: FloatArray) -> PoseCandidates:
     """PoseCandidates of every frame for a shape (m, 3); frames of few keypoints have none."""
-    still = evidence._replace(
-        shape=Shape(shape, evidence.shape.modes[:0], np.zeros(len(shape))),
-        scales=evidence.scales._replace(free=np.zeros(3), precision=np.zeros((3, 3))),
-    )
+    still = with_known_shape(evidence, shape)
     poses, frames, costs = [], [], []
     order = np.argsort(evidence.rig.pose, kind="stable")
     for view in order.tolist():

@@ -21,6 +21,8 @@ from cadalign.solvers.joint.motion import twist_between
 _RELATIVE_TIME = 1e-9  # of the track's length: such a time is that of a frame
 _STEP = 1e-6  # of finite differences, in radians and in units of the translation's size
 
+_Known = tuple[float, FloatArray, FloatArray]  # time, pose (12,) and velocity (6,) of the body
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -185,48 +187,19 @@ class Trajectory:
             )
         after = int(np.searchsorted(self.times, time))
         ends = [k for k in (after - 1, after) if 0 <= k < len(self)]
-        known = [FrameState(self.times[k], self.poses[k], self.velocities[k]) for k in ends]
-        steps = KnownStates(known, self._covariance_of(ends))
-        found = state_at(float(time), steps, self.motion.strength(np.full(2, np.nan)))
-        return self._point(time, found.pose, found.velocity, found.covariance)
-
-    def _covariance_of(self, ends: list[int]) -> FloatArray:
-        """Covariance of one frame, or of two successive ones."""
-        if len(ends) == 1:
-            return np.asarray(self.frames[ends[0]])
-        cross = self.links[ends[0]]
-        return np.asarray(
-            np.block([[self.frames[ends[0]], cross], [cross.T, self.frames[ends[1]]]])
-        )
+        known = [(self.times[k], self.poses[k], self.velocities[k]) for k in ends]
+        covariance = self.frames[ends[0]]
+        if len(ends) == 2:
+            cross = self.links[ends[0]]
+            covariance = np.block([[covariance, cross], [cross.T, self.frames[ends[1]]]])
+        strength = self.motion.strength(np.full(2, np.nan))
+        return self._point(time, *_state_at(float(time), known, covariance, strength))
 
     def _point(
         self, time: float, pose: FloatArray, velocity: FloatArray, covariance: FloatArray
     ) -> PoseAt:
         alignment = Alignment(pose[:9].reshape(3, 3), pose[9:], self.scale)
         return PoseAt(float(time), alignment, covariance, velocity)
-
-
-class FrameState(NamedTuple):
-    """Pose (12,) and velocity (6,) of the body at a time [s]."""
-
-    time: float
-    pose: FloatArray
-    velocity: FloatArray
-
-
-class KnownStates(NamedTuple):
-    """Known states, one or two successive ones, and their covariance (12 or 24, squared)."""
-
-    states: list[FrameState]
-    covariance: FloatArray
-
-
-class Between(NamedTuple):
-    """Pose (12,), velocity (6,) and covariance (6, 6) of the pose."""
-
-    pose: FloatArray
-    velocity: FloatArray
-    covariance: FloatArray
 
 
 def moved_by(pose: FloatArray, twist: FloatArray) -> FloatArray:
@@ -243,58 +216,61 @@ def moved_by(pose: FloatArray, twist: FloatArray) -> FloatArray:
     return np.concatenate([(rotation @ turn).ravel(), pose[9:] + rotation @ moved])
 
 
-def state_at(time: float, known: KnownStates, strength: FloatArray) -> Between:
-    """The state at a time between or beyond known ones, where the motion has a strength (2,)."""
-    pose, velocity = _mean(time, known.states)
-    size = len(known.covariance)
+def _state_at(
+    time: float, known: list[_Known], covariance: FloatArray, strength: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pose (12,), velocity (6,) and the pose's covariance (6, 6) between or beyond known states.
+
+    ``covariance`` (12 or 24, squared) is that of one, or of two successive ones; ``strength`` (2,)
+    that of the motion.
+    """
+    pose, velocity = _mean(time, known)
+    size = len(covariance)
     slopes = np.empty((6, size))
     scale = max(float(np.linalg.norm(pose[9:])), 1e-12)
     for k in range(size):
         change = np.zeros(size)
         change[k] = _STEP * (scale if k % 6 >= 3 else 1.0)
-        ends = [_mean(time, _stepped(known.states, sign * change))[0] for sign in (1, -1)]
+        ends = [_mean(time, _stepped(known, sign * change))[0] for sign in (1, -1)]
         slopes[:, k] = _step_between(ends[1], ends[0]) / (2 * change[k])
-    own = _own_variance(time, known.states)
-    variances = np.repeat(np.square(strength), 3) * own
+    variances = np.repeat(np.square(strength), 3) * _own_variance(time, known)
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = pose[:9].reshape(3, 3)
-    covariance = slopes @ known.covariance @ slopes.T + turned * variances @ turned.T
-    return Between(pose, velocity, covariance)
+    return pose, velocity, slopes @ covariance @ slopes.T + turned * variances @ turned.T
 
 
-def _mean(time: float, known: list[FrameState]) -> tuple[FloatArray, FloatArray]:
+def _mean(time: float, known: list[_Known]) -> tuple[FloatArray, FloatArray]:
     """Pose and velocity at a time: Hermite's cubic of the twist, or constant velocity."""
-    start = known[0]
+    begin, pose, first = known[0]
     if len(known) == 1:
-        return moved_by(start.pose, (time - start.time) * start.velocity), start.velocity
-    end = known[1]
-    length = end.time - start.time
-    s = (time - start.time) / length
-    twist = twist_between(start.pose, end.pose)
+        return moved_by(pose, (time - begin) * first), first
+    end, last_pose, last = known[1]
+    length = end - begin
+    s = (time - begin) / length
+    twist = twist_between(pose, last_pose)
     along = (3 * s**2 - 2 * s**3) * twist + length * (
-        (s - 2 * s**2 + s**3) * start.velocity + (s**3 - s**2) * end.velocity
+        (s - 2 * s**2 + s**3) * first + (s**3 - s**2) * last
     )
     velocity = 6 * (s - s**2) / length * twist
-    velocity += (1 - 4 * s + 3 * s**2) * start.velocity + (3 * s**2 - 2 * s) * end.velocity
-    return moved_by(start.pose, along), velocity
+    velocity += (1 - 4 * s + 3 * s**2) * first + (3 * s**2 - 2 * s) * last
+    return moved_by(pose, along), velocity
 
 
-def _own_variance(time: float, known: list[FrameState]) -> float:
+def _own_variance(time: float, known: list[_Known]) -> float:
     """Variance of an integrated random walk of unit strength, given the ends."""
-    before = abs(time - known[0].time)
+    before = abs(time - known[0][0])
     if len(known) == 1:
         return before**3 / 3
-    after = known[1].time - time
+    after = known[1][0] - time
     return (before * after / (before + after)) ** 3 / 3
 
 
-def _stepped(known: list[FrameState], change: FloatArray) -> list[FrameState]:
+def _stepped(known: list[_Known], change: FloatArray) -> list[_Known]:
     """The states after steps of pose, in the rig's axes, and velocity."""
     moved = []
-    for state, own in zip(known, change.reshape(-1, 12), strict=True):
-        turned = rotation_from_vector(own[:3]) @ state.pose[:9].reshape(3, 3)
-        pose = np.concatenate([turned.ravel(), state.pose[9:] + own[3:6]])
-        moved.append(FrameState(state.time, pose, state.velocity + own[6:]))
+    for (time, pose, velocity), own in zip(known, change.reshape(-1, 12), strict=True):
+        turned = rotation_from_vector(own[:3]) @ pose[:9].reshape(3, 3)
+        moved.append((time, np.append(turned.ravel(), pose[9:] + own[3:6]), velocity + own[6:]))
     return moved
 
 

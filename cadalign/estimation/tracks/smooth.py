@@ -58,18 +58,22 @@ _LEAST_STRENGTH = 1e-3  # change of the velocity over the whole track, over its 
 _LEAST_SPEED = 1e-6
 
 
-class Smoothed(NamedTuple):
-    """A path, the strength of its motion, and the sightings (N,) that it rests on.
+class EstimatedTrack(NamedTuple):
+    """A smooth path of the likeliest component of the shape, and the problem with its noise.
 
-    The ``correlation`` of errors in successive frames has been taken into account.
+    It has the strength of its motion and the sightings (N,) that it rests on; the ``correlation``
+    of errors in successive frames has been taken into account.
     """
 
+    problem: JointProblem
+    component: int
     evidence: Evidence
     inliers: BoolArray
     path: Path
     motion: MotionPrior
     iterations: int
-    correlation: float = 0.0
+    hypotheses: int
+    correlation: float
 
 
 def align_track(
@@ -98,16 +102,6 @@ def align_track(
     return _result(model, found, frames, stats)
 
 
-class EstimatedTrack(NamedTuple):
-    """A smooth path of the likeliest component of the shape, the problem with its noise."""
-
-    problem: JointProblem
-    smoothed: Smoothed
-    component: int
-    iterations: int
-    hypotheses: int
-
-
 def estimate_track(
     problem: JointProblem,
     frames: Frames,
@@ -124,9 +118,13 @@ def estimate_track(
     limits = None
     if ransac is not None:
         limits = thresholds(evidence, problem.lenses, problem.threshold(ransac))
-    found = smoothed(evidence, path, frames.times, motion, limits, may_correlate=may_correlate)
-    spent = iterations + found.iterations
-    return EstimatedTrack(problem, found, first.component, spent, hypotheses)
+    used, inliers, path, prior, spent, correlation = _smoothed(
+        evidence, path, frames.times, motion, limits, may_correlate=may_correlate
+    )
+    spent += iterations
+    return EstimatedTrack(
+        problem, first.component, used, inliers, path, prior, spent, hypotheses, correlation
+    )
 
 
 def _of_some(
@@ -177,19 +175,19 @@ def _first_path(
     return Path(state, velocities_of(poses, frames.times))
 
 
-def smoothed(
+def _smoothed(
     evidence: Evidence,
     path: Path,
     times: FloatArray,
     motion: Motion,
-    limits: FloatArray | None = None,
+    limits: FloatArray | None,
     *,
-    may_correlate: bool = True,
-) -> Smoothed:
+    may_correlate: bool,
+) -> tuple[Evidence, BoolArray, Path, MotionPrior, int, float]:
     """The smooth path near a first one, with the likeliest strengths where these are not given.
 
     Sightings whose whitened residuals exceed the ``limits`` (N,) are left out, where there are any.
-    Where errors of successive frames ``may_correlate``, it is estimated whether they do.
+    Returns the evidence that is used, inliers (N,), path, strengths, iterations and correlation.
     """
     seconds = np.diff(times)
     seen = np.unique(evidence.rig.pose[evidence.sightings.image])
@@ -215,7 +213,7 @@ def smoothed(
         correlation, used = found, weakened(independent, found)
         path, prior, more = _likeliest(used, path, prior, motion)
         spent += more
-    return Smoothed(used, inliers, path, prior, spent, correlation)
+    return used, inliers, path, prior, spent, correlation
 
 
 def _first_strength(path: Path, times: FloatArray, seen: IntArray) -> FloatArray:
@@ -270,10 +268,9 @@ def _likeliest(
 
 
 def _result(
-    model: Model | ShapeModel, estimated: EstimatedTrack, frames: Frames, stats: FitStats
+    model: Model | ShapeModel, found: EstimatedTrack, frames: Frames, stats: FitStats
 ) -> Result:
-    problem, found = estimated.problem, estimated.smoothed
-    evidence, path = found.evidence, found.path
+    problem, evidence, path = found.problem, found.evidence, found.path
     covariance = moving_covariance(evidence, found.motion, path)
     if not np.isfinite(covariance.costs).all():
         what = "the evidence does not determine the track"
@@ -286,16 +283,8 @@ def _result(
         widening = widening_of(max(unknowns, 1), max(redundancy, 1))
     track = Track(found.motion, path.velocities, redundancy, widening)
     cost = float(covariance.costs[0])
-    minimum = Minimum(
-        estimated.component,
-        found.inliers,
-        evidence,
-        path.state,
-        cost,
-        0.0,
-        problem.lenses,
-        track,
-    )
+    kept, lenses = found.inliers, problem.lenses
+    minimum = Minimum(found.component, kept, evidence, path.state, cost, 0.0, lenses, track)
     result = result_of_minima(model, problem, [minimum], stats)
     wide, state = widened(evidence, path.state, problem.prior.inflation)
     covariance = moving_covariance(wide, found.motion, path._replace(state=state))

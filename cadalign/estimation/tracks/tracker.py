@@ -19,8 +19,8 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.search import JointProblem, thresholds
 from cadalign.estimation.tracks.frames import Frames, SuccessiveErrors, candidates_of, weakened
 from cadalign.estimation.tracks.motion import Motion, PoseAt, moved_by
-from cadalign.estimation.tracks.smooth import Smoothed, estimate_track
-from cadalign.estimation.tracks.window import Window, without_pose
+from cadalign.estimation.tracks.smooth import EstimatedTrack, estimate_track
+from cadalign.estimation.tracks.window import Window, begun_again
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
@@ -149,7 +149,11 @@ class Tracker:
         InputError
             If the view has no time, or one that is not later than the last.
         """
-        self._check(view)
+        if view.time is None:
+            raise InputError("a tracked view wants one", where="view.time", fix="give seconds")
+        if self._views and float(view.time) <= float(self._views[-1].time or 0.0):
+            what = f"{view.time} is not later than {self._views[-1].time}, that of the last view"
+            raise InputError(what, where="view.time")
         self._views.append(view)
         self._recent.append(view)
         if self._window is None:
@@ -165,7 +169,12 @@ class Tracker:
             last = len(window.times) - 2
             newest = SuccessiveErrors.of(window.evidence, window.path.state, first=last)
             self._errors = self._errors.plus(newest)
-        self._check_lost(window, inliers)
+        if len(inliers):
+            contradicts = inliers.mean() < _MOST_LOST
+            self._contradicting = self._contradicting + 1 if contradicts else 0
+        turn = max(float(np.trace(window.newest()[:3, :3])), 0.0)
+        is_open = not np.degrees(np.sqrt(turn)) < _UNCERTAIN_DEG
+        self._is_lost = self._contradicting >= _LOST_AFTER or is_open
         again = self._again(view, window) if self._is_lost else None
         if again is not None:
             window, inliers = again, self._agreement(again)
@@ -178,13 +187,6 @@ class Tracker:
         self._window = window
         return self._told(view, inliers, again is not None)
 
-    def _check(self, view: View) -> None:
-        if view.time is None:
-            raise InputError("a tracked view wants one", where="view.time", fix="give seconds")
-        if self._views and float(view.time) <= float(self._views[-1].time or 0.0):
-            what = f"{view.time} is not later than {self._views[-1].time}, that of the last view"
-            raise InputError(what, where="view.time")
-
     def _begun(self, view: View) -> TrackUpdate:
         """Begin the track where the views so far determine poses."""
         mean = self._prior.components[0].mean
@@ -195,13 +197,18 @@ class Tracker:
         if sum(told) < first:
             return nothing
         del self._recent[: -max(self._lag, first)]
+        frames, unknown = Frames.of(self._recent), [None] * len(self._recent)
+        problem = self._problem(self._recent, frames.of_view.tolist())
         try:
-            found, component = self._estimated(self._recent)
+            # Of few frames it cannot be told if errors correlate.
+            found = estimate_track(
+                problem, frames, self._motion, unknown, self._ransac, may_correlate=False
+            )
         except (DegenerateError, NoConsensusError):
             return nothing
         if found.inliers.mean() < _LEAST_SHARE:
             return nothing
-        evidence, path = self._with_all_modes(component, found)
+        evidence, path = self._with_all_modes(found)
         times = np.array([each.time for each in self._recent], dtype=float)
         window = Window(evidence, times, path, found.motion)
         _, window = window.refined(_ITERATIONS)
@@ -211,33 +218,16 @@ class Tracker:
         self._window, self._is_lost, self._contradicting = window, False, 0
         return self._told(view, self._agreement(window), True)
 
-    def _estimated(self, views: Sequence[View]) -> tuple[Smoothed, int]:
-        frames = Frames.of(views)
-        problem = self._problem(views, frames.of_view.tolist())
-        found = estimate_track(
-            problem,
-            frames,
-            self._motion,
-            [None] * len(views),
-            self._ransac,
-            may_correlate=False,  # of few frames that cannot be told
-        )
-        return found.smoothed, found.component
-
     def _problem(self, views: Sequence[View], frames: Sequence[int]) -> JointProblem:
         lenses = Lenses.of(views, "known", None)
         return JointProblem(self._prior, views, None, FitOptions(), lenses, frames=tuple(frames))
 
-    def _with_all_modes(self, component: int, found: Smoothed) -> tuple[Evidence, Path]:
+    def _with_all_modes(self, found: EstimatedTrack) -> tuple[Evidence, Path]:
         """Evidence and path in modes that suffice for all keypoints."""
-        shape, ids = self._prior.components[component], self._prior.ids
-        camera = self._recent[0].camera
-        whole = View(camera, np.zeros((len(ids), 2)), ids=ids)
-        reduction = reduce_modes(
-            self._problem([whole, whole], (0, 1)).evidence(
-                shape, Lenses.of([whole, whole], "known", None)
-            )
-        )
+        shape, ids = self._prior.components[found.component], self._prior.ids
+        whole = View(self._recent[0].camera, np.zeros((len(ids), 2)), ids=ids)
+        problem = self._problem([whole, whole], (0, 1))
+        reduction = reduce_modes(problem.evidence(shape, problem.lenses))
         self._shape = reduction.evidence.shape
         state = reduced_state(reduction, shape, found.path.state)
         return self._evidence(), found.path._replace(state=state)
@@ -291,22 +281,13 @@ class Tracker:
         inliers[order] = fits[last]
         return inliers
 
-    def _check_lost(self, window: Window, inliers: BoolArray) -> None:
-        """Note whether the object is lost."""
-        if len(inliers):
-            contradicts = inliers.mean() < _MOST_LOST
-            self._contradicting = self._contradicting + 1 if contradicts else 0
-        turn = np.trace(window.newest().covariance[:3, :3])
-        is_open = not np.degrees(np.sqrt(max(turn, 0.0))) < _UNCERTAIN_DEG
-        self._is_lost = self._contradicting >= _LOST_AFTER or is_open
-
     def _again(self, view: View, window: Window) -> Window | None:
         """A window that begins anew where the view's keypoints fit the known shape."""
         if len(view.keypoint_ids) < _LEAST_FOUND:
             return None
         for pose in self._found(view):
             recent, self._recent = self._recent, [view]
-            begun = without_pose(window, pose, self._evidence())
+            begun = begun_again(window, pose, self._evidence())
             agreement = self._agreement(begun)
             if agreement.mean() >= _AGREE and agreement.sum() >= _LEAST_FOUND:
                 self._contradicting, self._is_lost = 0, False
@@ -320,6 +301,6 @@ class Tracker:
         pose = window.path.state.poses[-1]
         scale = np.exp(window.path.state.log_scales)
         alignment = Alignment(pose[:9].reshape(3, 3), pose[9:], scale)
-        covariance = window.newest().covariance[:6, :6]
+        covariance = window.newest()[:6, :6]
         at = PoseAt(float(view.time or 0.0), alignment, covariance, window.path.velocities[-1])
         return TrackUpdate(at, inliers, self._is_lost, is_new)

@@ -8,13 +8,12 @@ application to planetary landing", 2010).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.solvers.joint.arrow import Arrow, factorize_arrow, invert_arrow
-from cadalign.solvers.joint.evidence import Evidence, Focals, Rig, State, kept_rows
+from cadalign.solvers.joint.evidence import Evidence, Focals, Rig, kept_rows
 from cadalign.solvers.joint.motion import STATE, MotionPrior
 from cadalign.solvers.joint.tracks import (
     NOTHING_KNOWN,
@@ -26,13 +25,6 @@ from cadalign.solvers.joint.tracks import (
 )
 
 _LONG = 100.0  # seconds of the motion after which a velocity is unknown
-
-
-class NewestFrame(NamedTuple):
-    """Covariance (12, 12) of pose and velocity of the last frame; the cost of the window."""
-
-    covariance: FloatArray
-    cost: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,14 +52,14 @@ class Window:
         cost, path, _ = refine_path(self.system, self.path, max_iterations)
         return cost, replace(self, path=path)
 
-    def newest(self) -> NewestFrame:
-        """Uncertainty of the last frame."""
-        cost, arrow = equations_of(self.system, self.path)
+    def newest(self) -> FloatArray:
+        """Covariance (12, 12) of pose and velocity of the last frame."""
+        _, arrow = equations_of(self.system, self.path)
         for diagonal in range(STATE):
             arrow.blocks[:, diagonal, diagonal] *= 1 + 1e-12
         if not factorize_arrow(arrow):
-            return NewestFrame(np.full((STATE, STATE), np.inf), cost)
-        return NewestFrame(invert_arrow(arrow).blocks[-1], cost)
+            return np.full((STATE, STATE), np.inf)
+        return np.asarray(invert_arrow(arrow).blocks[-1])
 
     def without_first(self) -> Window:
         """The window without its first frame, which is marginalised."""
@@ -87,7 +79,7 @@ class Window:
         return replace(self, evidence=evidence, times=self.times[1:], path=later, anchor=anchor)
 
 
-def without_pose(window: Window, pose: FloatArray, evidence: Evidence) -> Window:
+def begun_again(window: Window, pose: FloatArray, evidence: Evidence) -> Window:
     """A window of one frame at a pose, of ``evidence``, that keeps what is known of the shape."""
     while len(window.times) > 2:
         window = window.without_first()
@@ -133,10 +125,11 @@ def _told_by_first(window: Window) -> Anchor:
     gone, kept = slice(0, STATE), slice(STATE, 2 * STATE + size)
     gain = np.linalg.solve(information[gone, gone], information[gone, kept]).T
     left = information[kept, kept] - gain @ information[gone, kept]
+    shared = [path.state.log_focals, path.state.log_scales, path.state.coefficients]
     return Anchor(
         path.state.poses[1].copy(),
         path.velocities[1].copy(),
-        border_of(path.state),
+        np.concatenate(shared),
         gradient[kept] - gain @ gradient[gone],
         (left + left.T) / 2,
     )
@@ -144,11 +137,6 @@ def _told_by_first(window: Window) -> Anchor:
 
 def _of_views(evidence: Evidence, kept: BoolArray) -> Focals:
     return evidence.focals._replace(group=evidence.focals.group[kept])
-
-
-def border_of(state: State) -> FloatArray:
-    """The unknowns (b,) that all frames share."""
-    return np.concatenate([state.log_focals, state.log_scales, state.coefficients])
 
 
 def _dense(arrow: Arrow) -> tuple[FloatArray, FloatArray]:

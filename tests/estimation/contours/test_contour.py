@@ -12,9 +12,9 @@ from cadalign.estimation.contours.contour import (
     SPACING,
     Contour,
     contour_of,
-    correlation_length,
     mask_contour,
 )
+from cadalign.estimation.contours.view_contour import correlation_length
 
 WIDTH, HEIGHT = 160, 120
 

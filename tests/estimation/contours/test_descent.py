@@ -11,9 +11,9 @@ from support.scenes import CAMERA, truth_of
 
 from cadalign import Alignment, Camera, Mesh, Model, Result, View, align
 from cadalign.datasets import KeypointNet
-from cadalign.estimation.contours.contour import Contour
-from cadalign.estimation.contours.descent import Descent, Masked, Place, settle
-from cadalign.estimation.contours.rims import Rims, across_rims
+from cadalign.estimation.contours.contour import Contour, Rims, across_rims
+from cadalign.estimation.contours.descent import Descent, Masked, settle
+from cadalign.estimation.contours.measured import Place
 from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.contours.view_contour import contour_view
 from cadalign.estimation.pack import evidence_of
@@ -102,14 +102,14 @@ def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
     found = settle(masked, start)
     assert found is not None
     descent = Descent(masked, found.noises, 4.0)
-    end = descent.at(found.place)
+    end = descent.at(found.joined.place)
     assert end is not None
     again, _ = descent.run(end)
     assert again is end
     for _ in range(20):
         step = np.zeros(6 + 3 + 3)
         step[:9] = rng.normal(0, 1e-3, 9) * [1, 1, 1, 1, 1, 1, 0, 1, 1]
-        there = descent.at(found.place.moved(step))
+        there = descent.at(found.joined.place.moved(step))
         assert there is not None
         assert there.cost > end.cost
 

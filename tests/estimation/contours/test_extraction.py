@@ -6,8 +6,13 @@ import numpy as np
 from support.scenes import CAMERA, truth_of
 
 from cadalign import Alignment, Mesh
-from cadalign.estimation.contours.contour import contour_of
-from cadalign.estimation.contours.rims import extraction_bias, find_rims, mask_image
+from cadalign.estimation.contours.contour import (
+    Sight,
+    contour_of,
+    extraction_bias,
+    find_rims,
+    mask_image,
+)
 from cadalign.estimation.contours.surface import caster_of
 from cadalign.render import Scene, cast_geometry
 
@@ -19,9 +24,9 @@ TRUTH = truth_of((0.6, 0.4, 0.8))
 
 def offsets_and_bias(mask: np.ndarray, pose: Alignment) -> tuple[np.ndarray, np.ndarray]:
     """How far the rims of a pose lie outside of a mask's contour, and the bias of these."""
-    contour, caster = contour_of(mask), caster_of(BOX)
-    rims = find_rims(caster, CAMERA, pose, contour, 8.0)
-    bias = extraction_bias(caster, CAMERA, pose, mask_image(mask, contour), contour, rims)
+    contour, sight = contour_of(mask), Sight(caster_of(BOX), CAMERA, pose)
+    rims = find_rims(sight, contour, 8.0)
+    bias = extraction_bias(sight, mask_image(mask, contour), contour, rims)
     assert rims.found.mean() > 0.9
     return rims.offset[rims.found], bias[rims.found]
 

@@ -1,0 +1,252 @@
+"""Evidence of what was measured at points of a surface, and estimates with it.
+
+What rims, lines across an outline and depth images measure at points of surfaces is evidence as any
+other: these points stand between the keypoints and the box's corners.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.estimation.contours.surface import PosedSurface, Surface
+from cadalign.estimation.estimates import poses_of
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.solvers.joint.covariance import information_of
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    Planes,
+    Shape,
+    Sightings,
+    State,
+    log_focals_of,
+    stacked,
+)
+from cadalign.solvers.joint.search import reduced, refine_joint
+
+OWN_MODES = 3
+"""Unknowns of a contour: its offset outwards, its registration along x and along y."""
+_LEAST_INFORMATION = 1e-12  # about a direction of the unknowns, relative
+
+Shown = TypeVar("Shown")
+
+
+class Measured(NamedTuple):
+    """Points of a surface in one view, with their modes, and what was measured at each.
+
+    ``mean`` (n, 3) and ``modes`` (K, n, 3) are as in `Shape`. ``table`` has a row for each point,
+    whose number follows. ``own`` (k, n, 3) are further modes of the shape, that move these points
+    alone.
+    """
+
+    mean: FloatArray
+    modes: FloatArray
+    table: Sightings | Planes
+    own: FloatArray | None = None
+
+
+class Place(NamedTuple):
+    """A state of the evidence, and the coefficients (V, 3) of the contours' own modes."""
+
+    state: State
+    own: FloatArray
+
+    @classmethod
+    def of(cls, state: State, contours: int = 0) -> Place:
+        """The place of a state, nothing known of the contours' own modes."""
+        return cls(state, np.zeros((contours, OWN_MODES)))
+
+    def towards(self, other: Place, share: float) -> Place:
+        """The place a share of the way to another one."""
+        a, b = self.state, other.state
+        poses = a.poses + share * (b.poses - a.poses)
+        for pose, start, end in zip(poses, a.poses, b.poses, strict=True):
+            turn = end[:9].reshape(3, 3) @ start[:9].reshape(3, 3).T
+            part = rotation_from_vector(share * vector_from_rotation(turn))
+            pose[:9] = (part @ start[:9].reshape(3, 3)).ravel()
+        rest = [x + share * (y - x) for x, y in zip(a[1:], b[1:], strict=True)]
+        return Place(State(poses, *rest), self.own + share * (other.own - self.own))
+
+    def moved(self, step: FloatArray) -> Place:
+        """The place after a step (U,) of poses, focal lengths, scales and own modes."""
+        state, count = self.state, len(self.state.poses)
+        poses = state.poses.copy()
+        ends = np.cumsum([6 * count, len(state.log_focals), 3])
+        steps, focals, scales, own = np.split(step, ends)
+        for pose, part in zip(poses, steps.reshape(-1, 6), strict=True):
+            pose[:9] = (rotation_from_vector(part[:3]) @ pose[:9].reshape(3, 3)).ravel()
+            pose[9:] += part[3:]
+        moved = state._replace(
+            poses=poses,
+            log_focals=state.log_focals + focals,
+            log_scales=state.log_scales + scales,
+        )
+        return Place(moved, self.own + own.reshape(self.own.shape))
+
+
+class Sought(NamedTuple, Generic[Shown]):
+    """Evidence, of so many keypoints, and the surface that is sought in ``views``.
+
+    These are contours of masks, photos or depths.
+    """
+
+    evidence: Evidence
+    keypoints: int
+    views: list[Shown]
+    surface: Surface
+
+    def at(self, state: State) -> tuple[PosedSurface, list[Alignment]]:
+        """The surface, and the alignments in all views."""
+        return self.surface.at(self.evidence.shape, state), poses_of(self.evidence, state)
+
+    def camera_at(self, image: int, camera: Camera, state: State) -> Camera:
+        """The camera of view number ``image`` with the focal length of a state."""
+        if self.evidence.focals.group[image] < 0:
+            return camera
+        ratio = float(np.exp(log_focals_of(self.evidence, state)[image]))
+        return camera.with_focal(camera.fx * ratio)
+
+    def joined(self, place: Place, rows: Sequence[Measured]) -> Joined:
+        """The evidence with what was measured at a place."""
+        return Joined.of(self.evidence, self.keypoints, rows, place)
+
+
+class Joined(NamedTuple):
+    """Evidence with what was measured at points of a surface.
+
+    The ``state`` of this evidence is that of the ``place``, with ``points`` more points after the
+    keypoints.
+    """
+
+    evidence: Evidence
+    state: State
+    place: Place
+    keypoints: int
+    points: int
+
+    @classmethod
+    def of(
+        cls, evidence: Evidence, keypoints: int, rows: Sequence[Measured], place: Place
+    ) -> Joined:
+        """The evidence with ``rows``; the modes of a contour's own are the last ones."""
+        points = sum(len(each.mean) for each in rows)
+        full = _with_measured(evidence, keypoints, rows, points)
+        bare = cls(full, place.state, place, keypoints, points)
+        return bare._replace(state=bare.at(place))
+
+    def at(self, place: Place) -> State:
+        """Another place as a state of this evidence."""
+        state, first = place.state, self.keypoints
+        still, none = state.displacements, np.zeros((self.points, 3))
+        return State(
+            state.poses.copy(),
+            state.log_focals.copy(),
+            state.log_scales.copy(),
+            np.concatenate([state.coefficients, place.own.ravel()]),
+            np.concatenate([still[:first], none, still[first:]]),
+        )
+
+    def refined(self, iterations: int) -> tuple[float, Joined] | None:
+        """The cost, and the place of the least cost, where every point of the surface stays."""
+        cost, state, _, _ = refine_joint(self.evidence, iterations, self.state)
+        if not cost < np.inf:
+            return None
+        still, first = state.displacements, self.keypoints
+        coefficients, own = np.split(
+            state.coefficients.copy(), [len(state.coefficients) - self.place.own.size]
+        )
+        bare = state._replace(
+            coefficients=coefficients,
+            displacements=np.concatenate([still[:first], still[first + self.points :]]),
+        )
+        place = Place(bare, own.reshape(self.place.own.shape))
+        return cost, self._replace(state=state, place=place)
+
+
+def _with_measured(
+    evidence: Evidence, keypoints: int, measured: Sequence[Measured], total: int
+) -> Evidence:
+    """The evidence with what was measured at ``total`` points."""
+    shape, last = evidence.shape, len(evidence.shape.modes)
+    further = sum(len(each.own) for each in measured if each.own is not None)
+    end = keypoints + total
+    mean = np.concatenate([shape.mean[:keypoints], np.zeros((total, 3)), shape.mean[keypoints:]])
+    modes = np.zeros((last + further, len(mean), 3))
+    modes[:last, :keypoints] = shape.modes[:, :keypoints]
+    modes[:last, end:] = shape.modes[:, keypoints:]
+
+    def moved(points: IntArray) -> IntArray:
+        return np.where(points >= keypoints, points + total, points)
+
+    tables: dict[str, list[Any]] = {
+        name: [table._replace(point=moved(table.point))]
+        for name, table in (("sightings", evidence.sightings), ("planes", evidence.planes))
+    }
+    first = keypoints
+    for points, own_modes, table, own in measured:
+        there = slice(first, first + len(points))
+        mean[there] = points
+        modes[: len(own_modes), there] = own_modes  # none for a rigid surface
+        if own is not None:
+            modes[last : last + len(own), there] = own
+            last += len(own)
+        name = "sightings" if isinstance(table, Sightings) else "planes"
+        tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
+        first = there.stop
+    spread = np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]])
+    return evidence._replace(
+        shape=Shape(mean, modes, spread),
+        offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
+        **{name: stacked(parts) for name, parts in tables.items()},
+    )
+
+
+def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
+    """The same with the points' own displacements as modes, which a warped surface follows."""
+    shape = evidence.shape
+    rows = np.repeat(np.flatnonzero(shape.spread > 0), 3)
+    if not len(rows):
+        return evidence, state
+    axes = np.tile(np.arange(3), len(rows) // 3)
+    own = np.zeros((len(rows), *shape.mean.shape))
+    own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
+    moved = state.displacements[rows, axes] / shape.spread[rows]
+    modes = np.concatenate([shape.modes, own])
+    return (
+        evidence._replace(shape=Shape(shape.mean, modes, np.zeros_like(shape.spread))),
+        state._replace(
+            coefficients=np.concatenate([state.coefficients, moved]),
+            displacements=np.zeros_like(state.displacements),
+        ),
+    )
+
+
+def cost_of(evidence: Evidence, state: State) -> float:
+    """Cost of all evidence."""
+    return information_of(*reduced(evidence, state))[0]
+
+
+def scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Information (U, U) of unit diagonal, and the roots (U,) of its own."""
+    sizes = np.sqrt(np.maximum(information.diagonal(), 1e-300))
+    return information / np.outer(sizes, sizes), sizes
+
+
+def solved(information: FloatArray, right: FloatArray) -> FloatArray:
+    """The covariance times columns (U, k), of unknowns of which next to nothing may be known."""
+    matrix, sizes = scaled(information)
+    matrix = matrix + _LEAST_INFORMATION * np.eye(len(sizes))
+    return np.asarray(np.linalg.solve(matrix, right / sizes[:, None]) / sizes[:, None])
+
+
+def weakest_steps(information: FloatArray, count: int) -> list[FloatArray]:
+    """Steps (U,) of one standard deviation along the directions of which least is known."""
+    matrix, sizes = scaled(information)
+    values, vectors = np.linalg.eigh(matrix)
+    roots = np.sqrt(np.maximum(values[:count], _LEAST_INFORMATION))
+    return list((vectors[:, :count] / roots / sizes[:, None]).T)

@@ -38,20 +38,13 @@ _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 
 @dataclass(frozen=True)
 class ManyEstimates:
-    """Estimates of observations; see `cadalign.evaluation.runs.work.Experiment`.
-
-    Parameters
-    ----------
-    options : ManyOptions
-    model : ModelKeypoints, optional
-        That keypoints of detectors are paired with.
-    folder : RunFolder, optional
-        The folder that pictures go to; none are drawn without.
-    """
+    """Estimates of observations; see `cadalign.evaluation.runs.work.Experiment`."""
 
     options: ManyOptions
     model: ModelKeypoints | None = None
+    """The keypoints that a detector's are paired with."""
     folder: RunFolder | None = field(default=None, repr=False)
+    """The folder that pictures go to; none are drawn without."""
 
     timing_columns = TIMING_COLUMNS
 
@@ -83,7 +76,7 @@ class ManyEstimates:
     def _evaluate(self, task: ObservationTask) -> Rows:
         start, seen = time.perf_counter(), None
         try:
-            seen = self.observation(task)
+            seen = self._observation(task)
             found = self.options.estimate_of(seen, task.name)
         except CadalignError as error:
             return _failed(task, str(error), seen)
@@ -98,32 +91,27 @@ class ManyEstimates:
         timing = {"row": task.row, "seconds": time.perf_counter() - start}
         return Rows([row], [timing], [_record(task.row, seen, found)])
 
-    def observation(self, task: ObservationTask) -> Observation:
-        """The observation of a task, with the shape that is to be fitted.
-
-        Raises
-        ------
-        CadalignError
-            If it cannot be read.
-        """
-        seen, shape = self._read(task), self.options.learned
-        return seen if shape is None else replace(seen, shape=shape.absolute())
-
-    def _read(self, task: ObservationTask) -> Observation:
-        options = self.options
+    def _observation(self, task: ObservationTask) -> Observation:
+        """The observation of a task, with the shape that is to be fitted."""
+        folder, shape = Path(task.folder), self.options.learned
         if isinstance(task.content, ImageKeypoints):
-            return self._detected(task.content, Path(task.folder))
-        if task.content is None:
-            data = parse_json(read_text(Path(task.name)), task.name)
+            seen = self._detected(task.content, folder)
         else:
-            data = _parsed(task.content, task.name)
-        return options.read(data, task.name, folder=Path(task.folder))
+            if task.content is None:
+                data = parse_json(read_text(Path(task.name)), task.name)
+            else:
+                data = _parsed(task.content, task.name)
+            seen = self.options.read(data, task.name, folder=folder)
+        return seen if shape is None else replace(seen, shape=shape.absolute())
 
     def _detected(self, found: ImageKeypoints, folder: Path) -> Observation:
         """A detector's keypoints paired with the model's."""
         detector, changes = self.options.detector, self.options.changes
         assert self.model is not None
-        photo = _photo(found, detector.images or folder)
+        photo = None
+        if found.image is not None:
+            path = (detector.images or folder) / Path(found.image).name
+            photo = path if _exists(path) else None
         size = found.size or (None if photo is None else photo_size(photo))
         with in_file(found.source):
             camera = changes.read_camera(size)
@@ -176,25 +164,12 @@ def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
         )
     opened = ShapeModel.open(shape)
     named = isinstance(opened.ids[0], str)
-    return ModelKeypoints(
-        tuple(
-            ModelKeypoint(str(each), tuple(xyz), None if named else int(each))
-            for each, xyz in zip(opened.ids, opened.components[0].mean.tolist(), strict=False)
-        )
-    )
+    pairs = zip(opened.ids, opened.components[0].mean.tolist(), strict=False)
+    keypoints = (ModelKeypoint(str(k), tuple(xyz), None if named else int(k)) for k, xyz in pairs)
+    return ModelKeypoints(tuple(keypoints))
 
 
-def _photo(found: ImageKeypoints, folder: Path) -> Path | None:
-    """The photo of an object, if it is there."""
-    if found.image is None:
-        return None
-    path = folder / Path(found.image).name
-    return path if _exists(path) else None
-
-
-@lru_cache(maxsize=1024)
-def _exists(path: Path) -> bool:
-    return path.is_file()
+_exists = lru_cache(maxsize=1024)(Path.is_file)
 
 
 def _parsed(content: bytes, name: str) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,16 +17,16 @@ from cadalign.estimation.exporting import object_of
 from cadalign.estimation.observed import model_of, own_ids, shape_ids
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result import Result
-from cadalign.export import AlignedObject
+from cadalign.export.aligned_object import AlignedObject
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file, read_json
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 
+_SAME = 1e-9  # of the model's size
 _FOLDER_ENDING = "_fit"
 _ANY_SIGMA = 1.0
-_SAME = 1e-9  # of the model's size
 
 
 def read_exported(
@@ -63,47 +63,30 @@ def read_exported(
     with in_file(fit):
         result = Result.from_dict(data)
     shape = shape or _stored(fit, data, "shape")
-    return exported_object(
-        result, seen, path, shape=shape, world_from_cam=world_from_cam, metres=metres
-    )
+    how = {"world_from_cam": world_from_cam, "metres": metres}
+    return exported_object(result, seen, path, shape=shape, **how)
 
 
 def exported_object(
-    result: Result,
-    seen: Observation,
-    path: Path,
-    *,
-    shape: Path | None = None,
-    world_from_cam: FloatArray | None = None,
-    metres: float = 1.0,
+    result: Result, seen: Observation, path: Path, *, shape: Path | None = None, **how: Any
 ) -> AlignedObject:
-    """The aligned object of a result and its observation, which errors call ``path``.
-
-    ``shape``, ``world_from_cam`` and ``metres`` are as for `read_exported`.
-    """
-    known: dict[str, Any] = {
-        "world_from_cam": world_from_cam,
-        "metres": metres,
-        "name": "model" if seen.model is None else seen.model.stem,
-    }
+    """The aligned object of a result and its observation, which errors call ``path``."""
     _require_same(len(result.views), len(seen.views), path, "views")
     for view, image in zip(result.views, seen.views, strict=True):
         _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
-    images = [view.image for view in seen.views]
     if result.method != "align":
         mesh = None if seen.model is None else _loaded(seen.model)
-        return object_of(result, mesh=mesh, images=images, **known)
-    opened = _shape(result, seen, shape)
-    with in_file(path):
-        result = _with_ids(result, seen, opened)
-    mesh = _warped(result, seen, opened, path)
-    return object_of(result, mesh=mesh, images=images, **known)
+    else:
+        opened = _shape(result, seen, shape)
+        with in_file(path):
+            result = _with_ids(result, seen, opened)
+        mesh = _warped(result, seen, opened, path)
+    name = "model" if seen.model is None else seen.model.stem
+    images = [view.image for view in seen.views]
+    return object_of(result, mesh=mesh, images=images, name=name, **how)
 
 
-@lru_cache(maxsize=8)
-def _loaded(path: Path) -> Mesh:
-    """Load a mesh that many objects of a run may share."""
-    return load_mesh(path)
+_loaded = lru_cache(maxsize=8)(load_mesh)  # many objects of a run may share a mesh
 
 
 def _stored(fit: Path, data: Mapping[str, Any], name: str) -> Path | None:
@@ -146,7 +129,7 @@ def _shape(aligned: Result, seen: Observation, shape: Path | None) -> ShapeModel
 
 def _with_ids(result: Result, seen: Observation, shape: ShapeModel | None) -> Result:
     """The result with the ids of every view's keypoints, which older files lack."""
-    ids: Sequence[Sequence[Hashable]] = own_ids(seen.views)
+    ids: Any = own_ids(seen.views)
     if shape is not None:
         ids = [shape_ids(image, shape) for image in seen.views]
     views = zip(result.views, ids, strict=True)

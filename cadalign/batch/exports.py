@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,13 +36,14 @@ from cadalign.render import OverlayStyle, Scene, overlay_model
 from cadalign.render.scene import LIGHT_GREY
 
 _MILLIMETRES = 1e-3
-_SAME = 1e-9
+_SAME = 1e-9  # of the model's size
 _SCENE = "1"
+_NOT_MOVED = Alignment(np.eye(3), np.zeros(3), np.ones(3))
+_Stored = tuple[Path, int, Observation, Result]
 
 
-@dataclass(frozen=True, eq=False)
-class RunObject:
-    """An aligned object of a run: its row, its observation's model and category, and itself."""
+class RunObject(NamedTuple):
+    """An aligned object of a run, with its row and category."""
 
     row: int
     category: str
@@ -104,13 +106,12 @@ def export_run(
         fix = f"of a run, give one of {', '.join(known)}"
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
     left_out: list[CadalignError] = []
-    results = run_results(RunFolder(run), rows)
-    with writing(to.parent):
-        to.parent.mkdir(parents=True, exist_ok=True)
+    results = _run_results(RunFolder(run), rows)
+    _make_folder(to.parent)
     if name == DOCUMENTS:
         count = _write_documents(to, results)
     else:
-        objects = run_objects(results, metres, left_out)
+        objects = _run_objects(results, metres, left_out)
         write = RUN_FORMATS[name] if style is None else partial(_write_overlays, style=style)
         count = write(to, objects, left_out)
     if not count:
@@ -120,12 +121,15 @@ def export_run(
     return Exported(to, count, tuple(left_out))
 
 
-def run_results(
-    folder: RunFolder, rows: Collection[int] = ()
-) -> Iterator[tuple[Path, int, Observation, Result]]:
-    """The results of a finished run with their observations, one at a time.
+def _make_folder(path: Path) -> None:
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
 
-    Each comes with its name in messages and its number; ``rows`` are those to read, by default all.
+
+def _run_results(folder: RunFolder, rows: Collection[int]) -> Iterator[_Stored]:
+    """The results of a finished run with their observations, one at a time; all without ``rows``.
+
+    Each comes with its name in messages and its number.
     """
     if not folder.is_finished:
         fix = "start the command that made it again: it goes on"
@@ -135,17 +139,14 @@ def run_results(
             raise DataError("not a run of fits", where=str(folder.path))
         for record in table.to_pylist():
             row = record["row"]
-            if not record["result"] or (rows and row not in rows):
-                continue
-            where = Path(f"{folder.path}, row {row}")
-            seen = Observation.from_dict(parse_json(record["observation"], str(where)))
-            yield where, row, seen, Result.from_json(record["result"])
+            if record["result"] and (not rows or row in rows):
+                where = Path(f"{folder.path}, row {row}")
+                seen = Observation.from_dict(parse_json(record["observation"], str(where)))
+                yield where, row, seen, Result.from_json(record["result"])
 
 
-def run_objects(
-    results: Iterator[tuple[Path, int, Observation, Result]],
-    metres: float,
-    left_out: list[CadalignError],
+def _run_objects(
+    results: Iterator[_Stored], metres: float, left_out: list[CadalignError]
 ) -> Iterator[RunObject]:
     """The aligned objects of results; those that lack something are left out."""
     for where, row, seen, result in results:
@@ -153,53 +154,40 @@ def run_objects(
             exported = exported_object(result, seen, where, metres=metres)
         except CadalignError as error:
             left_out.append(error)
-            continue
-        category = seen.shape.stem if seen.shape is not None else exported.name
-        yield RunObject(row, category, exported)
+        else:
+            category = seen.shape.stem if seen.shape is not None else exported.name
+            yield RunObject(row, category, exported)
 
 
-def _write_documents(folder: Path, results: Iterator[tuple[Path, int, Observation, Result]]) -> int:
+def _write_documents(folder: Path, results: Iterator[_Stored]) -> int:
     """Write each observation and its fit.json, as `cadalign fit` of the single file does."""
     count = 0
     for _, row, seen, result in results:
         path, fit = folder / f"{row:06d}.json", folder / f"{row:06d}_fit"
-        with writing(fit):
-            fit.mkdir(parents=True, exist_ok=True)
+        _make_folder(fit)
         seen.save(path)
         write_json(fit / "fit.json", result.to_dict() | {"observation": f"../{path.name}"})
         count += 1
     return count
 
 
-_Writer = Callable[[Path, Iterator[RunObject], list[CadalignError]], int]
-
-
 def _write_glb(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-    if path.suffix.lower() != ".glb":
-        return _write_each(path, objects, left_out)
-    placed, view = [], None
+    """One file of all objects in the camera's frame, or in a folder one of each, by its row."""
+    placed, view, count = [], None, 0
+    is_one = path.suffix.lower() == ".glb"
     for each in objects:
         try:
-            placed.append(each.exported.placed_mesh("camera").stretched(each.exported.metres))
+            if is_one:
+                mesh = each.exported.placed_mesh("camera")
+                placed.append(mesh.stretched(each.exported.metres))
+                view = view or ExportView(each.exported.views[0].camera, _NOT_MOVED)
+            else:
+                export_object(path / f"{each.row:06d}.glb", each.exported)
+            count += 1
         except InputError as error:
             left_out.append(error)
-        else:
-            view = view or ExportView(each.exported.views[0].camera, _NOT_MOVED)
     if view is not None:
         export_object(path, AlignedObject((view,), mesh=join(placed, path), name="objects"))
-    return len(placed)
-
-
-def _write_each(folder: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-    """One GLB of each object, named after its row."""
-    count = 0
-    for each in objects:
-        try:
-            export_object(folder / f"{each.row:06d}.glb", each.exported)
-        except InputError as error:
-            left_out.append(error)
-        else:
-            count += 1
     return count
 
 
@@ -244,8 +232,7 @@ def _write_coco(path: Path, objects: Iterator[RunObject], left_out: list[Cadalig
             photos[photo.name, photo.image] = more
         count += 1
     file = path if path.suffix.lower() == ".json" else path / "keypoints.json"
-    with writing(file.parent):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(file.parent)
     write_coco_keypoints(file, list(photos.values()))
     return count
 
@@ -264,8 +251,7 @@ def _write_bop_results(
 ) -> int:
     """Poses of the stretched meshes, which stand beside them as ``obj_<row + 1>.ply``."""
     file = path if path.suffix.lower() == ".csv" else path / "results.csv"
-    with writing(file.parent):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(file.parent)
     poses, entries, numbers = [], {}, dict[str, int]()
     for each in objects:
         exported, number = each.exported, each.row + 1
@@ -281,9 +267,7 @@ def _write_bop_results(
         for view in exported.views:
             stem = Path(view.image_name or "").stem
             image = int(stem) if stem.isdecimal() else numbers.setdefault(stem, len(numbers))
-            pose = view.cam_from_model
-            shift = pose.translation * exported.metres / _MILLIMETRES
-            rigid = Alignment(pose.rotation, shift, np.ones(3))
+            rigid = _rigid(view.cam_from_model, exported.metres / _MILLIMETRES)
             poses.append(PoseEstimate(_SCENE, str(image), str(number), rigid))
     if entries:
         bop_files.write_models_info(file.parent, entries)
@@ -292,20 +276,26 @@ def _write_bop_results(
     return len({each.model_id for each in poses})
 
 
+def _rigid(pose: Alignment, unit: float) -> Alignment:
+    """A pose without its stretch, lengths in another unit."""
+    return Alignment(pose.rotation, pose.translation * unit, np.ones(3))
+
+
 def _cameras(objects: Iterator[RunObject]) -> list[CameraView]:
     """The cameras in the frame of the object that each sees [m], with names of their own."""
     found, names = [], set[str]()
     for each in objects:
         for number, view in enumerate(each.exported.views):
-            pose = view.cam_from_model
             name = view.image_name or f"{each.row:06d}_{number}.png"
             if name in names:
                 name = f"{each.row:06d}_{number}_{name}"
             names.add(name)
-            shift = pose.translation * each.exported.metres
-            placed = Alignment(pose.rotation, shift, np.ones(3))
+            placed = _rigid(view.cam_from_model, each.exported.metres)
             found.append(CameraView(view.camera, placed, name))
     return found
+
+
+_Writer = Callable[[Path, Iterator[RunObject], list[CadalignError]], int]
 
 
 def _write_cameras(write: Callable[[Path, Sequence[CameraView]], None]) -> _Writer:
@@ -320,8 +310,7 @@ def _write_cameras(write: Callable[[Path, Sequence[CameraView]], None]) -> _Writ
 
 def _write_nerf(path: Path, cameras: Sequence[CameraView]) -> None:
     file = path if path.suffix.lower() == ".json" else path / "transforms.json"
-    with writing(file.parent):
-        file.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(file.parent)
     write_nerf(file, cameras)
 
 
@@ -337,7 +326,6 @@ def _write_data_set(form: str) -> _Writer:
     return written
 
 
-_NOT_MOVED = Alignment(np.eye(3), np.zeros(3), np.ones(3))
 DOCUMENTS = "json"
 """The format that needs no mesh, nor anything else that a file must be read for."""
 RUN_FORMATS: dict[str, _Writer] = {

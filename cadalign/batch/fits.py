@@ -7,10 +7,10 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
-from itertools import count, islice
+from dataclasses import fields, replace
+from itertools import chain, count, islice, starmap
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import pyarrow.compute as pc
@@ -40,8 +40,7 @@ _SPOOL = "observations.jsonl"
 Observed = str | os.PathLike[str] | Iterable[str | os.PathLike[str]] | Iterable[Observation]
 
 
-@dataclass(frozen=True)
-class Tally:
+class Tally(NamedTuple):
     """Numbers of observations of a finished run and of failures, these by reason."""
 
     total: int
@@ -194,15 +193,15 @@ def options_of(given: dict[str, Any]) -> FitRunOptions:
         If a name is not known.
     """
     kinds: tuple[Any, ...] = (ObservationFit, FitOptions, DetectorOptions, ObservationChanges)
+    names = [(field.name, kind) for kind in kinds for field in fields(kind)]
+    owners = {name: kind for name, kind in reversed(names) if name != "fitting"}
     parts: dict[Any, dict[str, Any]] = {kind: {} for kind in kinds}
     for name, value in given.items():
-        owner = next((k for k in kinds if name in {field.name for field in fields(k)}), None)
-        if owner is None or name == "fitting":
-            known = dict.fromkeys(field.name for kind in kinds for field in fields(kind))
-            listed = ", ".join(each for each in known if each != "fitting")
+        if name not in owners:
+            listed = ", ".join(dict.fromkeys(each for each, _ in names if each != "fitting"))
             raise InputError("not a known option", where=name, fix=f"known are {listed}")
         is_path = name in ("shape", "model", "images", "camera") and value is not None
-        parts[owner][name] = Path(value) if is_path else value
+        parts[owners[name]][name] = Path(value) if is_path else value
     if parts[ObservationFit].get("ransac") is not None:
         parts[ObservationFit].setdefault("robust", True)
     return FitRunOptions(
@@ -225,41 +224,34 @@ def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
         return (Path(first), *(Path(each) for each in source))  # type: ignore[arg-type]
     folder.make()
     path = folder.path / _SPOOL
+
+    def write(unfinished: Path) -> None:
+        with unfinished.open("wb") as file:
+            file.writelines(starmap(_line, enumerate(chain([first], source))))
+
     with folder.locked():
-        write_whole(path, lambda unfinished: _write_lines(unfinished, first, source))
+        write_whole(path, write)
     return (path,)
 
 
-def _write_lines(path: Path, first: Observation, others: Iterator[Any]) -> None:
-    with path.open("wb") as file:
-        file.write(_line(first))
-        for number, each in enumerate(others, start=1):
-            if not isinstance(each, Observation):
-                what = f"expected a cadalign.Observation, got {type(each).__name__}"
-                raise InputError(what, where=f"observations[{number}]")
-            file.write(_line(each))
-
-
-def _line(observation: Observation) -> bytes:
-    data = observation.to_dict(states_origins=True)
-    return msgspec.json.encode(data) + b"\n"
+def _line(number: int, observation: Any) -> bytes:
+    if not isinstance(observation, Observation):
+        what = f"expected a cadalign.Observation, got {type(observation).__name__}"
+        raise InputError(what, where=f"observations[{number}]")
+    return msgspec.json.encode(observation.to_dict(states_origins=True)) + b"\n"
 
 
 def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[ObservationTask]]:
     """Observations as tasks, so many at a time."""
-    source = iter(observations)
-    rows = count()
+    source = enumerate(observations)
     for index in count():
-        some = list(islice(source, size))
-        if not some:
+        tasks = [
+            ObservationTask(row, f"observation {row}", _line(row, each), os.getcwd())
+            for row, each in islice(source, size)
+        ]
+        if not tasks:
             return
-        yield Chunk(
-            index,
-            [
-                ObservationTask(row, f"observation {row}", _line(each), os.getcwd())
-                for each, row in zip(some, rows, strict=False)  # takes no row for nothing
-            ],
-        )
+        yield Chunk(index, tasks)
 
 
 def _tally(folder: RunFolder) -> Tally:

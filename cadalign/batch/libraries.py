@@ -12,13 +12,11 @@ warning
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cadalign.batch.fits import pool_of
 from cadalign.datasets import AnnotatedModel, KeypointNet
@@ -27,7 +25,7 @@ from cadalign.evaluation.outcome import FAILED, OK
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import OnProgress, execute
 from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups
-from cadalign.evaluation.runs.work import Plan, Rows
+from cadalign.evaluation.runs.work import Plan, Rows, fingerprint
 from cadalign.retrieval import Library
 from cadalign.retrieval.models import ModelTable, read_annotated, row_of
 
@@ -35,8 +33,7 @@ _LARGEST_CHUNK = 64
 _EXPERIMENT = "library"
 
 
-@dataclass(frozen=True, eq=False)
-class ModelTask:
+class ModelTask(NamedTuple):
     """One model of a data set; None, and why, where its annotation cannot be read."""
 
     category: str
@@ -113,7 +110,7 @@ def build_library(
     run = RunFolder(folder)
     if run.is_finished and (run.read_config() or {}).get("experiment") == _EXPERIMENT:
         shutil.rmtree(folder)
-    config = {"experiment": _EXPERIMENT, "contents": _fingerprint(tasks)}
+    config = {"experiment": _EXPERIMENT, "contents": _contents(tasks)}
     size = max(1, min(_LARGEST_CHUNK, len(tasks) // _LARGEST_CHUNK))
     execute(
         Plan(ModelRows(), tasks, config, size),
@@ -121,20 +118,14 @@ def build_library(
         workers=pool_of(len(tasks), workers, dask),
         on_progress=on_progress,
     )
-    models = [
-        json.loads(text)
-        for table in read_groups(run.records, fix=DONE_ANEW)
-        for text in table["model"].to_pylist()
-        if text
-    ]
+    records, results = (
+        [row for table in read_groups(path, fix=DONE_ANEW) for row in table.to_pylist()]
+        for path in (run.records, run.results)
+    )
+    models = [json.loads(row["model"]) for row in records if row["model"]]
     if not models:
         raise DataError("the data set has no such models", where=str(dataset.root))
-    troubles = [
-        row
-        for table in read_groups(run.results, fix=DONE_ANEW)
-        for row in table.to_pylist()
-        if row["reason"] or row["warning"]
-    ]
+    troubles = [row for row in results if row["reason"] or row["warning"]]
     return Library(ModelTable.of_rows(models)), troubles
 
 
@@ -145,16 +136,16 @@ def _task(dataset: KeypointNet, key: tuple[str, str]) -> ModelTask:
         return ModelTask(*key, None, str(error))
 
 
-def _fingerprint(tasks: Sequence[ModelTask]) -> str:
+def _contents(tasks: Sequence[ModelTask]) -> str:
     """A text that changes with the annotations and with the meshes' files."""
-    digest = hashlib.sha256()
+    parts: list[Any] = []
     for task in tasks:
         known: list[Any] = [task.category, task.model_id, task.reason]
         if task.model is not None:
             keypoints, path = task.model.keypoints, task.model.mesh_path
             known += [keypoints.ids.tolist(), task.model.symmetries, path]
-            digest.update(keypoints.xyz.tobytes())
+            parts.append(keypoints.xyz)
             if path is not None and path.is_file():
                 known.append(path.stat().st_mtime_ns)
-        digest.update(repr(known).encode())
-    return digest.hexdigest()[:16]
+        parts.append(repr(known))
+    return fingerprint(*parts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -22,30 +22,18 @@ from cadalign.io.observation import Observation, ObservationChanges
 from cadalign.shapes.model import ShapeModel
 
 
-@dataclass(frozen=True, eq=False)
-class Estimated:
-    """Result of an observation, what it is the alignment of, and cells that the table adds."""
+class Estimated(NamedTuple):
+    """Result of an observation, what it is the alignment of, and cells that the tables add."""
 
     observation: Observation
     result: Result
-    cells: Row = field(default_factory=dict)
-    record: Row = field(default_factory=dict)
+    cells: Row
+    record: Row
 
 
 @dataclass(frozen=True, kw_only=True)
 class ManyOptions(ExperimentOptions):
-    """A run over many observations, whatever is estimated of each.
-
-    Parameters
-    ----------
-    inputs : tuple of Path
-        Observation files, folders and patterns of such, JSON lines, files of detectors.
-    changes : ObservationChanges
-        What takes the place of the observations' own.
-    detector : DetectorOptions
-    pictures : int
-        Number of observations whose photos the page shows, the first ones.
-    """
+    """A run over many observations, whatever is estimated of each."""
 
     columns: ClassVar[Columns] = ()
     """Columns of the table beside those of every run."""
@@ -53,9 +41,12 @@ class ManyOptions(ExperimentOptions):
     """Columns of the records beside those of every run."""
 
     inputs: tuple[Path, ...]
+    """Observation files, folders and patterns of such, JSON lines, files of detectors."""
     changes: ObservationChanges = field(default_factory=ObservationChanges)
+    """Takes the place of the observations' own."""
     detector: DetectorOptions = field(default_factory=DetectorOptions)
     pictures: int = 0
+    """Number of observations whose photos the page shows, the first ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,64 +93,55 @@ class FitRunOptions(ManyOptions):
 
     @property
     def learned(self) -> Path | None:
-        """See `ManyOptions.learned`."""
         return self.estimate.shape
 
     def warm_up(self, seen: Observation) -> Result:
-        """See `ManyOptions.warm_up`."""
         return replace(self.estimate, shape=None).fit(seen, "warm-up")[0]
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        """See `ManyOptions.read`."""
         return self.estimate.read(data, where, folder=folder, changes=self.changes)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
-        """See `ManyOptions.estimate_of`."""
         result, _ = self.estimate.fit(seen, where)
-        doubts = [text for view in seen.views for text in _photo_doubt(view)]
+        doubts = [doubt for view in seen.views if (doubt := _photo_doubt(view))]
         if doubts:
             stated = Stated.of(result.statistics)
             statistics = replace(stated, warnings=(*doubts, *stated.warnings))
             result = replace(result, statistics=statistics)
-        return Estimated(seen, result)
+        return Estimated(seen, result, {}, {})
 
     def contents(self) -> dict[str, Any]:
-        """See `ManyOptions.contents`."""
         shape, noise = self.estimate.shape, self.estimate.noise
         found = {"shapes": None if shape is None else ShapeModel.open(shape).category}
         return found if noise is None else found | {"noise": str(opened_noise(noise))}
 
 
-def _photo_doubt(view: ObservedImage) -> tuple[str, ...]:
+def _photo_doubt(view: ObservedImage) -> str:
     """Warning about a photo, if it is there, of another size than its camera's images."""
     if view.image is None or not view.image.is_file():
-        return ()
+        return ""
     try:
         width, height = photo_size(view.image)
     except DataError:  # which whoever draws it will name
-        return ()
+        return ""
     if (width, height) == (view.camera.width, view.camera.height):
-        return ()
+        return ""
     return (
         f"{view.image.name} is {width} x {height} px, the camera {view.camera.width} x "
         f"{view.camera.height}: give camera and keypoints of its resolution "
-        "(`Camera.resized`, `Camera.cropped`)",
+        "(`Camera.resized`, `Camera.cropped`)"
     )
 
 
 def _changed(part: Any) -> dict[str, Any]:
     """The fields of some of the options that are not at their defaults."""
-    values = asdict(part)
-    return {
-        each.name: values[each.name]
-        for each in fields(part)
-        if values[each.name] != _plain_default(each)
-    }
-
-
-def _plain_default(each: Any) -> Any:
-    default: Any = each.default if each.default_factory is MISSING else each.default_factory()
-    return asdict(default) if is_dataclass(default) and not isinstance(default, type) else default
+    found, values = {}, asdict(part)
+    for each in fields(part):
+        default: Any = each.default if each.default_factory is MISSING else each.default_factory()
+        plain = asdict(default) if hasattr(default, "__dataclass_fields__") else default
+        if values[each.name] != plain:
+            found[each.name] = values[each.name]
+    return found
 
 
 def _plain(value: Any) -> Any:

@@ -17,7 +17,6 @@ The records hold all matches as JSON (`cadalign.Match.to_dict`) in the column ``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -37,7 +36,7 @@ from cadalign.io.documents import in_file
 from cadalign.io.files import dense_json
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import fill_xyz
-from cadalign.retrieval import Library, LibraryModel, Match
+from cadalign.retrieval import Library, LibraryModel
 from cadalign.retrieval.query import ObservationRetrieval
 
 SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
@@ -67,24 +66,20 @@ class RetrieveRunOptions(ManyOptions):
 
     @property
     def learned(self) -> Path | None:
-        """See `ManyOptions.learned`."""
         return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
 
     def warm_up(self, seen: Observation) -> Result:
-        """See `ManyOptions.warm_up`."""
         points, ids = seen.points_3d, np.arange(len(seen.points_3d))
         bounds = np.array([points.min(axis=0), points.max(axis=0)])
         library = Library.from_models([LibraryModel("", "", points, ids, bounds)])
         return library.retrieve(seen.points_2d, ids, seen.camera, workers=1)[0].result
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:
-        """See `ManyOptions.read`."""
         with in_file(where):
             seen = Observation.from_dict(fill_xyz(data), folder=folder)
         return self.changes.applied_to(seen, where)
 
     def estimate_of(self, seen: Observation, where: str) -> Estimated:
-        """See `ManyOptions.estimate_of`."""
         matches = self.estimate.retrieve(seen, where, workers=1)
         best = matches[0]
         cells = {
@@ -100,17 +95,12 @@ class RetrieveRunOptions(ManyOptions):
             "top_ids": [match.model_id for match in matches],
             "top_scores": [match.score for match in matches],
         }
-        record = {"matches": _json_of(matches)}
+        record = {"matches": dense_json([match.to_dict() for match in matches])}
         return Estimated(best.observation(seen), best.result, cells, record)
 
     def contents(self) -> dict[str, Any]:
-        """See `ManyOptions.contents`."""
         library, _ = self.estimate.opened()
         return {"library_contents": library.fingerprint}
-
-
-def _json_of(matches: Sequence[Match]) -> str:
-    return dense_json([match.to_dict() for match in matches])
 
 
 _SHOWN = (SCORE, NONE)

@@ -11,19 +11,17 @@ import hashlib
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from glob import glob
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
-import numpy as np
 
-from cadalign.arrays import IntArray
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
+from cadalign.evaluation.runs.work import fingerprint
 from cadalign.io.files import open_input, read_bytes
 from cadalign.io.input_kinds import (
     DETECTOR,
@@ -38,26 +36,17 @@ from cadalign.io.input_kinds import (
 _DAMAGED = "damaged"
 
 
-@dataclass(frozen=True, eq=False)
-class ObservationTask:
-    """One observation of a run.
-
-    Parameters
-    ----------
-    row : int
-        Its number in the run.
-    name : str
-        Its file, with the line or the object where the file holds several.
-    content : bytes or ImageKeypoints, optional
-        Its JSON, or a detector's keypoints; None to read the file ``name``.
-    folder : str
-        The folder that paths in it are relative to.
-    """
+class ObservationTask(NamedTuple):
+    """One observation of a run."""
 
     row: int
+    """Its number in the run."""
     name: str
+    """Its file, with the line or the object where the file holds several."""
     content: bytes | ImageKeypoints | None
+    """Its JSON, or a detector's keypoints; None to read the file ``name``."""
     folder: str
+    """The folder that paths in it are relative to."""
 
 
 class Source(Protocol):
@@ -73,44 +62,30 @@ class Source(Protocol):
         """A text that changes with the content."""
 
 
-@dataclass(frozen=True, eq=False)
-class Files:
+class Files(list[Path]):
     """Observation files, one each."""
 
-    paths: Sequence[Path]
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
     def tasks(self, first: int, last: int) -> list[ObservationTask]:
-        """See `Source.tasks`."""
-        chosen = enumerate(self.paths[first:last], start=first)
+        chosen = enumerate(self[first:last], start=first)
         return [ObservationTask(row, str(path), None, _folder(path)) for row, path in chosen]
 
     def fingerprint(self) -> str:
         """Names, sizes and times of the files: to read thousands would take as long as the run."""
-        digest = hashlib.sha256()
-        for path in self.paths:
+        lines = []
+        for path in self:
             try:
                 status = path.stat()
             except (OSError, ValueError):
                 continue  # its row says so
-            digest.update(f"{path.name} {status.st_size} {status.st_mtime_ns}\n".encode())
-        return digest.hexdigest()[:16]
+            lines.append(f"{path.name} {status.st_size} {status.st_mtime_ns}\n")
+        return fingerprint(*lines)
 
 
-@dataclass(frozen=True, eq=False)
 class Lines:
-    """A file of JSON lines; ``starts`` (n + 1,) are the places of its lines, empty ones too."""
+    """A file of JSON lines, of which empty ones are passed over."""
 
-    path: Path
-    starts: IntArray
-    numbers: IntArray
-    digest: str
-
-    @classmethod
-    def of(cls, path: Path) -> Lines:
-        """Find the lines of a file."""
+    def __init__(self, path: Path) -> None:
+        self._path = path
         digest, place = hashlib.sha256(), 0
         starts, numbers = array("q"), array("q")  # of hundreds of thousands of lines
         with open_input(path) as file:
@@ -121,48 +96,45 @@ class Lines:
                     numbers.append(number)
                 place += len(line)
         starts.append(place)
-        return cls(path, np.array(starts), np.array(numbers), digest.hexdigest()[:16])
+        self._starts, self._numbers = starts, numbers
+        self._digest = digest.hexdigest()[:16]
 
     def __len__(self) -> int:
-        return len(self.numbers)
+        return len(self._numbers)
 
     def tasks(self, first: int, last: int) -> list[ObservationTask]:
-        """See `Source.tasks`."""
-        with open_input(self.path) as file:
-            file.seek(int(self.starts[first]))
-            content = file.read(int(self.starts[last] - self.starts[first]))
+        with open_input(self._path) as file:
+            file.seek(self._starts[first])
+            content = file.read(self._starts[last] - self._starts[first])
         lines = [line for line in content.split(b"\n") if line.strip()]
-        numbered = zip(range(first, last), self.numbers[first:last].tolist(), lines, strict=True)
-        folder = _folder(self.path)
+        numbered = zip(range(first, last), self._numbers[first:last], lines, strict=True)
+        folder = _folder(self._path)
         return [
-            ObservationTask(row, f"{self.path}, line {number}", line, folder)
+            ObservationTask(row, f"{self._path}, line {number}", line, folder)
             for row, number, line in numbered
         ]
 
     def fingerprint(self) -> str:
-        """See `Source.fingerprint`."""
-        return self.digest
+        return self._digest
 
 
-@dataclass(frozen=True, eq=False)
 class Detections:
     """A detector's file, which memory holds whole."""
 
-    path: Path
-    objects: Sequence[ImageKeypoints]
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._objects: Sequence[ImageKeypoints] = read_image_keypoints(path)
 
     def __len__(self) -> int:
-        return len(self.objects)
+        return len(self._objects)
 
     def tasks(self, first: int, last: int) -> list[ObservationTask]:
-        """See `Source.tasks`."""
-        chosen = enumerate(self.objects[first:last], start=first)
-        folder = _folder(self.path)
+        chosen = enumerate(self._objects[first:last], start=first)
+        folder = _folder(self._path)
         return [ObservationTask(row, found.source, found, folder) for row, found in chosen]
 
     def fingerprint(self) -> str:
-        """See `Source.fingerprint`."""
-        return hashlib.sha256(read_bytes(self.path)).hexdigest()[:16]
+        return fingerprint(read_bytes(self._path))
 
 
 class ObservationTasks(Sequence[ObservationTask]):
@@ -177,19 +149,16 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def __getitem__(self, place: Any) -> Any:
         if not isinstance(place, slice):
-            (task,) = self._between(range(len(self))[place], range(len(self))[place] + 1)
-            return task
+            row = range(len(self))[place]
+            return self[row : row + 1][0]
         first, last, _ = place.indices(len(self))
-        return self._between(first, last)
-
-    def _between(self, first: int, last: int) -> list[ObservationTask]:
         found: list[ObservationTask] = []
         index = bisect_right(self._ends, first)
         while first < last:
             source, end = self._sources[index], self._ends[index]
             start, stop = end - len(source), min(last, end)
             own = source.tasks(first - start, stop - start)
-            found += [replace(task, row=task.row + start) for task in own]
+            found += [task._replace(row=task.row + start) for task in own]
             first, index = stop, index + 1
         return found
 
@@ -200,8 +169,7 @@ class ObservationTasks(Sequence[ObservationTask]):
 
     def fingerprint(self) -> str:
         """A text that changes with the content of the inputs."""
-        texts = "\n".join(source.fingerprint() for source in self._sources)
-        return hashlib.sha256(texts.encode()).hexdigest()[:16]
+        return fingerprint("\n".join(source.fingerprint() for source in self._sources))
 
 
 def read_sources(inputs: Iterable[Path]) -> ObservationTasks:
@@ -214,8 +182,13 @@ def read_sources(inputs: Iterable[Path]) -> ObservationTasks:
     """
     sources: list[Source] = []
     for path in inputs:
-        sources += _sources_of(path)
-    return ObservationTasks(_files_joined(sources))
+        for source in _sources_of(path):
+            last = sources[-1] if sources else None
+            if isinstance(source, Files) and isinstance(last, Files):
+                last.extend(source)  # thousands may be given, or match a pattern
+            else:
+                sources.append(source)
+    return ObservationTasks(sources)
 
 
 def _sources_of(path: Path) -> list[Source]:
@@ -232,7 +205,7 @@ def _sources_of(path: Path) -> list[Source]:
 def _of_folder(folder: Path) -> list[Source]:
     """The observations of a folder, whose other JSON files are passed over."""
     files = [path for path in sorted(folder.iterdir()) if path.is_file()]
-    lines: list[Source] = [Lines.of(path) for path in files if path.suffix.lower() in LINES]
+    lines: list[Source] = [Lines(path) for path in files if path.suffix.lower() in LINES]
     single = [path for path in files if path.suffix.lower() == ".json"]
     found = [path for path in single if _kind_of_file(path) in (OBSERVATION, _DAMAGED)]
     if not found and not lines:
@@ -248,12 +221,12 @@ def _of_file(path: Path) -> Source:
     suffix = path.suffix.lower()
     refuse_photo(path)
     if suffix in LINES:
-        lines = Lines.of(path)
+        lines = Lines(path)
         if not len(lines):
             raise DataError("the file holds no observation", where=str(path))
         return lines
     if suffix == TABLE or _kind_of_file(path) == DETECTOR:
-        return Detections(path, read_image_keypoints(path))
+        return Detections(path)
     return Files([path])
 
 
@@ -270,16 +243,3 @@ def _kind_of_file(path: Path) -> str:
     except (DataError, msgspec.MsgspecError, UnicodeError, RecursionError):
         return _DAMAGED
     return kind_of(data)
-
-
-def _files_joined(sources: Sequence[Source]) -> list[Source]:
-    """The sources with neighbouring files as one: thousands may be given, or match a pattern."""
-    joined: list[Source] = []
-    paths: list[Path] = []
-    for source in sources:
-        if isinstance(source, Files):
-            paths += source.paths
-            continue
-        joined += [Files(paths)] * bool(paths) + [source]
-        paths = []
-    return joined + [Files(paths)] * bool(paths)

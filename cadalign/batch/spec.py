@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 import numpy as np
@@ -18,7 +18,7 @@ from cadalign.batch.table import COLUMNS as TABLE_COLUMNS
 from cadalign.batch.table import RECORD_COLUMNS, without_lists
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.plots import Plot, cumulative
+from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.opened import Cells, Run
 from cadalign.evaluation.runs.tables import Columns, Row
@@ -26,7 +26,6 @@ from cadalign.evaluation.summary import (
     ALL,
     Summary,
     by_category_and_method,
-    known,
     mean,
     median,
     median_of,
@@ -66,19 +65,13 @@ class FitRun(Run):
 
     def records(self, columns: Columns) -> Iterator[Row]:
         """The records of the observations that could be read, made of their stored results."""
-        table = self.results
+        table = self.results.select(["category", "model_id", "view", "reason"])
+        places = {row: place for place, row in enumerate(self.results["row"].to_pylist())}
         for stored in super().records(RECORD_COLUMNS):
-            if not stored["observation"]:
-                continue
-            place = stored["row"] if self.is_finished else self._places[stored["row"]]
-            names = table.select(["category", "model_id", "view", "reason"]).slice(place, 1)
-            (row,) = names.to_pylist()
-            reason = row.pop("reason")
-            yield {**row, "exhibit": _exhibit(stored, reason)}
-
-    @property
-    def _places(self) -> dict[int, int]:
-        return {row: place for place, row in enumerate(self.results["row"].to_pylist())}
+            if stored["observation"]:
+                (row,) = table.slice(places[stored["row"]], 1).to_pylist()
+                reason = row.pop("reason")
+                yield {**row, "exhibit": _exhibit(stored, reason)}
 
 
 def _as_instances(table: pa.Table) -> pa.Table:
@@ -88,50 +81,43 @@ def _as_instances(table: pa.Table) -> pa.Table:
     names = [page_names(row) for row in shown.select(naming).to_pylist()]
     for name in ("category", "model_id", "view", "model_name"):
         shown = shown.append_column(name, pa.array([each[name] for each in names]))
-    inliers, keypoints = (_floats(shown, name) for name in ("inliers", "keypoints"))
+    inliers, keypoints, std, depth = (
+        shown[name].to_numpy().astype(float) for name in ("inliers", "keypoints", "tz_std", "tz")
+    )
     shown = shown.append_column(MATCHED.key, pa.array(inliers / np.maximum(keypoints, 1)))
-    distance = _floats(shown, "tz_std") / np.abs(_floats(shown, "tz"))
-    shown = shown.append_column(DISTANCE_STD.key, pa.array(distance))
+    shown = shown.append_column(DISTANCE_STD.key, pa.array(std / np.abs(depth)))
     place = shown.schema.get_field_index("method")
     return shown.set_column(place, "method", pa.array([METHOD] * len(shown), pa.string()))
 
 
-def _floats(table: pa.Table, name: str) -> Any:
-    return table[name].to_numpy().astype(float)
-
-
 def _exhibit(stored: Row, reason: str) -> str:
     """The instance record of a stored result; see `cadalign.evaluation.instances.record`."""
-    seen = msgspec.json.decode(stored["observation"])
+    estimate: Row = {"method": METHOD}
     if not stored["result"]:
+        seen = msgspec.json.decode(stored["observation"])
         view = seen["views"][0] if "views" in seen else seen
         points = [each["xyz"] for each in view["keypoints"]]
         pixels = [each["uv"] for each in view["keypoints"]]
-        camera, bounds = Camera.from_dict(view["camera"]), _extent(points)
-        estimate: Row = {"method": METHOD, "reason": reason}
+        bounds = _extent(points)
+        estimate["reason"] = reason
     else:
         found = msgspec.json.decode(stored["result"])
         view, places = found["views"][0], found["points_3d"]
         row_of = {label: row for row, label in enumerate(found["ids"])}
         points = [places[row_of[label]] for label in view["ids"] or ()] or places
-        pixels = view["points_2d"]
-        camera, bounds = Camera.from_dict(view["camera"]), found["bounds"] or _extent(places)
-        names = ("sigma", "std", "warnings")
-        estimate = {
-            "method": METHOD,
-            **_pose(found["alignment"]),
-            "rms_px": round(found["rms"], 4),
-            **{name: found[name] for name in names},
-            "alternatives": [
-                {**_pose(other["alignment"]), "likelihood": other["relative_likelihood"]}
-                for other in found["alternatives"]
-            ],
-        }
+        pixels, bounds = view["points_2d"], found["bounds"] or _extent(places)
+        estimate |= _pose(found["alignment"])
+        estimate |= {name: found[name] for name in ("sigma", "std", "warnings")}
+        estimate["rms_px"] = round(found["rms"], 4)
+        estimate["alternatives"] = [
+            {**_pose(other["alignment"]), "likelihood": other["relative_likelihood"]}
+            for other in found["alternatives"]
+        ]
+    camera = Camera.from_dict(view["camera"])
     shown = [k for k, pixel in enumerate(pixels) if pixel is not None]
+    names = ("width", "height", "fx", "fy", "cx", "cy")
     record = {
-        "camera": {
-            name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")
-        },
+        "camera": {name: getattr(camera, name) for name in names},
         "gt": None,
         "stretch": [1.0, 1.0, 1.0],
         "bounds": bounds,
@@ -197,13 +183,10 @@ def _by_model(run: Run) -> Run | None:
     return replace(run, results=results, timings=timings)
 
 
-def plots(runs: Sequence[Run]) -> list[Plot]:
+def _plots(runs: Sequence[Run]) -> list[Plot]:
     """Shares of the observations within a residual and within an uncertainty."""
-    return [
-        cumulative(runs, metric, _PLACES, title=f"{metric.label} of the observations")
-        for metric in (metrics.RMS, ROTATION_STD)
-        if any(len(known(run.cells[metric.key])) for run in runs)
-    ]
+    curves = [(metric, _PLACES) for metric in (metrics.RMS, ROTATION_STD)]
+    return cumulative_curves(runs, curves=curves, of="of the observations")
 
 
 def _describe(run: Run) -> str:
@@ -226,7 +209,7 @@ SPEC = FitSpec(
     results=TABLE_COLUMNS,
     columns=_HEADLINE,
     summarize=summarize_by({}),
-    plots=plots,
+    plots=_plots,
     title=lambda runs: "alignments",
     joins=True,
     describe=_describe,

@@ -97,8 +97,7 @@ def naming_row(row: int, source: str, observation: Observation | None) -> Row:
 
 def result_row(result: Result) -> Row:
     """The cells of a result."""
-    pose, std = result.alignment, result.std
-    warnings = result.warnings
+    pose, std, warnings = result.alignment, result.std, result.warnings
     row: Row = {
         "status": OK,
         "reason": "",
@@ -116,12 +115,14 @@ def result_row(result: Result) -> Row:
         "residuals": result.residuals.ravel().tolist(),
         "is_inlier": result.inliers.tolist(),
     }
-    quaternion = quat_wxyz_from_rotation(pose.rotation)
-    row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion.tolist(), strict=True)}
-    row |= _by_axis("t{}", pose.translation) | _by_axis("scale_{}", pose.scale)
+    by_axis: dict[str, Any] = {"t{}": pose.translation, "scale_{}": pose.scale}
     if std is not None:
-        row |= _by_axis("t{}_std", std.translation) | _by_axis("scale_{}_std", std.scale)
+        by_axis |= {"t{}_std": std.translation, "scale_{}_std": std.scale}
         row |= {"rotation_std_deg": std.rotation_deg, "focal_length_std": std.focal}
+    for name, values in by_axis.items():
+        row |= {name.format(axis): float(each) for axis, each in zip(_AXES, values, strict=True)}
+    quaternion = quat_wxyz_from_rotation(pose.rotation).tolist()
+    row |= {f"q{axis}": value for axis, value in zip("wxyz", quaternion, strict=True)}
     if result.covariance is not None:
         row["covariance"] = result.covariance.ravel().tolist()
     if isinstance(result.model, ShapeModel):
@@ -166,10 +167,6 @@ def _one_sigma(result: Result) -> float | None:
         return float(result.sigma)
     given: Any = None if result.options is None else result.options.sigma
     return None if given is None or np.ndim(given) else float(given)
-
-
-def _by_axis(name: str, values: Any) -> Row:
-    return {name.format(axis): float(value) for axis, value in zip(_AXES, values, strict=True)}
 
 
 def read_rows(folder: RunFolder) -> list[Row]:

@@ -89,7 +89,7 @@ class TrackCommand(CameraOptions):
                 min_score=self.min_score,
             )
         if video is not None:
-            from cadalign.batch.track_video import require_size
+            from cadalign.batch.tracks import require_size
 
             folders = {str(Path(image).parent) for each in tracks for image in each.images if image}
             if len(folders) > 1:
@@ -171,8 +171,7 @@ class TrackCommand(CameraOptions):
         failures: Mapping[str, str],
         video: Video | None,
     ) -> None:
-        from cadalign.batch.track_video import draw_video, moving_object
-        from cadalign.batch.tracks import COLUMNS, rows_of
+        from cadalign.batch.tracks import COLUMNS, draw_video, moving_object, rows_of
         from cadalign.evaluation.runs.tables import write_rows
         from cadalign.export.camera_files import write_kitti, write_tum
         from cadalign.export.glb import write_moving_glb

@@ -13,7 +13,6 @@ from cadalign.arrays import FloatArray, as_floats, as_points, as_positive
 from cadalign.datasets.photos.formats import PHOTO_FORMATS, write_photos
 from cadalign.datasets.photos.photo import (
     CadModel,
-    LoadedModel,
     NamedPoints,
     Photo,
     PhotoKeypoints,
@@ -221,7 +220,8 @@ def photos_of(
     names = tuple(str(name) for name in exported.ids)
     model = CadModel(
         exported.name,
-        LoadedModel(exported.mesh, NamedPoints(names, exported.points_3d)),
+        exported.mesh,
+        NamedPoints(names, exported.points_3d),
         bounds=exported.bounds if exported.mesh or names else None,
     )
     photos = []

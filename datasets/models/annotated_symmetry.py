@@ -59,8 +59,12 @@ def rotations_of(xyz: FloatArray, symmetries: Symmetries) -> FoundRotations:
     if revolution is not None:
         center, axis = revolution
         return FoundRotations(center, np.eye(3)[None], axis)
-    center = xyz.mean(axis=0)
-    kept = _map_onto_themselves(xyz - center, _equivalent(len(xyz), symmetries), tolerance)
+    from cadalign.datasets.models.rotated_onto import rotations_onto_themselves  # compiled
+
+    center, equivalent = xyz.mean(axis=0), _equivalent(len(xyz), symmetries)
+    shifted = np.ascontiguousarray(xyz - center)
+    most = tolerance**2, _OF_WAY**2
+    kept = rotations_onto_themselves(shifted, equivalent, _candidates(), *most)
     if not kept.any():
         return trivial
     return FoundRotations(center, np.concatenate([np.eye(3)[None], _candidates()[kept]]))
@@ -117,15 +121,4 @@ def _candidates() -> FloatArray:
     turns = sorted({k / fold for fold in _FOLDS for k in range(1, fold)})
     return np.array(
         [rotation_from_vector(2 * np.pi * t * axis) for axis in np.eye(3) for t in turns]
-    )
-
-
-def _map_onto_themselves(
-    centered: FloatArray, equivalent: BoolArray, tolerance: float
-) -> BoolArray:
-    """Mask (g,) of the candidates that are symmetries."""
-    from cadalign.datasets.models.rotated_onto import rotations_onto_themselves  # compiled
-
-    return rotations_onto_themselves(
-        np.ascontiguousarray(centered), equivalent, _candidates(), tolerance**2, _OF_WAY**2
     )

@@ -12,7 +12,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import overload
 
 import numpy as np
 
@@ -86,17 +86,11 @@ class AnnotatedModel:
         """
         where = f"{self.category}, model {self.model_id}"
         if self.mesh_path is None:
-            raise DataError(
-                "there is no mesh of this model",
-                where=where,
-                fix="get KeypointNet's ShapeNetCore.v2.ply, or give shapenet_root",
-            )
+            fix = "get KeypointNet's ShapeNetCore.v2.ply, or give shapenet_root"
+            raise DataError("there is no mesh of this model", where=where, fix=fix)
         mesh = load_mesh(self.mesh_path)
-        if check:
-            self._check_match(mesh, where)
-        return mesh
-
-    def _check_match(self, mesh: Mesh, where: str) -> None:
+        if not check:
+            return mesh
         fix = "is the mesh ShapeNetCore.v2's? check=False loads it all the same"
         try:
             rebuilt = self.keypoints.on_mesh(mesh)
@@ -113,14 +107,11 @@ class AnnotatedModel:
                 where=where,
                 fix=fix,
             )
+        return mesh
 
 
-class _Category(NamedTuple):
-    """One category's models: annotated ones, why others could not be read, all in file order."""
-
-    models: dict[str, AnnotatedModel]
-    problems: dict[str, DataError]
-    order: list[str]
+# One category's models, or why one could not be read, by id in file order.
+_Models = dict[str, AnnotatedModel | DataError]
 
 
 class KeypointNet:
@@ -233,21 +224,16 @@ class KeypointNet:
         An entry without a model id goes by its position: ``("chair", "#17")``.
         """
         names = self.categories if category is None else (self._require(category),)
-        return tuple(
-            (name, model_id)
-            for name in names
-            for model_id in self._source.load(name).order
-            if self._has(name, model_id)
-        )
+        return tuple((name, model_id) for name in names for model_id in self._models(name))
 
     @property
     def problems(self) -> dict[ModelKey, DataError]:
         """Errors of the models that could not be read, by (category, model id)."""
         return {
-            (name, model_id): error
+            (name, model_id): found
             for name in self.categories
-            for model_id, error in self._source.load(name).problems.items()
-            if self._has(name, model_id)
+            for model_id, found in self._models(name).items()
+            if isinstance(found, DataError)
         }
 
     def mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
@@ -268,18 +254,17 @@ class KeypointNet:
         DataError
             If the category's file, or that model's annotation, is malformed.
         """
-        if isinstance(key, tuple):
-            name, model_id = self._require(key[0]), key[1]
-            loaded = self._source.load(name)
-            if model_id in loaded.problems:
-                # A copy: the raised one keeps the frames that it passes through alive.
-                raise copy.copy(loaded.problems[model_id])
-            if model_id not in loaded.models or not self._has(name, model_id):
-                raise InputError(f"no model {model_id!r} of {name!r}", where=str(self.root))
-            return loaded.models[model_id]
-        name = self._require(key)
-        models = self._source.load(name).models.items()
-        return tuple(model for model_id, model in models if self._has(name, model_id))
+        if not isinstance(key, tuple):
+            models = self._models(self._require(key)).values()
+            return tuple(model for model in models if isinstance(model, AnnotatedModel))
+        name, model_id = self._require(key[0]), key[1]
+        found = self._source.load(name).get(model_id)
+        if isinstance(found, DataError):
+            # A copy: the raised one keeps the frames that it passes through alive.
+            raise copy.copy(found)
+        if found is None or not self._has(name, model_id):
+            raise InputError(f"no model {model_id!r} of {name!r}", where=str(self.root))
+        return found
 
     def __iter__(self) -> Iterator[AnnotatedModel]:
         for category in self.categories:
@@ -294,6 +279,10 @@ class KeypointNet:
     def _require(self, category: str) -> str:
         return require_category(category, self.categories, where=str(self.root))
 
+    def _models(self, category: str) -> _Models:
+        models = self._source.load(category).items()
+        return {model_id: found for model_id, found in models if self._has(category, model_id)}
+
     def _has(self, category: str, model_id: str) -> bool:
         if self._allowed is not None and (category, model_id) not in self._allowed:
             return False
@@ -305,53 +294,45 @@ class _Source:
 
     def __init__(self, root: Path, locator: MeshLocator) -> None:
         self._locator = locator
-        self._loaded: dict[str, _Category] = {}
+        self._loaded: dict[str, _Models] = {}
         folder = root / "annotations"
         self._files = {path.stem: path for path in folder.glob("*.json") if path.stem != _ALL}
         if not self._files:
-            single = [folder / f"{_ALL}.json", root / f"{_ALL}.json", root / "keypointnet.json"]
-            found = [path for path in single if path.is_file()]
-            if not found:
-                raise DataError(
-                    "no annotations/*.json below it",
-                    where=str(root),
-                    fix="give the folder that holds KeypointNet's annotations/ and splits/",
-                )
-            self._read_single(found[0])
+            single = (folder / f"{_ALL}.json", root / f"{_ALL}.json", root / "keypointnet.json")
+            path = next(filter(Path.is_file, single), None)
+            if path is None:
+                fix = "give the folder that holds KeypointNet's annotations/ and splits/"
+                raise DataError("no annotations/*.json below it", where=str(root), fix=fix)
+            # Entries of all categories are told apart by their class id.
+            grouped: dict[str, list[tuple[int, object]]] = {}
+            for position, entry in enumerate(read_entries(path)):
+                class_id = entry.get("class_id") if isinstance(entry, dict) else None
+                name = name_of_synset(class_id) if isinstance(class_id, str) else "unknown"
+                grouped.setdefault(name, []).append((position, entry))
+            self._loaded = {name: self._build(name, path, found) for name, found in grouped.items()}
         self.categories = tuple(sorted({*self._files, *self._loaded}))
 
-    def load(self, category: str) -> _Category:
+    def load(self, category: str) -> _Models:
         if category not in self._loaded:
             path = self._files[category]
-            entries = list(enumerate(read_entries(path)))
-            self._loaded[category] = self._build(category, path, entries)
+            self._loaded[category] = self._build(category, path, enumerate(read_entries(path)))
         return self._loaded[category]
 
     def mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
         """All mesh files of a model, also of a malformed one."""
-        model = self.load(category).models.get(model_id)
-        synset = synset_of_name(category) if model is None else model.class_id
+        model = self.load(category).get(model_id)
+        synset = synset_of_name(category)
+        if isinstance(model, AnnotatedModel):
+            synset = model.class_id
         return self._locator.paths(synset, model_id)
 
-    def _read_single(self, path: Path) -> None:
-        """Read the file of all categories; entries are told apart by their class id."""
-        grouped: dict[str, list[tuple[int, object]]] = {}
-        for position, entry in enumerate(read_entries(path)):
-            class_id = entry.get("class_id") if isinstance(entry, dict) else None
-            name = name_of_synset(class_id) if isinstance(class_id, str) else "unknown"
-            grouped.setdefault(name, []).append((position, entry))
-        for name, entries in grouped.items():
-            self._loaded[name] = self._build(name, path, entries)
-
-    def _build(self, category: str, path: Path, entries: list[tuple[int, object]]) -> _Category:
-        models: dict[str, AnnotatedModel] = {}
-        problems: dict[str, DataError] = {}
-        order = []
+    def _build(self, category: str, path: Path, entries: Iterable[tuple[int, object]]) -> _Models:
+        models: _Models = {}
         for position, entry in entries:
             model_id = entry_id(entry, position)
             where = f"{path.name}, model {model_id}"
             try:
-                if model_id in models or model_id in problems:
+                if model_id in models:
                     model_id = f"{model_id}#{position}"
                     raise DataError("the model occurs twice", where=where, fix="remove one entry")
                 annotation = parse_entry(entry, where=where)
@@ -360,9 +341,8 @@ class _Source:
                 models[model_id] = AnnotatedModel(category, *annotation, mesh_path)
             except DataError as error:
                 logger.warning("left out: %s", error)
-                problems[model_id] = error.with_traceback(None)
-            order.append(model_id)
-        return _Category(models, problems, order)
+                models[model_id] = error.with_traceback(None)
+        return models
 
 
 def _read_split(path: Path) -> frozenset[ModelKey]:

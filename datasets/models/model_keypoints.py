@@ -158,18 +158,13 @@ class ModelKeypoints:
     def _of_keypoints(
         cls, annotated: Keypoints, model: Path | None, names: Mapping[int, str]
     ) -> ModelKeypoints:
-        rows = zip(
-            annotated.ids.tolist(),
-            annotated.xyz.tolist(),
-            annotated.face_index.tolist(),
-            annotated.barycentric.tolist(),
-            strict=True,
-        )
+        columns = annotated.xyz, annotated.ids, annotated.face_index, annotated.barycentric
+        rows = zip(*(column.tolist() for column in columns), strict=True)
         keypoints = (
-            (names.get(number, f"keypoint {number}"), tuple(xyz), number, face, tuple(weights))
-            for number, xyz, face, weights in rows
+            ModelKeypoint(names.get(k, f"keypoint {k}"), tuple(xyz), k, face, tuple(weights))
+            for xyz, k, face, weights in rows
         )
-        return cls(tuple(ModelKeypoint(*fields) for fields in keypoints), model)
+        return cls(tuple(keypoints), model)
 
     @classmethod
     def load(
@@ -229,18 +224,20 @@ class ModelKeypoints:
                 raise DataError(f"{quote(data.get(name))} is not {wanted!r}", where=name, fix=fix)
         read: _File = convert(data, _File)
         model = None if read.model is None else path_from(read.model, folder)
-        floating = [row for row, entry in enumerate(read.keypoints) if entry.xyz is None]
-        if floating and mesh is None:
-            if model is None:
-                raise DataError(
-                    "neither xyz nor a model that the face belongs to",
-                    where=f"keypoints[{floating[0]}]",
-                    fix="give xyz, or name the mesh file under model",
-                )
-            mesh = load_mesh(model)
-        return cls(
-            tuple(_keypoint(entry, row, mesh) for row, entry in enumerate(read.keypoints)), model
-        )
+        keypoints = []
+        for row, entry in enumerate(read.keypoints):
+            xyz = entry.xyz
+            if xyz is None:
+                if mesh is None:
+                    if model is None:
+                        what = "neither xyz nor a model that the face belongs to"
+                        fix = "give xyz, or name the mesh file under model"
+                        raise DataError(what, where=f"keypoints[{row}]", fix=fix)
+                    mesh = load_mesh(model)
+                xyz = _on_face(mesh, entry, f"keypoints[{row}].face_index")
+            face = entry.face_index, entry.barycentric
+            keypoints.append(ModelKeypoint(entry.name, xyz, entry.semantic_id, *face))
+        return cls(tuple(keypoints), model)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a file of model keypoints; the model's path is written relative to it.
@@ -261,26 +258,17 @@ class ModelKeypoints:
         return data
 
 
-def _keypoint(entry: _Entry, row: int, mesh: Mesh | None) -> ModelKeypoint:
-    """The keypoint of an entry; one without ``xyz`` lies on the mesh."""
-    xyz = entry.xyz
-    if xyz is None and mesh and entry.face_index is not None and entry.barycentric is not None:
-        try:
-            (place,) = mesh.surface_points([entry.face_index], [entry.barycentric])
-        except CadalignError as error:
-            raise DataError(error.what, where=f"keypoints[{row}].face_index") from None
-        xyz = tuple(place.tolist())
-    return ModelKeypoint(
-        name=entry.name,
-        xyz=xyz or (0.0, 0.0, 0.0),
-        semantic_id=entry.semantic_id,
-        face_index=entry.face_index,
-        barycentric=entry.barycentric,
-    )
+def _on_face(mesh: Mesh, entry: _Entry, where: str) -> tuple[float, float, float]:
+    """The point on the mesh where the entry's face and barycentric coordinates place it."""
+    try:
+        place = mesh.surface_points(np.array([entry.face_index]), np.array([entry.barycentric]))
+    except CadalignError as error:
+        raise DataError(error.what, where=where) from None
+    x, y, z = place[0].tolist()
+    return x, y, z
 
 
 def _written(keypoint: ModelKeypoint) -> dict[str, Any]:
-    """The entry of one keypoint in the file."""
     data: dict[str, Any] = {"name": keypoint.name, "xyz": list(keypoint.xyz)}
     if keypoint.semantic_id is not None:
         data["semantic_id"] = keypoint.semantic_id

@@ -12,14 +12,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from msgspec import Raw
 
+from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.bop_files import (
     TRUTH,
     BopModels,
+    Estimates,
     Nine,
     ScenePose,
     object_name,
@@ -30,7 +32,6 @@ from cadalign.datasets.photos.bop_files import (
     write_scene_gt,
 )
 from cadalign.datasets.photos.dataset import (
-    Estimates,
     PhotoDataset,
     PhotoFormat,
     PoseEstimate,
@@ -68,7 +69,7 @@ MILLIMETRES = 1e-3
 _CAMERAS = "scene_camera.json"
 _INFO = "scene_gt_info.json"
 _CAMERA = "camera.json"
-_COLOR_FOLDERS = ("rgb", "gray")
+_MASK_FOLDERS = ("mask_visib", "mask")
 _MOST_DIGITS = 18
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif")
 _WRITTEN_SCENE = Path("test", "000001")
@@ -77,6 +78,12 @@ _WRITTEN_SCENE = Path("test", "000001")
 class _Info(ForeignDocument):
     bbox_obj: tuple[Finite, Finite, Finite, Finite] | None = None
     visib_fract: Finite | None = None
+
+    def bbox(self) -> FloatArray | None:
+        if self.bbox_obj is None or min(self.bbox_obj[2:]) <= 0:
+            return None
+        left, top, width, height = self.bbox_obj
+        return np.array([left, top, left + width, top + height])
 
 
 class _FrameCamera(ForeignDocument):
@@ -105,6 +112,33 @@ class _Scene:
     cameras: dict[str, Raw]
     info: dict[str, Raw]
     common: _SceneCamera | None
+
+    @classmethod
+    def read(cls, folder: Path) -> _Scene:
+        paths = folder / _CAMERAS, folder / _INFO
+        cameras, info = (read_table(path) if path.is_file() else {} for path in paths)
+        return cls(folder, read_table(folder / TRUTH), cameras, info, _common_camera(folder))
+
+    def camera(self, key: str, image: Path | None) -> tuple[Camera | None, float]:
+        """The photo's camera, None where its size is not known; and the depth's scale."""
+        common = self.common
+        size = photo_size(image) if image is not None else None
+        if size is None and common is not None and common.width and common.height:
+            size = int(common.width), int(common.height)
+        if key in self.cameras:
+            path = self.folder / _CAMERAS
+            found: _FrameCamera = parse(self.cameras[key], _FrameCamera, path=path, where=key)
+            k = found.cam_K
+            values, scale = (k[0], k[4], k[2], k[5]), found.depth_scale
+        elif common is not None:
+            values, scale = (common.fx, common.fy, common.cx, common.cy), common.depth_scale
+        else:
+            what = f"no camera of photo {key}: neither {_CAMERAS} nor {_CAMERA} has it"
+            raise DataError(what, where=str(self.folder))
+        if size is None:
+            return None, scale
+        with in_file(f"{self.folder}, camera of photo {key}"):
+            return Camera(*size, *values), scale
 
 
 class Bop(PhotoDataset):
@@ -141,11 +175,9 @@ class Bop(PhotoDataset):
         folder = Path(root)
         scenes = tuple(find_scenes(folder))
         if not scenes:
-            raise DataError(
-                f"there is no {TRUTH} in this folder, nor one or two below",
-                where=str(folder),
-                fix="give a BOP data set, one of its splits, or a scene",
-            )
+            what = f"there is no {TRUTH} in this folder, nor one or two below"
+            fix = "give a BOP data set, one of its splits, or a scene"
+            raise DataError(what, where=str(folder), fix=fix)
         self._photos: list[tuple[Path, str]] = []
         names, bad = [], {}
         for scene in scenes:
@@ -170,26 +202,36 @@ class Bop(PhotoDataset):
         folder, key = self._photos[index]
         # Photos come scene by scene; tables and models of one scene are kept.
         if self._scene is None or self._scene.folder != folder:
-            self._scene = _read_scene(folder)
+            self._scene = _Scene.read(folder)
             models = BopModels.find(folder)
             if self._models != models:
                 self._models, self._known = models, {}
         scene = self._scene
-        image = _image(folder, _COLOR_FOLDERS, key)
-        camera, depth_scale = _camera(scene, key, image)
+        image = _image(folder, ("rgb", "gray"), key)
+        camera, depth_scale = scene.camera(key, image)
         poses: list[Any] = parse(scene.truth[key], list[Any], path=folder / TRUTH, where=key)
         infos: list[_Info] = []
         if key in scene.info:
             infos = parse(scene.info[key], list[_Info], path=folder / _INFO, where=key)
 
-        def read_object(number: int, pose: Any) -> PhotoObject:
-            checked: ScenePose = convert(pose, ScenePose)
-            found = _object(number, checked, *self._model(checked.obj_id))
-            if number < len(infos):
-                found = _with_info(found, infos[number])
-            name = f"{int(key):06d}_{number:06d}.png"
-            masks = (folder / kind / name for kind in ("mask_visib", "mask"))
-            return replace(found, mask_path=first_existing(masks))
+        def read_object(number: int, entry: Any) -> PhotoObject:
+            pose: ScenePose = convert(entry, ScenePose)
+            model, symmetry = self._model(pose.obj_id)
+            alignment, box = pose.alignment(), None
+            if model is not None and model.bounds is not None:
+                box = Box.from_model(model.bounds, alignment)
+            info = infos[number] if number < len(infos) else _Info()
+            masks = (folder / kind / f"{int(key):06d}_{number:06d}.png" for kind in _MASK_FOLDERS)
+            return PhotoObject(
+                object_id=str(number),
+                category=object_name(pose.obj_id),
+                truth=Truth(cam_from_model=alignment, box=box, metres=MILLIMETRES),
+                model=model,
+                symmetry=symmetry,
+                mask_path=first_existing(masks),
+                bbox=info.bbox(),
+                visible_fraction=info.visib_fract,
+            )
 
         objects, problems = read_each(poses, read_object, where=f"{folder / TRUTH}, {key}")
         depth_path = _image(folder, ("depth",), key)
@@ -209,7 +251,7 @@ class Bop(PhotoDataset):
         if self._models is None:
             return None, Symmetry.none()
         if obj_id not in self._known:
-            self._known[obj_id] = self._models.model(obj_id), self._models.symmetry(obj_id)
+            self._known[obj_id] = self._models.model(obj_id)
         return self._known[obj_id]
 
 
@@ -222,41 +264,11 @@ def find_scenes(folder: Path) -> Iterator[Path]:
         yield from sorted(path.parent for path in folder.glob(f"{pattern}/{TRUTH}"))
 
 
-def _read_scene(folder: Path) -> _Scene:
-    tables = {name: folder / name for name in (_CAMERAS, _INFO)}
-    found = {name: read_table(path) if path.is_file() else {} for name, path in tables.items()}
-    common = _common_camera(folder)
-    return _Scene(folder, read_table(folder / TRUTH), found[_CAMERAS], found[_INFO], common)
-
-
 def _image(folder: Path, kinds: tuple[str, ...], key: str) -> Path | None:
     if not key.isdecimal() or len(key) > _MOST_DIGITS:
         raise DataError(f"{quote(key)} is not the number of an image", where=str(folder / TRUTH))
     name = f"{int(key):06d}"
     return first_existing(folder / kind / f"{name}{end}" for kind in kinds for end in _IMAGES)
-
-
-def _camera(scene: _Scene, key: str, image: Path | None) -> tuple[Camera | None, float]:
-    """The photo's camera, None where its size is not known; and the depth's scale."""
-    common = scene.common
-    size = photo_size(image) if image is not None else None
-    if size is None and common is not None and common.width and common.height:
-        size = int(common.width), int(common.height)
-    if key in scene.cameras:
-        found = parse(scene.cameras[key], _FrameCamera, path=scene.folder / _CAMERAS, where=key)
-        k = found.cam_K
-        values, scale = (k[0], k[4], k[2], k[5]), found.depth_scale
-    elif common is not None:
-        values, scale = (common.fx, common.fy, common.cx, common.cy), common.depth_scale
-    else:
-        raise DataError(
-            f"no camera of photo {key}: neither {_CAMERAS} nor {_CAMERA} has it",
-            where=str(scene.folder),
-        )
-    if size is None:
-        return None, scale
-    with in_file(f"{scene.folder}, camera of photo {key}"):
-        return Camera(*size, *values), scale
 
 
 def _common_camera(folder: Path) -> _SceneCamera | None:
@@ -269,30 +281,6 @@ def _common_camera(folder: Path) -> _SceneCamera | None:
                 found: _SceneCamera = convert(data, _SceneCamera)
             return found
     return None
-
-
-def _object(
-    number: int, pose: ScenePose, model: CadModel | None, symmetry: Symmetry
-) -> PhotoObject:
-    alignment = pose.alignment()
-    box = None
-    if model is not None and model.bounds is not None:
-        box = Box.from_model(model.bounds, alignment)
-    return PhotoObject(
-        object_id=str(number),
-        category=object_name(pose.obj_id),
-        truth=Truth(cam_from_model=alignment, box=box, metres=MILLIMETRES),
-        model=model,
-        symmetry=symmetry,
-    )
-
-
-def _with_info(found: PhotoObject, info: _Info) -> PhotoObject:
-    bbox = None
-    if info.bbox_obj is not None and min(info.bbox_obj[2:]) > 0:
-        left, top, width, height = info.bbox_obj
-        bbox = np.array([left, top, left + width, top + height])
-    return replace(found, bbox=bbox, visible_fraction=info.visib_fract)
 
 
 class _Poses(PoseFile):
@@ -335,38 +323,29 @@ def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> lis
     Each object has a model of its own, ``obj_000001`` and so on: poses have no stretch. Returns
     why objects were left out.
     """
-    scene = folder / _WRITTEN_SCENE
     entries, problems = converted(numbered, partial(_written, folder))
-    write_models_info(folder, {int(each.pose.model_id): each.model for each in entries})
-    cameras = {each.pose.image: each.camera for each in entries}
-    write_scene(scene, [each.pose for each in entries], cameras)
-    write_json(scene / _INFO, {each.pose.image: [each.info] for each in entries})
+    poses = [pose for pose, *_ in entries]
+    write_models_info(folder, {int(pose.model_id): model for pose, _, model, _ in entries})
+    cameras = {pose.image: camera for pose, camera, *_ in entries}
+    write_scene(folder / _WRITTEN_SCENE, poses, cameras)
+    write_json(folder / _WRITTEN_SCENE / _INFO, {pose.image: [info] for pose, *_, info in entries})
     return problems
 
 
-class _Written(NamedTuple):
-    """A written object in the tables of a scene."""
-
-    pose: PoseEstimate
-    camera: Camera
-    model: dict[str, float]
-    info: dict[str, list[float]]
-
-
-def _written(folder: Path, number: int, placed: PlacedObject) -> _Written:
+def _written(
+    folder: Path, number: int, placed: PlacedObject
+) -> tuple[PoseEstimate, Camera, dict[str, float], dict[str, list[float]]]:
+    """An object's pose and camera, and its entries in the tables of models and of objects."""
     placed.require_plain_camera("BOP")
-    scene, image, model_id = folder / _WRITTEN_SCENE, str(number), number + 1
+    scene, model_id = folder / _WRITTEN_SCENE, number + 1
     left, top, right, bottom = placed.bbox.tolist()
     mesh = placed.mesh.stretched(placed.scale / MILLIMETRES)
     placed.copy_image(scene / "rgb" / f"{number:06d}")
     placed.write_mask(scene / "mask_visib" / f"{number:06d}_000000.png")
     pose = replace(placed.pose, translation=placed.pose.translation / MILLIMETRES)
-    return _Written(
-        PoseEstimate("1", image, str(model_id), pose),
-        placed.camera,
-        write_model(folder, mesh, model_id),
-        {"bbox_obj": [left, top, right - left, bottom - top]},
-    )
+    estimate = PoseEstimate("1", str(number), str(model_id), pose)
+    info = {"bbox_obj": [left, top, right - left, bottom - top]}
+    return estimate, placed.camera, write_model(folder, mesh, model_id), info
 
 
 def write_scene(folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, Camera]) -> None:

@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import Estimates, PoseEstimate
-from cadalign.datasets.photos.photo import CadModel, ModelFiles, existing
+from cadalign.datasets.photos.dataset import PoseEstimate
+from cadalign.datasets.photos.photo import CadModel, existing
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
@@ -67,6 +67,14 @@ class ScenePose(ForeignDocument):
 # Poses -----------------------------------------------------------------------------------------
 
 
+class Estimates(NamedTuple):
+    """The poses in a result file, and why some of its records could not be read."""
+
+    path: Path
+    poses: tuple[PoseEstimate, ...]
+    problems: tuple[DataError, ...]
+
+
 def object_name(number: int) -> str:
     """The name of a model's files, as ``obj_000001``."""
     return f"obj_{number:06d}"
@@ -83,33 +91,22 @@ def write_bop_results(path: Path, poses: Iterable[PoseEstimate]) -> None:
     writer.writerow(RESULT_COLUMNS)
     for number, each in enumerate(poses):
         rotation, translation = _rigid(each, number)
-        writer.writerow(
-            [
-                _number(each.scene or "0", f"poses[{number}].scene"),
-                _number(each.image, f"poses[{number}].image"),
-                _object_number(each.model_id, f"poses[{number}].model_id"),
-                f"{each.score:.17g}",
-                _blank_separated(rotation),
-                _blank_separated(translation),
-                f"{_UNKNOWN_TIME if each.seconds is None else each.seconds:.17g}",
-            ]
-        )
+        ids = _numbers(replace(each, scene=each.scene or "0"), number, "scene", "image", "model_id")
+        seconds = _UNKNOWN_TIME if each.seconds is None else each.seconds
+        numbers = (" ".join(f"{x:.17g}" for x in values) for values in (rotation, translation))
+        writer.writerow([*ids, f"{each.score:.17g}", *numbers, f"{seconds:.17g}"])
     write_text(path, text.getvalue())
 
 
 def write_scene_gt(path: Path, poses: Iterable[PoseEstimate]) -> None:
     """Write poses of one scene as ``scene_gt.json``; see `write_bop_results`."""
-    table: dict[str, list[dict[str, Any]]] = {}
+    table: dict[int, list[dict[str, Any]]] = {}
     for number, each in enumerate(poses):
         rotation, translation = _rigid(each, number)
-        entry = {
-            "cam_R_m2c": rotation.tolist(),
-            "cam_t_m2c": translation.tolist(),
-            "obj_id": _object_number(each.model_id, f"poses[{number}].model_id"),
-        }
-        image = str(_number(each.image, f"poses[{number}].image"))
-        table.setdefault(image, []).append(entry)
-    write_json(path, dict(sorted(table.items(), key=lambda item: int(item[0]))))
+        obj_id, image = _numbers(each, number, "model_id", "image")
+        pose = {"cam_R_m2c": rotation.tolist(), "cam_t_m2c": translation.tolist()}
+        table.setdefault(image, []).append({**pose, "obj_id": obj_id})
+    write_json(path, {str(image): table[image] for image in sorted(table)})
 
 
 def read_bop_results(path: Path) -> Estimates:
@@ -117,8 +114,7 @@ def read_bop_results(path: Path) -> Estimates:
 
     Raises DataError if the file cannot be read, or is not such a file.
     """
-    text = read_text(path)
-    rows = list(csv.reader(io.StringIO(text)))
+    rows = list(csv.reader(io.StringIO(read_text(path))))
     if not rows or tuple(cell.strip() for cell in rows[0]) != RESULT_COLUMNS:
         what = f"the first line is not {','.join(RESULT_COLUMNS)}"
         fix = "give a CSV file of results as the BOP challenge takes it"
@@ -132,9 +128,7 @@ def read_bop_results(path: Path) -> Estimates:
         except (CadalignError, ValueError) as error:
             what = error.what if isinstance(error, CadalignError) else brief(error)
             problems.append(DataError(what, where=f"{path}, line {line}"))
-    if problems and not poses:
-        raise problems[0]
-    return Estimates(path, tuple(poses), tuple(problems))
+    return _estimates(path, poses, problems)
 
 
 def read_scene_gt(path: Path) -> Estimates:
@@ -145,19 +139,23 @@ def read_scene_gt(path: Path) -> Estimates:
     Raises DataError if the file cannot be read, or is not such a file.
     """
     table = read_json(path)
-    is_table = isinstance(table, dict) and all(isinstance(each, list) for each in table.values())
-    if not is_table:
+    if not (isinstance(table, dict) and all(isinstance(each, list) for each in table.values())):
         what = "is not a table of lists of poses by the images' numbers"
         raise DataError(what, where=str(path), fix=f"give a file such as BOP's {TRUTH}")
     scene = str(int(path.parent.name)) if path.parent.name.isdecimal() else ""
     poses, problems = [], []
-    entries = [(image, *each) for image, found in table.items() for each in enumerate(found)]
-    for image, row, entry in entries:
+    for image, row, entry in (
+        (i, *each) for i, found in table.items() for each in enumerate(found)
+    ):
         try:
             with in_file(path):
                 poses.append(_pose_of_entry(entry, scene, image, f"{image}[{row}]"))
-        except CadalignError as error:
-            problems.append(DataError(error.what, where=error.where, fix=error.fix))
+        except DataError as error:
+            problems.append(error)
+    return _estimates(path, poses, problems)
+
+
+def _estimates(path: Path, poses: list[PoseEstimate], problems: list[DataError]) -> Estimates:
     if problems and not poses:
         raise problems[0]
     return Estimates(path, tuple(poses), tuple(problems))
@@ -175,17 +173,11 @@ def _pose_of_row(row: list[str]) -> PoseEstimate:
     if len(row) != len(RESULT_COLUMNS):
         raise InputError(f"{len(row)} cells, expected {len(RESULT_COLUMNS)}")
     cells = dict(zip(RESULT_COLUMNS, (cell.strip() for cell in row), strict=True))
-    ids = [_number(cells[name], name) for name in ("scene_id", "im_id", "obj_id")]
+    scene, image, number = (_number(cells[name], name) for name in RESULT_COLUMNS[:3])
     score, seconds = _floats(cells["score"], 1, "score")[0], _floats(cells["time"], 1, "time")[0]
-    alignment = _alignment(_floats(cells["R"], 9, "R"), _floats(cells["t"], 3, "t"))
-    return PoseEstimate(
-        scene=str(ids[0]),
-        image=str(ids[1]),
-        model_id=object_name(ids[2]),
-        cam_from_model=alignment,
-        score=float(score),
-        seconds=None if seconds < 0 else float(seconds),
-    )
+    pose = _alignment(_floats(cells["R"], 9, "R"), _floats(cells["t"], 3, "t"))
+    time = None if seconds < 0 else float(seconds)
+    return PoseEstimate(str(scene), str(image), object_name(number), pose, float(score), time)
 
 
 def _floats(text: str, count: int, name: str) -> FloatArray:
@@ -206,16 +198,11 @@ def _alignment(rotation: FloatArray, translation: FloatArray) -> Alignment:
 def _rigid(each: PoseEstimate, number: int) -> tuple[FloatArray, FloatArray]:
     pose = each.cam_from_model
     if np.abs(pose.scale - 1).max() > 1e-12:
-        what = (
-            f"the pose has the stretch {pose.scale.tolist()}, which BOP's files have no place for"
-        )
+        scale = pose.scale.tolist()
+        what = f"the pose has the stretch {scale}, which BOP's files have no place for"
         fix = "stretch the mesh, write that, and give the pose with scale 1"
         raise InputError(what, where=f"poses[{number}]", fix=fix)
     return pose.rotation.ravel(), pose.translation
-
-
-def _blank_separated(values: FloatArray) -> str:
-    return " ".join(f"{value:.17g}" for value in values)
 
 
 def _number(text: str, where: str) -> int:
@@ -225,8 +212,12 @@ def _number(text: str, where: str) -> int:
     return int(text)
 
 
-def _object_number(name: str, where: str) -> int:
-    return _number(name.removeprefix("obj_"), where)
+def _numbers(pose: PoseEstimate, number: int, *fields: str) -> Iterator[int]:
+    """The ids of a pose as numbers."""
+    for field in fields:
+        text = getattr(pose, field)
+        text = text.removeprefix("obj_") if field == "model_id" else text
+        yield _number(text, f"poses[{number}].{field}")
 
 
 # Models ----------------------------------------------------------------------------------------
@@ -283,45 +274,27 @@ class BopModels:
 
         Raises DataError if ``models_info.json`` cannot be read.
         """
-        for place in (scene, *scene.parents[:_LEVELS]):
-            for name in _MODEL_FOLDERS:
-                folder = place / name
-                if not folder.is_dir():
-                    continue
-                path = folder / _MODELS_INFO
-                if not path.is_file():
-                    return cls(folder, {})
-                with in_file(path):
-                    return cls(folder, convert(read_json(path), dict[str, Any]))
-        return None
+        places = (scene, *scene.parents[:_LEVELS])
+        folders = (place / name for place in places for name in _MODEL_FOLDERS)
+        folder = next(filter(Path.is_dir, folders), None)
+        if folder is None:
+            return None
+        path = folder / _MODELS_INFO
+        with in_file(path):
+            return cls(folder, convert(read_json(path), dict[str, Any]) if path.is_file() else {})
 
-    def model(self, obj_id: int) -> CadModel:
-        """The CAD model of an id; its mesh is None where the file is missing."""
-        name = object_name(obj_id)
-        info = self._entry(obj_id)
-        return CadModel(
-            name,
-            ModelFiles(existing(self.folder / f"{name}.ply")),
-            bounds=info.bounds(),
-            diameter=info.diameter,
-        )
-
-    def symmetry(self, obj_id: int) -> Symmetry:
-        """The symmetries of a model.
+    def model(self, obj_id: int) -> tuple[CadModel, Symmetry]:
+        """The CAD model of an id, its mesh None where the file is missing, and its symmetries.
 
         Raises DataError if a motion is not rigid, or an axis has no direction.
         """
-        with in_file(self.folder / _MODELS_INFO), within(str(obj_id)):
-            return self._entry(obj_id).symmetry()
-
-    def _entry(self, obj_id: int) -> ModelInfo:
-        if str(obj_id) not in self.info:
-            return ModelInfo()
+        name = object_name(obj_id)
         with in_file(self.folder / _MODELS_INFO):
-            found = convert(self.info[str(obj_id)], ModelInfo, str(obj_id))
-        if not isinstance(found, ModelInfo):
-            raise InputError("not a model's entry", where=str(obj_id))
-        return found
+            info: ModelInfo = convert(self.info.get(str(obj_id), {}), ModelInfo, str(obj_id))
+            with within(str(obj_id)):
+                symmetry = info.symmetry()
+        mesh = existing(self.folder / f"{name}.ply")
+        return CadModel(name, mesh, bounds=info.bounds(), diameter=info.diameter), symmetry
 
 
 def write_model(folder: Path, mesh: Mesh, number: int) -> dict[str, float]:

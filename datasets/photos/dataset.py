@@ -101,8 +101,8 @@ class PhotoDataset(ABC):
     def __getitem__(self, key: int | str) -> Photo:
         """The photo of a number or name.
 
-        Raises DataError if its record is bad, or there is none of this name; and IndexError if the
-        number is out of range.
+        Raises DataError if its record is bad or no photo has this name, IndexError if the number is
+        out of range.
         """
         if isinstance(key, str):
             if key not in self.names:
@@ -129,12 +129,7 @@ class PhotoDataset(ABC):
     def open_poses(self, path: Path) -> PoseFile:
         """Open a file of poses that were estimated on this data set.
 
-        Raises
-        ------
-        InputError
-            If it is not of the form of this data set.
-        DataError
-            If it cannot be read.
+        Raises InputError if it is not of the form of this data set, DataError if it cannot be read.
         """
         raise self.other_poses(path, "give poses on a data set of BOP or Scan2CAD")
 
@@ -146,20 +141,21 @@ class PhotoDataset(ABC):
     def summary(self, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
         """Read all records, not the images, and count what there is.
 
-        Parameters
-        ----------
-        progress : callable, optional
-            Called with the number of photos read after each.
+        ``progress`` is called with the number of photos read after each.
         """
         photos = images = 0
         objects: Counter[str] = Counter()
-        having: Counter[str] = Counter()
+        having = dict.fromkeys(("keypoints", "model", "pose", "mask"), 0)
         for photo in self:
             photos += 1
             images += photo.image is not None
             for found in photo.objects:
                 objects[found.category] += 1
-                having.update(_parts(found))
+                truth = found.truth
+                having["keypoints"] += found.keypoints is not None
+                having["model"] += found.model is not None
+                having["pose"] += not (truth.cam_from_model is None and truth.box is None)
+                having["mask"] += found.mask_path is not None
             if progress is not None:
                 progress(photos)
         return PhotoSummary(
@@ -170,10 +166,7 @@ class PhotoDataset(ABC):
             images=images,
             objects=objects.total(),
             categories=dict(objects.most_common()),
-            with_keypoints=having["keypoints"],
-            with_model=having["model"],
-            with_pose=having["pose"],
-            with_mask=having["mask"],
+            **{f"with_{name}": count for name, count in having.items()},
             problems=tuple(str(problem) for problem in self.problems.values()),
         )
 
@@ -216,17 +209,6 @@ def has(*patterns: str) -> Callable[[Path], bool]:
     return lambda folder: any(next(folder.glob(pattern), None) is not None for pattern in patterns)
 
 
-def _parts(found: PhotoObject) -> Iterator[str]:
-    if found.keypoints is not None:
-        yield "keypoints"
-    if found.model is not None:
-        yield "model"
-    if found.truth.cam_from_model is not None or found.truth.box is not None:
-        yield "pose"
-    if found.mask_path is not None:
-        yield "mask"
-
-
 def read_each(
     records: Iterable[_Record], read: Callable[[int, _Record], PhotoObject | None], *, where: str
 ) -> tuple[tuple[PhotoObject, ...], tuple[DataError, ...]]:
@@ -257,15 +239,12 @@ def read_list(path: Path) -> list[Raw]:
 
     Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no list.
     """
-    return list(_read_raw(path, list[Raw], "a list"))
+    return list(_decode(read_bytes(path), list[Raw], "a list", path))
 
 
 def read_table(path: Path) -> dict[str, Raw]:
-    """Read a JSON file that holds an object, its values not yet parsed.
-
-    Raises DataError if it cannot be read, is no valid JSON (cut short, say), or holds no object.
-    """
-    return dict(_read_raw(path, dict[str, Raw], "an object"))
+    """Read a JSON file that holds an object, its values not yet parsed; see `read_list`."""
+    return dict(_decode(read_bytes(path), dict[str, Raw], "an object", path))
 
 
 def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
@@ -273,26 +252,22 @@ def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
 
     Raises DataError if it is not of this type, or no valid JSON.
     """
-    try:
-        data = msgspec.json.decode(raw)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"not valid JSON: {brief(error)}", where=f"{path}: {where}") from None
-    except RecursionError:
-        raise DataError("nested too deeply", where=f"{path}: {where}") from None
+    data = _decode(raw, Any, "", f"{path}: {where}")
     with in_file(path):
         return convert(data, kind, where)
 
 
-def _read_raw(path: Path, kind: Any, name: str) -> Any:
-    data = read_bytes(path)
+def _decode(data: bytes | Raw, kind: Any, name: str, where: Path | str) -> Any:
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError:
-        raise DataError(f"expected {name}", where=str(path)) from None
+        raise DataError(f"expected {name}", where=str(where)) from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise damaged(f"not valid JSON: {brief(error)}", path) from None
+        what = f"not valid JSON: {brief(error)}"
+        raise damaged(what, where) if name else DataError(what, where=str(where)) from None
     except RecursionError:
-        raise DataError("not valid JSON: nested too deeply", where=str(path)) from None
+        what = "not valid JSON: nested too deeply" if name else "nested too deeply"
+        raise DataError(what, where=str(where)) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,25 +282,11 @@ class PoseEstimate:
     seconds: float | None = None  # time that the estimate took, of all objects in the photo
 
 
-@dataclass(frozen=True, eq=False)
-class Estimates:
-    """The poses in a result file, and why some of its records could not be read."""
-
-    path: Path
-    poses: tuple[PoseEstimate, ...]
-    problems: tuple[DataError, ...] = ()
-
-
 class PoseFile(ABC):
-    """The poses of a file that was opened on a data set, by photo.
-
-    Attributes
-    ----------
-    problems : tuple of DataError
-        Why some of its records could not be read.
-    """
+    """The poses of a file that was opened on a data set, by photo."""
 
     problems: tuple[DataError, ...] = ()
+    """Why some of its records could not be read."""
 
     @abstractmethod
     def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:

@@ -6,8 +6,10 @@ Geiger et al., "Are we ready for Autonomous Driving? The KITTI Vision Benchmark 
 from __future__ import annotations
 
 import os
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +36,7 @@ from cadalign.io.files import damaged, read_text
 from cadalign.io.images import photo_size
 
 _OBJECT, _TRACKING = ("label_2", "image_2"), ("label_02", "image_02")
-_PLACES = (".", "training")
+_LAYOUTS = (_OBJECT, _TRACKING)
 # The numbers after an object's type: truncated, occluded, alpha, bbox 4, dimensions h w l,
 # location 3, rotation_y; a detector's score may follow.
 _NUMBERS = 14
@@ -116,18 +118,15 @@ class KittiCars(PhotoDataset):
         self._categories = frozenset(categories)
         self._frames: list[KeypointFrame | _LabelFrame] = []
         bad: dict[str, DataError] = {}
-        for list_them in (_list_keypoints, _list_object_labels, _list_tracking_labels):
-            for found in list_them(folder):
-                if isinstance(found, DataError):
-                    bad[str(found.where)] = found
-                else:
-                    self._frames.append(found)
+        for found in _list_frames(folder):
+            if isinstance(found, DataError):
+                bad[str(found.where)] = found
+            else:
+                self._frames.append(found)
         if not self._frames:
-            raise next(iter(bad.values()), None) or DataError(
-                "no KITTI labels are here",
-                where=str(folder),
-                fix=f"give a folder of {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}",
-            )
+            fix = f"give a folder of {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}"
+            nothing = DataError("no KITTI labels are here", where=str(folder), fix=fix)
+            raise next(iter(bad.values()), nothing)
         super().__init__(folder, [frame.name for frame in self._frames])
         self.problems |= bad
         self._sequence: tuple[Path, dict[int, list[KittiLabel | DataError]]] | None = None
@@ -138,9 +137,7 @@ class KittiCars(PhotoDataset):
         if isinstance(frame, KeypointFrame):
             return frame.photo(SIZE)
         image = existing(frame.image)
-        camera: Camera | None = None
-        shift = np.zeros(3)
-        problems: tuple[DataError, ...] = ()
+        camera, shift = None, np.zeros(3)
         if frame.calibration.is_file():
             size = SIZE if image is None else photo_size(image)
             camera, shift = read_projection(frame.calibration, size)
@@ -148,7 +145,15 @@ class KittiCars(PhotoDataset):
         def read_object(number: int, label: KittiLabel | DataError) -> PhotoObject | None:
             if isinstance(label, DataError):
                 raise label
-            return self._object(number, label, shift)
+            if label.kind not in self._categories:
+                return None
+            return PhotoObject(
+                object_id=str(number if label.track is None else label.track),
+                category=label.kind,
+                truth=Truth(box=label.box(shift), metres=1.0),
+                bbox=label.bbox,
+                flags=label.flags,
+            )
 
         objects, problems = read_each(self._labels(frame), read_object, where=str(frame.labels))
         return Photo(frame.name, image, camera, objects, up=UP, problems=problems)
@@ -160,56 +165,35 @@ class KittiCars(PhotoDataset):
             self._sequence = frame.labels, _by_frame(read_labels(frame.labels, tracking=True))
         return self._sequence[1].get(frame.frame, [])
 
-    def _object(self, number: int, label: KittiLabel, shift: FloatArray) -> PhotoObject | None:
-        if label.kind not in self._categories:
-            return None
-        return PhotoObject(
-            object_id=str(number if label.track is None else label.track),
-            category=label.kind,
-            truth=Truth(box=label.box(shift), metres=1.0),
-            bbox=label.bbox,
-            flags=label.flags,
-        )
 
-
-def _list_keypoints(root: Path) -> Iterator[KeypointFrame | DataError]:
+def _list_frames(root: Path) -> Iterator[KeypointFrame | _LabelFrame | DataError]:
+    """List the photos of all layouts; what cannot be read is the reason why."""
     for name, list_them in ((CARS, list_cars), (TRACKS, list_tracks)):
         if (root / name).is_file():
             yield from list_them(root / name)
-
-
-def _list_object_labels(root: Path) -> Iterator[_LabelFrame]:
-    labels, images = _OBJECT
-    for place in _PLACES:
-        for path in sorted((root / place / labels).glob("*.txt")):
-            image = root / place / images / f"{path.stem}.png"
-            yield _LabelFrame(path.stem, path, image, root / place / "calib" / path.name)
-
-
-def _list_tracking_labels(root: Path) -> Iterator[_LabelFrame | DataError]:
-    labels, images = _TRACKING
-    for place in _PLACES:
-        for path in sorted((root / place / labels).glob("*.txt")):
+    for (labels, images), place in product(_LAYOUTS, (root, root / "training")):
+        for path in sorted((place / labels).glob("*.txt")):
+            image, calibration = place / images, place / "calib" / path.name
+            if labels == _OBJECT[0]:
+                yield _LabelFrame(path.stem, path, image / f"{path.stem}.png", calibration)
+                continue
             try:
                 found = _by_frame(read_labels(path, tracking=True))
             except DataError as error:
                 yield error
                 continue
-            yield from (each for each in found.get(_NO_FRAME, []) if isinstance(each, DataError))
-            for frame in sorted(set(found) - {_NO_FRAME}):
-                name = f"{frame:06d}"
-                image = root / place / images / path.stem / f"{name}.png"
-                calibration = root / place / "calib" / path.name
-                yield _LabelFrame(f"{path.stem}/{name}", path, image, calibration, frame)
+            yield from (each for each in found.pop(_NO_FRAME, []) if isinstance(each, DataError))
+            for frame in sorted(found):
+                name = f"{path.stem}/{frame:06d}"
+                yield _LabelFrame(name, path, image / f"{name}.png", calibration, frame)
 
 
 def _by_frame(labels: Iterable[KittiLabel | DataError]) -> dict[int, list[KittiLabel | DataError]]:
     """A sequence's labels by frame; lines that could not be read are those of frame -1."""
-    found: dict[int, list[KittiLabel | DataError]] = {}
+    found: dict[int, list[KittiLabel | DataError]] = defaultdict(list)
     for label in labels:
-        is_read = isinstance(label, KittiLabel) and label.frame is not None
-        frame = label.frame if is_read and isinstance(label, KittiLabel) else _NO_FRAME
-        found.setdefault(_NO_FRAME if frame is None else frame, []).append(label)
+        frame = label.frame if isinstance(label, KittiLabel) else None
+        found[_NO_FRAME if frame is None else frame].append(label)
     return found
 
 
@@ -272,9 +256,7 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
 FORMAT = PhotoFormat(
     "kitti",
     f"KITTI: {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}",
-    has(
-        CARS, TRACKS, *(f"{place}/{kind[0]}" for place in _PLACES for kind in (_OBJECT, _TRACKING))
-    ),
+    has(CARS, TRACKS, *(f"{place}{kind}" for place in ("", "training/") for kind, _ in _LAYOUTS)),
     KittiCars,
     write_cars,
 )

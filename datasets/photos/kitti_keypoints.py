@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.photos.dataset import parse, read_list, read_table
 from cadalign.datasets.photos.photo import (
     CadModel,
-    ModelFiles,
     NamedPoints,
     Photo,
     PhotoKeypoints,
@@ -28,7 +26,7 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.placed import LEVEL_UP, PlacedObject, converted
+from cadalign.datasets.photos.placed import LEVEL_UP, PlacedObject, write_entries
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -45,7 +43,7 @@ from cadalign.io.documents import (
     in_file,
     within,
 )
-from cadalign.io.files import damaged, read_text, write_json
+from cadalign.io.files import damaged, read_text
 from cadalign.io.images import photo_size
 from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.model import ShapeModel
@@ -139,31 +137,24 @@ class KeypointFrame:
         with in_file(self.path), within(self.place):
             if self.track is None or self.model is None:
                 return self._photo_of_car(convert(self.entry, _Car), size)
-            frame = convert(self.entry, _Frame)
-            return self._photo_of_track(frame, self.model, self.track, size)
+            frame, track = convert(self.entry, _Frame), self.track
+            names = tuple(self.model.names)
+            points = NamedPoints(names, np.array(self.model.model_xyz).reshape(-1, 3))
+            marked = _marked(frame.uv, names, frame.score)
+            found = _object(str(track.track), frame, track.dims_hwl, points, marked)
+            return Photo(self.name, None, _camera(track.K, size), (found,), up=UP)
 
     def _photo_of_car(self, car: _Car, size: tuple[int, int]) -> Photo:
         names = tuple(each.name for each in car.keypoints)
         if len(set(names)) != len(names):
             raise InputError("a name occurs twice", where="keypoints")
         points = NamedPoints(names, np.array([each.xyz for each in car.keypoints]).reshape(-1, 3))
-        pixels = np.array([each.uv for each in car.keypoints], dtype=float).reshape(-1, 2)
         scores = [each.score for each in car.keypoints if each.score is not None]
         image = existing(self.path.parent / car.image)
         camera = _camera(car.K, size if image is None else photo_size(image))
-        marked = _marked(pixels, names, scores or None)
-        found = _object("0", car, np.array(car.dims_hwl), points, marked)
+        marked = _marked([each.uv for each in car.keypoints], names, scores or None)
+        found = _object("0", car, car.dims_hwl, points, marked)
         return Photo(self.name, image, camera, (found,), up=UP)
-
-    def _photo_of_track(
-        self, frame: _Frame, model: MeanCar, track: _Track, size: tuple[int, int]
-    ) -> Photo:
-        names = tuple(model.names)
-        points = NamedPoints(names, np.array(model.model_xyz).reshape(-1, 3))
-        marked = _marked(np.array(frame.uv, dtype=float).reshape(-1, 2), names, frame.score)
-        dims = np.array(track.dims_hwl)
-        found = _object(str(track.track), frame, dims, points, marked)
-        return Photo(self.name, None, _camera(track.K, size), (found,), up=UP)
 
 
 def car_box(dims_hwl: FloatArray, location: FloatArray, rotation_y: float) -> Box:
@@ -290,23 +281,24 @@ def _camera(k: _Matrix, size: tuple[int, int]) -> Camera:
     return Camera(*size, k[0][0], k[1][1], k[0][2], k[1][2])
 
 
-def _marked(
-    pixels: FloatArray, names: tuple[str, ...], scores: list[float] | None
-) -> PhotoKeypoints:
-    known = np.ones(len(pixels)) if scores is None else np.array(scores, dtype=float)
-    return PhotoKeypoints(pixels, names, known >= HIDDEN, known if scores is not None else None)
+def _marked(uv: list[Point2], names: tuple[str, ...], scores: list[float] | None) -> PhotoKeypoints:
+    pixels = np.array(uv, dtype=float).reshape(-1, 2)
+    if scores is None:
+        return PhotoKeypoints(pixels, names, np.ones(len(pixels), dtype=bool))
+    known = np.array(scores, dtype=float)
+    return PhotoKeypoints(pixels, names, known >= HIDDEN, known)
 
 
 def _object(
-    object_id: str, pose: _Pose, dims: FloatArray, points: NamedPoints, marked: PhotoKeypoints
+    object_id: str, pose: _Pose, dims: _Dims, points: NamedPoints, marked: PhotoKeypoints
 ) -> PhotoObject:
-    box = car_box(dims, np.array(pose.location_bottom_centre), pose.rotation_y)
+    box = car_box(np.array(dims), np.array(pose.location_bottom_centre), pose.rotation_y)
     return PhotoObject(
         object_id=object_id,
         category="Car",
         truth=Truth(box=box, metres=1.0),
         keypoints=marked,
-        model=CadModel("mean car", ModelFiles(None, points), bounds=car_bounds(points.xyz)),
+        model=CadModel("mean car", None, points, car_bounds(points.xyz)),
         bbox=np.array(pose.bbox),
     )
 
@@ -317,9 +309,7 @@ def write_cars(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> li
     A model whose y is up is taken to face -z, as ShapeNet's do; one whose z is up to face -y.
     Returns why objects were left out.
     """
-    entries, problems = converted(numbered, partial(_written, folder))
-    write_json(folder / CARS, entries)
-    return problems
+    return write_entries(folder / CARS, numbered, _written)
 
 
 def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:

@@ -7,9 +7,8 @@ Annotations", CVPR 2021.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,13 +21,10 @@ from cadalign.datasets.photos.objectron_files import (
     ArCamera,
     ObjectronAnnotation,
     Sequence,
-    WorldObject,
     read_sequence,
 )
 from cadalign.datasets.photos.photo import (
     CadModel,
-    ImageReader,
-    ModelFiles,
     NamedPoints,
     Photo,
     PhotoKeypoints,
@@ -69,35 +65,28 @@ _CONTAINERS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _MOST_BYTES = 2**36  # of a video
 
 
-@dataclass(frozen=True)
-class VideoFrame:
-    """A frame of a video file."""
+def read_video_frame(path: Path, number: int) -> ByteImage:
+    """Read a frame of a video, from 0, upright, (h, w, 3) uint8.
 
-    path: Path  # the video
-    number: int  # the frame, from 0
+    Raises DataError if the video has no such frame, or cannot be read.
+    """
+    import cv2  # on first use: it takes longer to import than all the rest
 
-    def read(self) -> ByteImage:
-        """Read the frame upright, (h, w, 3) uint8.
-
-        Raises DataError if the video has no such frame, or cannot be read.
-        """
-        import cv2  # on first use: it takes longer to import than all the rest
-
-        # Going by the content, OpenCV would play lists of other files and addresses, too.
-        with open_input(self.path, most=_MOST_BYTES) as file:
-            if file.read(8)[4:] not in _CONTAINERS:
-                raise DataError("not a video in QuickTime's or MP4's form", where=str(self.path))
-        video = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-        try:
-            video.set(cv2.CAP_PROP_POS_FRAMES, self.number)
-            is_read, pixels = video.read()
-        finally:
-            video.release()
-        if not is_read:
-            raise DataError(f"frame {self.number} cannot be read", where=str(self.path))
-        if pixels.shape[0] < pixels.shape[1]:  # the file's note on rotation was not heeded
-            pixels = np.rot90(pixels, k=-1)
-        return np.ascontiguousarray(pixels[:, :, ::-1], dtype=np.uint8)
+    # Going by the content, OpenCV would play lists of other files and addresses, too.
+    with open_input(path, most=_MOST_BYTES) as file:
+        if file.read(8)[4:] not in _CONTAINERS:
+            raise DataError("not a video in QuickTime's or MP4's form", where=str(path))
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        video.set(cv2.CAP_PROP_POS_FRAMES, number)
+        is_read, pixels = video.read()
+    finally:
+        video.release()
+    if not is_read:
+        raise DataError(f"frame {number} cannot be read", where=str(path))
+    if pixels.shape[0] < pixels.shape[1]:  # the file's note on rotation was not heeded
+        pixels = np.rot90(pixels, k=-1)
+    return np.ascontiguousarray(pixels[:, :, ::-1], dtype=np.uint8)
 
 
 class Objectron(PhotoDataset):
@@ -133,11 +122,8 @@ class Objectron(PhotoDataset):
         folder = Path(root)
         paths = list_annotations(folder)
         if not paths:
-            raise DataError(
-                "there are no annotation files (.pbdata)",
-                where=str(folder),
-                fix="give the folder of Objectron's annotations",
-            )
+            fix = "give the folder of Objectron's annotations"
+            raise DataError("there are no annotation files (.pbdata)", where=str(folder), fix=fix)
         self._frames: list[tuple[Path, int]] = []
         names, bad = [], {}
         for path in paths:
@@ -165,15 +151,31 @@ class Objectron(PhotoDataset):
         sequence = self._sequence
         frame = sequence.frame(number)
         camera = _camera(frame.camera)
-        cam_from_world = _cam_from_world(frame.camera)
-        objects, problems = read_each(
-            frame.annotations,
-            partial(_object, sequence=sequence, camera=camera, cam_from_world=cam_from_world),
-            where=f"{path}: frame_annotations[{number}]",
-        )
+        view: FloatArray = np.reshape(frame.camera.view_matrix, (4, 4)).astype(float)
+        turn = _CV_FROM_SENSOR @ nearest_rotation(view[:3, :3])
+        cam_from_world = Alignment(turn, _CV_FROM_SENSOR @ view[:3, 3], np.ones(3))
+
+        def read_object(row: int, entry: Any) -> PhotoObject:
+            annotation: ObjectronAnnotation = convert(entry, ObjectronAnnotation)
+            found = sequence.object(annotation.object_id)
+            rotation = nearest_rotation(np.reshape(found.rotation, (3, 3)).astype(float))
+            shift, scale = np.array(found.translation), np.array(found.scale)
+            world_from_model = Alignment(rotation, shift, scale)
+            cam_from_model = cam_from_world @ world_from_model
+            return PhotoObject(
+                object_id=str(row),
+                category=found.category,
+                truth=Truth(cam_from_model, Box.from_model(_BOUNDS, cam_from_model), metres=1.0),
+                keypoints=_keypoints(annotation, camera),
+                model=CadModel("unit box", None, NamedPoints(_NAMES, _UNIT_BOX), _BOUNDS),
+                visible_fraction=float(np.clip(annotation.visibility, 0.0, 1.0)),
+                flags=frozenset(() if annotation.visibility > _VISIBLE else ("occluded",)),
+            )
+
+        where = f"{path}: frame_annotations[{number}]"
+        objects, problems = read_each(frame.annotations, read_object, where=where)
         image = _image(self.root, path, frame.frame_id)
-        # The phone's world is upright: y points up.
-        up = cam_from_world.rotation[:, 1]
+        up = cam_from_world.rotation[:, 1]  # the phone's world is upright: y points up
         return Photo(self.names[index], image, camera, objects, up=up, problems=problems)
 
 
@@ -196,38 +198,6 @@ def _is_sequence(path: Path) -> bool:
     return False
 
 
-def _object(
-    number: int, entry: Any, *, sequence: Sequence, camera: Camera, cam_from_world: Alignment
-) -> PhotoObject:
-    annotation: ObjectronAnnotation = convert(entry, ObjectronAnnotation)
-    found = _find(sequence, annotation.object_id)
-    world_from_model = Alignment(
-        nearest_rotation(np.reshape(found.rotation, (3, 3)).astype(float)),
-        np.array(found.translation),
-        np.array(found.scale),
-    )
-    cam_from_model = cam_from_world @ world_from_model
-    return PhotoObject(
-        object_id=str(number),
-        category=found.category,
-        truth=Truth(cam_from_model, Box.from_model(_BOUNDS, cam_from_model), metres=1.0),
-        keypoints=_keypoints(annotation, camera),
-        model=CadModel(
-            "unit box", ModelFiles(None, NamedPoints(_NAMES, _UNIT_BOX)), bounds=_BOUNDS
-        ),
-        visible_fraction=float(np.clip(annotation.visibility, 0.0, 1.0)),
-        flags=frozenset() if annotation.visibility > _VISIBLE else frozenset({"occluded"}),
-    )
-
-
-def _find(sequence: Sequence, object_id: int) -> WorldObject:
-    for number in range(len(sequence.objects)):
-        found = sequence.object(number)
-        if found.id == object_id:
-            return found
-    raise InputError(f"there is no object {object_id}", where="object_id")
-
-
 def _keypoints(annotation: ObjectronAnnotation, camera: Camera) -> PhotoKeypoints:
     if len(annotation.keypoints) != len(_NAMES):
         raise InputError(f"{len(annotation.keypoints)}, expected {len(_NAMES)}", where="keypoints")
@@ -248,28 +218,19 @@ def _camera(found: ArCamera) -> Camera:
     return Camera(width, height, float(fx), float(fy), float(cx), float(cy))
 
 
-def _cam_from_world(found: ArCamera) -> Alignment:
-    view: FloatArray = np.reshape(found.view_matrix, (4, 4)).astype(float)
-    rotation = _CV_FROM_SENSOR @ nearest_rotation(view[:3, :3])
-    return Alignment(rotation, _CV_FROM_SENSOR @ view[:3, 3], np.ones(3))
-
-
-def _image(root: Path, annotation: Path, frame_id: int) -> Path | ImageReader | None:
-    for folder in _image_folders(root, annotation):
+def _image(root: Path, annotation: Path, frame_id: int) -> Path | Callable[[], ByteImage] | None:
+    place = annotation.with_suffix("").relative_to(root)
+    folders = [root / place]
+    if place.parts[0] == ANNOTATIONS:
+        folders.append(root / Path("videos", *place.parts[1:]))
+    for folder in folders:
         names = (str(frame_id), f"{frame_id:06d}")
         image = first_existing(folder / f"{n}{end}" for n in names for end in (".jpg", ".png"))
         if image is not None:
             return image
         if (folder / "video.MOV").is_file():
-            return VideoFrame(folder / "video.MOV", frame_id)
+            return partial(read_video_frame, folder / "video.MOV", frame_id)
     return None
-
-
-def _image_folders(root: Path, annotation: Path) -> Iterator[Path]:
-    yield annotation.with_suffix("")
-    place = annotation.with_suffix("").relative_to(root)
-    if place.parts[0] == ANNOTATIONS:
-        yield root / Path("videos", *place.parts[1:])
 
 
 def write_objectron(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
@@ -277,16 +238,15 @@ def write_objectron(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) 
 
     The scene's y points up. Returns why objects were left out.
     """
-    _, problems = converted(numbered, partial(_written, folder))
+
+    def write(number: int, placed: PlacedObject) -> None:
+        sequence = _sequence(placed)
+        place = folder / ANNOTATIONS / placed.category / "batch-1"
+        placed.copy_image(place / f"{number}" / "0")
+        write_json(place / f"{number}.json", sequence)
+
+    _, problems = converted(numbered, write)
     return problems
-
-
-def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
-    sequence = _sequence(placed)
-    place = folder / ANNOTATIONS / placed.category / "batch-1"
-    placed.copy_image(place / f"{number}" / "0")
-    write_json(place / f"{number}.json", sequence)
-    return sequence
 
 
 def _sequence(placed: PlacedObject) -> dict[str, Any]:
@@ -310,20 +270,16 @@ def _sequence(placed: PlacedObject) -> dict[str, Any]:
     }
     keypoints = [
         {"id": k, "point2d": {"x": x, "y": y, "depth": depth}}
-        for k, ((x, y), depth) in enumerate(
-            zip(share.tolist(), corners[:, 2].tolist(), strict=True)
-        )
+        for k, (x, y, depth) in enumerate(np.column_stack([share, corners[:, 2]]).tolist())
     ]
-    frame = {
-        "frameId": 0,
-        "annotations": [{"objectId": 1, "keypoints": keypoints, "visibility": 1.0}],
-        "camera": {
-            "imageResolutionWidth": camera.height,
-            "imageResolutionHeight": camera.width,
-            "projectionMatrix": _projection(camera).ravel().tolist(),
-            "viewMatrix": view.ravel().tolist(),
-        },
+    sensor = {
+        "imageResolutionWidth": camera.height,
+        "imageResolutionHeight": camera.width,
+        "projectionMatrix": _projection(camera).ravel().tolist(),
+        "viewMatrix": view.ravel().tolist(),
     }
+    annotation = {"objectId": 1, "keypoints": keypoints, "visibility": 1.0}
+    frame = {"frameId": 0, "annotations": [annotation], "camera": sensor}
     return {"objects": [found], "frameAnnotations": [frame]}
 
 

@@ -124,22 +124,24 @@ class Sequence:
     """A sequence's objects and frames, not yet checked."""
 
     path: Path  # the file
-    objects: tuple[Any, ...]
-    frames: tuple[Any, ...]  # messages as bytes, or as parsed JSON
+    objects: list[Any]
+    frames: list[Any]  # messages as bytes, or as parsed JSON
 
     def frame(self, number: int) -> ObjectronFrame:
         """Decode a frame; raises DataError if it is no valid frame."""
         where = f"frame_annotations[{number}]"
-        found: ObjectronFrame = self._convert(self.frames[number], _FRAME, ObjectronFrame, where)
+        found: ObjectronFrame = self._decode(self.frames[number], _FRAME, ObjectronFrame, where)
         return found
 
-    def object(self, number: int) -> WorldObject:
-        """Decode an object; see `frame`."""
-        where = f"objects[{number}]"
-        found: WorldObject = self._convert(self.objects[number], _OBJECT, WorldObject, where)
-        return found
+    def object(self, object_id: int) -> WorldObject:
+        """Decode the object of an id; raises InputError if there is none, otherwise as `frame`."""
+        for number, message in enumerate(self.objects):
+            found: WorldObject = self._decode(message, _OBJECT, WorldObject, f"objects[{number}]")
+            if found.id == object_id:
+                return found
+        raise InputError(f"there is no object {object_id}", where="object_id")
 
-    def _convert(self, message: Any, fields: dict[int, Field], kind: Any, where: str) -> Any:
+    def _decode(self, message: Any, fields: dict[int, Field], kind: Any, where: str) -> Any:
         with in_file(self.path):
             try:
                 data = decode(message, fields) if isinstance(message, bytes) else message
@@ -157,12 +159,8 @@ def read_sequence(path: Path) -> Sequence:
         data = _snake_case(read_json(path))
         if not isinstance(data, dict) or not isinstance(data.get("frame_annotations"), list):
             raise DataError("there are no frame_annotations", where=str(path))
-        objects = data.get("objects", [])
-        return Sequence(
-            path,
-            tuple(objects if isinstance(objects, list) else ()),
-            tuple(data["frame_annotations"]),
-        )
+        objects, frames = data.get("objects"), data["frame_annotations"]
+        return Sequence(path, objects if isinstance(objects, list) else [], frames)
     content = read_bytes(path)
     messages: dict[int, list[bytes]] = {_OBJECTS: [], _FRAMES: []}
     try:
@@ -173,7 +171,7 @@ def read_sequence(path: Path) -> Sequence:
         raise DataError(error.what, where=str(path), fix="get it again") from None
     if not messages[_FRAMES]:
         raise DataError("there are no frame_annotations", where=str(path))
-    return Sequence(path, tuple(messages[_OBJECTS]), tuple(messages[_FRAMES]))
+    return Sequence(path, messages[_OBJECTS], messages[_FRAMES])
 
 
 def _snake_case(value: Any) -> Any:

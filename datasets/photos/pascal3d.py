@@ -7,9 +7,7 @@ Xiang et al., "ObjectNet3D: A Large Scale Database for 3D Object Recognition", E
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -59,14 +57,6 @@ _IMAGES = (".jpg", ".JPEG", ".jpeg", ".png")
 _FLAGS = ("truncated", "occluded", "difficult")
 
 
-@dataclass(frozen=True)
-class _Record:
-    """An annotation file, and the category whose objects it annotates; None for all."""
-
-    path: Path
-    category: str | None
-
-
 class Pascal3D(PhotoDataset):
     """PASCAL3D+, or ObjectNet3D.
 
@@ -97,34 +87,34 @@ class Pascal3D(PhotoDataset):
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = Path(root)
-        self._records = tuple(_list_records(folder / ANNOTATIONS))
+        # Annotation files, and the category whose objects each annotates; None for all.
+        place = folder / ANNOTATIONS
+        self._records: list[tuple[Path, str | None]] = [
+            *((path, None) for path in sorted(place.glob("*.mat"))),
+            *((p, p.parent.name.rpartition("_")[0] or None) for p in sorted(place.glob("*/*.mat"))),
+        ]
         if not self._records:
-            raise DataError(
-                f"there are no {ANNOTATIONS}/*.mat nor {ANNOTATIONS}/*/*.mat",
-                where=str(folder),
-                fix="give the folder of PASCAL3D+ or ObjectNet3D",
-            )
-        names = (
-            record.path.relative_to(folder / ANNOTATIONS).with_suffix("").as_posix()
-            for record in self._records
-        )
+            what = f"there are no {ANNOTATIONS}/*.mat nor {ANNOTATIONS}/*/*.mat"
+            fix = "give the folder of PASCAL3D+ or ObjectNet3D"
+            raise DataError(what, where=str(folder), fix=fix)
+        names = (path.relative_to(place).with_suffix("").as_posix() for path, _ in self._records)
         super().__init__(folder, names)
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
-        record = self._records[index]
-        found = read_structs(record.path, "record")[0]
+        path, taken = self._records[index]
+        found = read_structs(path, "record")[0]
         name = self.names[index]
         image = find_image(self.root, name)
         camera = Camera.without_focal(*_size(found, image))
 
         def read_object(number: int, each: MatStruct) -> PhotoObject | None:
             category = each.text("class")
-            if record.category not in (None, category):
+            if taken not in (None, category):
                 return None
-            return _object(number, category, each, camera, cad_folder(self.root))
+            return _object(number, category, each, camera, self.root)
 
-        objects, problems = read_each(found.structs("objects"), read_object, where=str(record.path))
+        objects, problems = read_each(found.structs("objects"), read_object, where=str(path))
         return Photo(name, image, camera, objects, problems=problems)
 
 
@@ -135,26 +125,15 @@ def find_image(root: Path, name: str) -> Path | None:
     )
 
 
-def cad_folder(root: Path) -> Path | None:
-    """Find the folder of the CAD models, None where there is none."""
-    folders = (root / name for name in _CAD_FOLDERS)
-    return next((folder for folder in folders if any(folder.glob("*.mat"))), None)
-
-
-def cad_model(folder: Path | None, category: str, index: int) -> CadModel | None:
+def cad_model(root: Path, category: str, index: int) -> CadModel | None:
     """The CAD model of a number from 1; None where the category has no file."""
+    folders = (root / name for name in _CAD_FOLDERS)
+    folder = next((folder for folder in folders if any(folder.glob("*.mat"))), None)
     if folder is None or not existing(folder / f"{category}.mat"):
         return None
-    return CadModel(
-        f"{category}/{index:02d}", PascalCad(folder / f"{category}.mat", category, index)
-    )
-
-
-def _list_records(folder: Path) -> Iterator[_Record]:
-    for path in sorted(folder.glob("*.mat")):
-        yield _Record(path, None)
-    for path in sorted(folder.glob("*/*.mat")):
-        yield _Record(path, path.parent.name.rpartition("_")[0] or None)
+    which = folder / f"{category}.mat", category, index
+    name = f"{category}/{index:02d}"
+    return CadModel(name, partial(_load_mesh, *which), partial(_load_keypoints, *which))
 
 
 def _size(record: MatStruct, image: Path | None) -> tuple[int, int]:
@@ -166,14 +145,13 @@ def _size(record: MatStruct, image: Path | None) -> tuple[int, int]:
     try:
         width, height = record.array("imgsize").ravel()[:2]
     except (InputError, ValueError):
-        raise DataError(
-            "the image is missing, and its size is unknown", where=record.where
-        ) from None
+        what = "the image is missing, and its size is unknown"
+        raise DataError(what, where=record.where) from None
     return int(width), int(height)
 
 
 def _object(
-    number: int, category: str, found: MatStruct, camera: Camera, cads: Path | None
+    number: int, category: str, found: MatStruct, camera: Camera, root: Path
 ) -> PhotoObject:
     index = int(found.number("cad_index", default=0.0))
     corners = found.array("bbox").ravel() - _FIRST_PIXEL
@@ -186,7 +164,7 @@ def _object(
         category=category,
         truth=Truth() if viewpoint is None else _truth(viewpoint, camera),
         keypoints=_anchors(found.struct("anchors")),
-        model=cad_model(cads, category, index) if index >= 1 else None,
+        model=cad_model(root, category, index) if index >= 1 else None,
         bbox=corners,
         flags=frozenset(flags),
     )
@@ -195,13 +173,12 @@ def _object(
 def _anchors(anchors: MatStruct | None) -> PhotoKeypoints | None:
     """The anchors that are visible."""
     marked: dict[str, FloatArray] = {}
-    for name in () if anchors is None else anchors.names:
-        each = None if anchors is None else anchors.struct(name)
-        if each is None or each.number("status", default=0.0) != _VISIBLE:
-            continue
-        location = each.array("location", 2)
-        if len(location) == 1:
-            marked[name] = location[0] - _FIRST_PIXEL
+    for name in anchors.names if anchors else ():
+        each = anchors.struct(name) if anchors else None
+        if each is not None and each.number("status", default=0.0) == _VISIBLE:
+            location = each.array("location", 2)
+            if len(location) == 1:
+                marked[name] = location[0] - _FIRST_PIXEL
     if not marked:
         return None
     points = np.array(list(marked.values()))
@@ -222,26 +199,15 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
         for name in ("azimuth", "elevation", "theta")
     )
     focal = viewpoint.number("focal", default=1.0) * viewpoint.number("viewport", _VIEWPORT)
-    center = distance * np.array(
-        [
-            np.cos(elevation) * np.sin(azimuth),
-            -np.cos(elevation) * np.cos(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    across = np.cos(elevation)
+    direction = [across * np.sin(azimuth), -across * np.cos(azimuth), np.sin(elevation)]
+    center = distance * np.array(direction)
     about_x, about_z = np.eye(3)[[0, 2]]
-    upright = rotation_from_vector((elevation - np.pi / 2) * about_x) @ rotation_from_vector(
-        -azimuth * about_z
-    )
+    lean, turn = rotation_from_vector((elevation - np.pi / 2) * about_x), -azimuth * about_z
+    upright = lean @ rotation_from_vector(turn)
     rotation = OPENGL_AXES[:, None] * (rotation_from_vector(theta * about_z) @ upright)
-    annotated = Camera(
-        camera.width,
-        camera.height,
-        focal,
-        focal,
-        viewpoint.number("px") - _FIRST_PIXEL,
-        viewpoint.number("py") - _FIRST_PIXEL,
-    )
+    cx, cy = (viewpoint.number(name) - _FIRST_PIXEL for name in ("px", "py"))
+    annotated = Camera(camera.width, camera.height, focal, focal, cx, cy)
     pose = Alignment(rotation, -rotation @ center, np.ones(3))
     return Truth(cam_from_model=pose, camera=annotated)
 
@@ -249,45 +215,36 @@ def _truth(viewpoint: MatStruct, camera: Camera) -> Truth:
 # CAD models -------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class PascalCad:
-    """One CAD model of a category."""
+# A category's file has a variable of the category's name: a struct array with ``vertices``,
+# ``faces`` (from 1), ``pnames`` and one field per named anchor. x is lateral, y along the length,
+# z up. Models have numbers from 1, as in the annotations.
 
-    path: Path
-    """The category's file, whose variable has the category's name: a struct array with
-    ``vertices``, ``faces`` (from 1), ``pnames`` and one field per named anchor. x is lateral, y
-    along the length, z up."""
-    category: str  # the category
-    index: int  # the model's number, from 1 as in the annotations
 
-    def load_mesh(self) -> Mesh:
-        """Read the mesh."""
-        found = self._find()
-        where = f"{self.path}: model {self.index}"
-        with in_file(where):
-            vertices, faces = found.array("vertices", 3), found.array("faces", 3)
-            if not (np.abs(faces) < _MOST_VERTICES).all():
-                raise DataError("`faces` has entries that are no numbers of vertices", where=where)
-            return Mesh(vertices, faces.astype(np.int64) - 1, source=where)
+def _load_mesh(path: Path, category: str, index: int) -> Mesh:
+    found = _find_cad(path, category, index)
+    where = f"{path}: model {index}"
+    with in_file(where):
+        vertices, faces = found.array("vertices", 3), found.array("faces", 3)
+        if not (np.abs(faces) < _MOST_VERTICES).all():
+            raise DataError("`faces` has entries that are no numbers of vertices", where=where)
+        return Mesh(vertices, faces.astype(np.int64) - 1, source=where)
 
-    def load_keypoints(self) -> NamedPoints | None:
-        """Read the anchors that this model has."""
-        found = self._find()
-        with in_file(f"{self.path}: model {self.index}"):
-            anchors = {
-                name: found.array(name, 3) for name in found.texts("pnames") if name in found.names
-            }
-        present = {name: xyz[0] for name, xyz in anchors.items() if len(xyz) == 1}
-        if not present:
-            return None
-        return NamedPoints(tuple(present), np.array(list(present.values())))
 
-    def _find(self) -> MatStruct:
-        models = _models(self.path, self.category)
-        if not 1 <= self.index <= len(models):
-            what = f"there is no model {self.index}, only {len(models)}"
-            raise DataError(what, where=str(self.path))
-        return models[self.index - 1]
+def _load_keypoints(path: Path, category: str, index: int) -> NamedPoints | None:
+    """The anchors that a model has."""
+    found = _find_cad(path, category, index)
+    with in_file(f"{path}: model {index}"):
+        names = [name for name in found.texts("pnames") if name in found.names]
+        anchors = {name: found.array(name, 3) for name in names}
+    present = {name: xyz[0] for name, xyz in anchors.items() if len(xyz) == 1}
+    return NamedPoints(tuple(present), np.array(list(present.values()))) if present else None
+
+
+def _find_cad(path: Path, category: str, index: int) -> MatStruct:
+    models = _models(path, category)
+    if not 1 <= index <= len(models):
+        raise DataError(f"there is no model {index}, only {len(models)}", where=str(path))
+    return models[index - 1]
 
 
 # A category's file takes a second to read, and all of a category's objects need it.
@@ -308,12 +265,6 @@ class _Keypoint(ForeignDocument):
 class _Observation(ForeignDocument):
     image: PathText
     keypoints: list[_Keypoint]
-
-
-@dataclass(frozen=True)
-class _Detected:
-    category: str
-    cad_index: int
 
 
 class Pascal3DDetections(PhotoDataset):
@@ -345,7 +296,7 @@ class Pascal3DDetections(PhotoDataset):
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = Path(root)
-        self._records: list[_Detected] = []
+        self._records: list[tuple[str, int]] = []  # category and number of the CAD model
         names: list[str] = []
         for path in sorted((folder / DETECTED).glob("*.mat")):
             found = read_structs(path, "annot")[0]
@@ -355,10 +306,7 @@ class Pascal3DDetections(PhotoDataset):
                 if len({len(each) for each in (images, categories, indices)}) != 1:
                     raise InputError("its lists have different lengths")
             names += images
-            self._records += [
-                _Detected(category, int(index))
-                for category, index in zip(categories, indices, strict=True)
-            ]
+            self._records += zip(categories, map(int, indices), strict=True)
         if not names:
             raise DataError(f"there are no {DETECTED}/*.mat", where=str(folder))
         super().__init__(folder, names)
@@ -366,15 +314,15 @@ class Pascal3DDetections(PhotoDataset):
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
-        name, record = self.names[index], self._records[index]
+        name, (category, cad_index) = self.names[index], self._records[index]
         image = find_image(self.root, name)
         if image is None:
             raise DataError("the image is missing", where=f"{self.root}, photo {name}")
         shown = PhotoObject(
             object_id="0",
-            category=record.category,
+            category=category,
             keypoints=self._keypoints(name),
-            model=cad_model(cad_folder(self.root), record.category, record.cad_index),
+            model=cad_model(self.root, category, cad_index),
         )
         return Photo(name, image, Camera.without_focal(*photo_size(image)), (shown,))
 

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.errors import DataError, InputError
@@ -27,12 +25,7 @@ from cadalign.io.meshes.load import load_mesh
 class PhotoKeypoints:
     """The keypoints of an object that are marked in a photo.
 
-    Raises
-    ------
-    DataError
-        If lengths don't match.
-    InputError
-        If a value is not finite.
+    Raises DataError if lengths don't match, InputError if a value is not finite.
     """
 
     points_2d: FloatArray
@@ -72,84 +65,38 @@ class NamedPoints:
         return len(self.names)
 
 
-class ModelSource(Protocol):
-    """Source of a CAD model's mesh and keypoints, each read when it is asked for."""
-
-    def load_mesh(self) -> Mesh | None:
-        """Read the mesh; None where there is none."""
-
-    def load_keypoints(self) -> NamedPoints | None:
-        """Read the named keypoints; None where there are none."""
-
-
-@dataclass(frozen=True, eq=False)
-class ModelFiles:
-    """A model whose mesh is a file of its own."""
-
-    mesh_path: Path | None  # the mesh file, None where there is none
-    keypoints: NamedPoints | None = None  # the keypoints that the annotation gives
-
-    def load_mesh(self) -> Mesh | None:
-        """Read the mesh file."""
-        return None if self.mesh_path is None else load_mesh(self.mesh_path)
-
-    def load_keypoints(self) -> NamedPoints | None:
-        """The annotation's keypoints."""
-        return self.keypoints
-
-
-@dataclass(frozen=True, eq=False)
-class LoadedModel:
-    """A model that is in memory."""
-
-    mesh: Mesh | None = None
-    keypoints: NamedPoints | None = None
-
-    def load_mesh(self) -> Mesh | None:
-        """The mesh."""
-        return self.mesh
-
-    def load_keypoints(self) -> NamedPoints | None:
-        """The keypoints."""
-        return self.keypoints
-
-
 @dataclass(frozen=True, eq=False)
 class CadModel:
     """The CAD model that an object is aligned with, read when it is asked for."""
 
     model_id: str
     """The model's id in its data set."""
-    source: ModelSource
-    """Where mesh and keypoints are read from."""
+    mesh: Mesh | Path | Callable[[], Mesh | None] | None = None
+    """The mesh, its file, or the function that reads it; None where there is none."""
+    keypoints: NamedPoints | Callable[[], NamedPoints | None] | None = None
+    """The named keypoints, or the function that reads them; None where there are none."""
     bounds: FloatArray | None = None
     """(2, 3), the bounding box's lowest and highest corner, where the annotation gives it [model
     units]."""
     diameter: float | None = None
     """The largest distance of two of the model's points, where the data set gives it."""
 
-    def load_mesh(self) -> Mesh:
-        """Read the mesh.
+    def find_mesh(self) -> Mesh | None:
+        """Read the mesh; None where there is none. Raises DataError if it cannot be read."""
+        if isinstance(self.mesh, Path):
+            return load_mesh(self.mesh)
+        return self.mesh() if callable(self.mesh) else self.mesh
 
-        Raises
-        ------
-        DataError
-            If there is none, or it cannot be read.
-        """
-        mesh = self.source.load_mesh()
+    def load_mesh(self) -> Mesh:
+        """Read the mesh; raises DataError if there is none, or it cannot be read."""
+        mesh = self.find_mesh()
         if mesh is None:
             raise DataError("there is no mesh of this model", where=f"model {self.model_id}")
         return mesh
 
     def load_keypoints(self) -> NamedPoints | None:
-        """Read the named keypoints; None where the data set has none.
-
-        Raises
-        ------
-        DataError
-            If they cannot be read.
-        """
-        return self.source.load_keypoints()
+        """Read the named keypoints; None where there are none. Raises DataError as `load_mesh`."""
+        return self.keypoints() if callable(self.keypoints) else self.keypoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,24 +150,11 @@ class PhotoObject:
     """Some of "truncated", "occluded", "difficult"."""
 
     def read_mask(self) -> BoolArray:
-        """Read the object's pixels, (h, w) bool.
-
-        Raises
-        ------
-        DataError
-            If there is no mask, or it cannot be read.
-        """
+        """Read the object's pixels, (h, w) bool; raises DataError if there are none."""
         if self.mask_path is None:
             raise DataError("this object has no mask", where=f"object {self.object_id}")
         with open_photo(self.mask_path) as image:
             return np.asarray(image.convert("L")) > 0
-
-
-class ImageReader(Protocol):
-    """An image that is no file of its own, such as a frame of a video."""
-
-    def read(self) -> ByteImage:
-        """Read the pixels, (h, w, 3) uint8."""
 
 
 @dataclass(frozen=True)
@@ -253,8 +187,9 @@ class Photo:
 
     name: str
     """The photo's name within its data set; no other has it."""
-    image: Path | ImageReader | None
-    """The image, None where it is not there."""
+    image: Path | Callable[[], ByteImage] | None
+    """The image's file, or the function that reads it, such as a frame of a video; None where it is
+    not there."""
     camera: Camera | None
     """Its camera, `Camera.without_focal` where the focal length is unknown; None where not even the
     image's size is."""
@@ -275,17 +210,11 @@ class Photo:
             raise InputError("the camera of this photo is not known", where=self.name)
         return self.camera
 
-    def read_image(self) -> npt.NDArray[np.uint8]:
-        """Read the photo's pixels, (h, w, 3) uint8.
-
-        Raises
-        ------
-        DataError
-            If there is no image, or it cannot be read.
-        """
+    def read_image(self) -> ByteImage:
+        """Read the photo's pixels, (h, w, 3) uint8; raises DataError if there are none."""
         if self.image is None:
             raise DataError("the image of this photo is not there", where=self.name)
-        return read_photo(self.image) if isinstance(self.image, Path) else self.image.read()
+        return read_photo(self.image) if isinstance(self.image, Path) else self.image()
 
 
 def existing(path: Path) -> Path | None:

@@ -6,11 +6,10 @@ Sun et al., "Pix3D: Dataset and Methods for Single-Image 3D Shape Modeling", CVP
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from msgspec import field
@@ -25,18 +24,17 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject, converted
+from cadalign.datasets.photos.placed import PlacedObject, write_entries
 from cadalign.datasets.photos.scannet import read_matrix, write_matrix
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
-from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import Finite, ForeignDocument, PathText, Point2, Point3, Positive, Text
-from cadalign.io.files import write_json
 from cadalign.io.meshes.load import load_mesh
 
+T = TypeVar("T")
 ANNOTATIONS = "pix3d.json"
 # The width of the sensor that focal lengths are for [mm].
 _SENSOR = 32.0
@@ -67,28 +65,7 @@ class _Entry(ForeignDocument):
 
     def flags(self) -> frozenset[str]:
         named = ((flag, getattr(self, name)) for name, flag in _FLAGS.items())
-        return frozenset(flag for flag, value in named if value is True or _is_true(value))
-
-
-def _is_true(value: bool | str) -> bool:
-    return isinstance(value, str) and value.lower() == "true"
-
-
-@dataclass(frozen=True)
-class _Model:
-    """A model's files, either of which may be missing; they are looked for when they are read."""
-
-    mesh_path: Path
-    keypoints_path: Path | None
-
-    def load_mesh(self) -> Mesh | None:
-        return load_mesh(self.mesh_path) if existing(self.mesh_path) else None
-
-    def load_keypoints(self) -> NamedPoints | None:
-        if self.keypoints_path is None or not existing(self.keypoints_path):
-            return None
-        xyz = read_matrix(self.keypoints_path, (None, 3))
-        return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
+        return frozenset(flag for flag, value in named if str(value).lower() == "true")
 
 
 class Pix3D(PhotoDataset):
@@ -120,8 +97,8 @@ class Pix3D(PhotoDataset):
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
-        path, where = self.root / ANNOTATIONS, f"[{index}]"
-        entry: _Entry = parse(self._entries[index], _Entry, path=path, where=where)
+        path = self.root / ANNOTATIONS
+        entry: _Entry = parse(self._entries[index], _Entry, path=path, where=f"[{index}]")
         width, height = map(int, entry.img_size)
         camera = _camera(width, height, entry.focal_length)
         shown = PhotoObject(
@@ -139,8 +116,21 @@ class Pix3D(PhotoDataset):
     def _model(self, entry: _Entry) -> CadModel | None:
         if entry.model is None:
             return None
-        keypoints = None if entry.keypoints_3d is None else self.root / entry.keypoints_3d
-        return CadModel(entry.model, _Model(self.root / entry.model, keypoints))
+        mesh = partial(_load, self.root / entry.model, load_mesh)
+        keypoints = None
+        if entry.keypoints_3d is not None:
+            keypoints = partial(_load, self.root / entry.keypoints_3d, _read_keypoints)
+        return CadModel(entry.model, mesh, keypoints)
+
+
+def _load(path: Path, read: Callable[[Path], T]) -> T | None:
+    """Read a file of a model; None where it is missing, which is looked for only then."""
+    return read(path) if existing(path) else None
+
+
+def _read_keypoints(path: Path) -> NamedPoints:
+    xyz = read_matrix(path, (None, 3))
+    return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
 
 
 @lru_cache(maxsize=64)
@@ -180,9 +170,7 @@ def write_pix3d(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> l
 
     Returns why objects were left out.
     """
-    entries, problems = converted(numbered, partial(_written, folder))
-    write_json(folder / ANNOTATIONS, entries)
-    return problems
+    return write_entries(folder / ANNOTATIONS, numbered, _written)
 
 
 def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:

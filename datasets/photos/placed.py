@@ -7,9 +7,9 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import writing
+from cadalign.io.files import write_json, writing
 from cadalign.io.images import open_photo, write_image
 from cadalign.io.meshes.write import write_obj_mesh
 
@@ -43,13 +43,14 @@ class PlacedObject:
     found: PhotoObject
 
     def __post_init__(self) -> None:
-        for name, is_missing in (
-            ("pose with all scales", self.found.truth.cam_from_model is None),
-            ("CAD model", self.found.model is None),
-        ):
-            if is_missing:
-                what = f"object {self.found.object_id} has no {name}, which a data set needs"
-                raise InputError(what, where=self.photo.name)
+        missing = None
+        if self.found.truth.cam_from_model is None:
+            missing = "pose with all scales"
+        elif self.found.model is None:
+            missing = "CAD model"
+        if missing:
+            what = f"object {self.found.object_id} has no {missing}, which a data set needs"
+            raise InputError(what, where=self.photo.name)
         self.camera.require_focal()
 
     @property
@@ -79,35 +80,31 @@ class PlacedObject:
         return self.found.truth.cam_from_model
 
     @property
-    def _metres(self) -> float:
-        return self.found.truth.metres or 1.0
-
-    @property
     def pose(self) -> Alignment:
         """The pose of the stretched model, without stretch [m]."""
-        return Alignment(
-            self._aligned.rotation, self._aligned.translation * self._metres, np.ones(3)
-        )
+        shift = self._aligned.translation * (self.found.truth.metres or 1.0)
+        return Alignment(self._aligned.rotation, shift, np.ones(3))
 
     @property
     def scale(self) -> FloatArray:
         """Metres per model unit along the model's axes, (3,) float."""
-        return self._aligned.scale * self._metres
+        return self._aligned.scale * (self.found.truth.metres or 1.0)
+
+    @cached_property
+    def keypoints(self) -> NamedPoints:
+        """The model's keypoints, none where it has none."""
+        with _left_out():
+            return self.model.load_keypoints() or NamedPoints((), np.empty((0, 3)))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the model's keypoints."""
-        return self._keypoints.names
+        return self.keypoints.names
 
     @property
     def points(self) -> FloatArray:
         """The keypoints on the stretched model, (k, 3) float [m]."""
-        return self._keypoints.xyz * self.scale
-
-    @cached_property
-    def _keypoints(self) -> NamedPoints:
-        with _left_out():
-            return self.model.load_keypoints() or NamedPoints((), np.empty((0, 3)))
+        return self.keypoints.xyz * self.scale
 
     @property
     def marked(self) -> dict[str, FloatArray]:
@@ -149,7 +146,7 @@ class PlacedObject:
         if self.found.bbox is not None:
             return self.found.bbox
         with _left_out():
-            mesh = self.model.source.load_mesh()
+            mesh = self.model.find_mesh()
         points = self.points if mesh is None else mesh.vertices * self.scale
         pixels = self.camera.project_where_ahead(self.pose.apply(points))
         pixels = pixels[np.isfinite(pixels).all(axis=1)]
@@ -181,9 +178,9 @@ class PlacedObject:
                 with writing(path):
                     shutil.copyfile(self.photo.image, path)
                 return path
-        path = stem.with_name(f"{stem.name}.png")
         with _left_out():
             pixels = self.photo.read_image()
+        path = stem.with_name(f"{stem.name}.png")
         write_image(path, pixels)
         return path
 
@@ -230,6 +227,17 @@ def converted(
         except InputError as error:
             problems.append(error)
     return entries, problems
+
+
+def write_entries(
+    path: Path,
+    numbered: Iterable[tuple[int, PlacedObject]],
+    convert: Callable[[Path, int, PlacedObject], Any],
+) -> list[InputError]:
+    """Write a JSON list of the objects' entries, made in its folder; see `converted`."""
+    entries, problems = converted(numbered, partial(convert, path.parent))
+    write_json(path, entries)
+    return problems
 
 
 @contextmanager

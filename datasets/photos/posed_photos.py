@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, parse, read_table
-from cadalign.datasets.photos.photo import CadModel, ModelFiles, Photo, PhotoObject, Truth, existing
+from cadalign.datasets.photos.photo import CadModel, Photo, PhotoObject, Truth, existing
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
@@ -70,7 +70,7 @@ class PosedPhotos(PhotoDataset):
             object_id="0",
             category=model.stem,
             truth=Truth(cam_from_model=alignment, metres=1e-3),
-            model=CadModel(model.stem, ModelFiles(existing(self.root / model))),
+            model=CadModel(model.stem, existing(self.root / model)),
         )
         return Photo(name, existing(self.root / name), camera, (shown,))
 

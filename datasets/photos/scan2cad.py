@@ -8,8 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,7 +28,6 @@ from cadalign.datasets.photos.dataset import (
 )
 from cadalign.datasets.photos.photo import (
     CadModel,
-    ModelFiles,
     NamedPoints,
     Photo,
     PhotoKeypoints,
@@ -39,7 +36,7 @@ from cadalign.datasets.photos.photo import (
     existing,
     first_existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject, converted, upright_rotation
+from cadalign.datasets.photos.placed import PlacedObject, upright_rotation, write_entries
 from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames, write_frame
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
@@ -48,7 +45,6 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
 from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, read_json
-from cadalign.io.files import write_json
 
 FULL = "full_annotations.json"
 # One scan's annotations, as in the repository and its derivatives.
@@ -100,14 +96,6 @@ class _Scan(_Head):
     aligned_models: list[Any]
 
 
-@dataclass(frozen=True)
-class _Record:
-    """A frame, and the scan's entry in the annotations."""
-
-    entry: int
-    frame: ScanNetFrame
-
-
 class Scan2CAD(PhotoDataset):
     """Frames of ScanNet scenes with the CAD models that annotators aligned.
 
@@ -153,9 +141,9 @@ class Scan2CAD(PhotoDataset):
         self._entries = read_list(self.annotations)
         frames = [folder / name for name in _FRAME_FOLDERS] if scannet is None else [Path(scannet)]
         self._frame_folders = frames
-        models = [folder / name for name in _MODEL_FOLDERS]
-        self._models = models if shapenet is None else [Path(shapenet)]
-        self._records: list[_Record] = []
+        below = [folder / name for name in _MODEL_FOLDERS]
+        self._models = below if shapenet is None else [Path(shapenet)]
+        self._records: list[tuple[int, ScanNetFrame]] = []  # with the row of the scan
         names, bad = [], {}
         for number, entry in enumerate(self._entries):
             try:
@@ -164,16 +152,14 @@ class Scan2CAD(PhotoDataset):
                 bad[f"[{number}]"] = error
                 continue
             for frame in list_frames(frames, scene)[::every]:
-                self._records.append(_Record(number, frame))
+                self._records.append((number, frame))
                 names.append(f"{scene}/{frame.frame_id}")
         super().__init__(folder, names)
         self.problems |= bad
         if not names:
-            raise DataError(
-                f"no frame of the {len(self._entries) - len(bad)} annotated scans is here",
-                where=str(self.annotations),
-                fix="give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)",
-            )
+            what = f"no frame of the {len(self._entries) - len(bad)} annotated scans is here"
+            fix = "give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)"
+            raise DataError(what, where=str(self.annotations), fix=fix)
 
     def open_poses(self, path: Path) -> PoseFile:
         """Open annotations in the form of these, such as an estimate's, seen from these frames."""
@@ -187,23 +173,20 @@ class Scan2CAD(PhotoDataset):
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
-        record = self._records[index]
-        scan = self._parse(record.entry, self._entries[record.entry], _Scan)
-        camera = record.frame.camera()
-        cam_from_scan = record.frame.cam_from_scan()
+        row, frame = self._records[index]
+        scan = self._parse(row, self._entries[row], _Scan)
+        camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
         cam_from_world = cam_from_scan @ _inverse(scan.trs.alignment())
 
         def read_object(number: int, model: Any) -> PhotoObject | None:
             found: _Model = convert(model, _Model)
             return _object(str(number), found, cam_from_world, camera, self._models)
 
-        objects, problems = read_each(
-            scan.aligned_models, read_object, where=f"{self.annotations}, {self.names[index]}"
-        )
-        image = record.frame.image_path
-        # Scans are upright: z points up.
-        up = cam_from_scan.rotation[:, 2]
-        return Photo(self.names[index], image, camera, objects, up=up, problems=problems)
+        name = self.names[index]
+        where = f"{self.annotations}, {name}"
+        objects, problems = read_each(scan.aligned_models, read_object, where=where)
+        up = cam_from_scan.rotation[:, 2]  # scans are upright: z points up
+        return Photo(name, frame.image_path, camera, objects, up=up, problems=problems)
 
     def _parse(self, number: int, entry: Raw, kind: Any) -> Any:
         return parse(entry, kind, path=self.annotations, where=f"[{number}]")
@@ -231,14 +214,19 @@ def _object(
         bbox = _rectangle(box, camera)
         if bbox is None:
             return None
-    mesh = _mesh_path(folders, found.catid_cad, found.id_cad)
+    mesh = first_existing(
+        place / file
+        for folder in folders
+        for place in (folder / found.catid_cad / found.id_cad, folder / found.id_cad)
+        for file in _MESH_FILES
+    )
     keypoints, points = _keypoints(found, world_from_model, cam_from_world, camera)
     return PhotoObject(
         object_id=object_id,
         category=name_of_synset(found.catid_cad),
         truth=Truth(cam_from_model=cam_from_model, box=box, metres=1.0),
         keypoints=keypoints,
-        model=CadModel(found.id_cad, ModelFiles(mesh, points), bounds=bounds),
+        model=CadModel(found.id_cad, mesh, points, bounds),
         symmetry=Symmetry.around(_UP, fold=SCAN2CAD_FOLDS[found.sym], offset=center),
         bbox=bbox,
     )
@@ -274,15 +262,6 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
     return np.concatenate([low, high]) if (low < high).all() else None
 
 
-def _mesh_path(folders: Iterable[Path], synset: str, model_id: str) -> Path | None:
-    return first_existing(
-        place / file
-        for folder in folders
-        for place in (folder / synset / model_id, folder / model_id)
-        for file in _MESH_FILES
-    )
-
-
 def _inverse(alignment: Alignment) -> Alignment:
     """The inverse of an alignment with equal scales."""
     scale = alignment.scale
@@ -300,11 +279,8 @@ def _annotation_file(path: Path) -> tuple[Path, Path]:
     found = first_existing(path / name for name in (FULL, *_SAMPLES))
     if found is not None:
         return path, found
-    raise DataError(
-        f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here",
-        where=str(path),
-        fix="give the folder of Scan2CAD's annotations",
-    )
+    what = f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here"
+    raise DataError(what, where=str(path), fix="give the folder of Scan2CAD's annotations")
 
 
 class _Poses(PoseFile):
@@ -363,9 +339,7 @@ def write_scan2cad(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -
     Keypoints are pairs: on the CAD model, and on the scan, where the marked pixel's ray has the
     depth of the model's keypoint. Returns why objects were left out.
     """
-    scans, problems = converted(numbered, partial(_written, folder))
-    write_json(folder / FULL, scans)
-    return problems
+    return write_entries(folder / FULL, numbered, _written)
 
 
 def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import cadalign.datasets
 from cadalign.cli import main
 from cadalign.datasets import Bop, CadModel, PhotoKeypoints, PhotoObject
 from cadalign.datasets.photos.formats import PHOTO_FORMATS
-from cadalign.datasets.photos.photo import DepthImage, ModelFiles
+from cadalign.datasets.photos.photo import DepthImage
 from cadalign.errors import DataError
 
 
@@ -56,9 +56,9 @@ def test_what_is_missing_is_told(tmp_path):
     with pytest.raises(DataError, match="object 3: this object has no mask"):
         found.read_mask()
     with pytest.raises(DataError, match="model x: there is no mesh"):
-        CadModel("x", ModelFiles(None)).load_mesh()
+        CadModel("x").load_mesh()
     with pytest.raises(DataError, match=r"gone\.obj"):
-        CadModel("x", ModelFiles(tmp_path / "gone.obj")).load_mesh()
+        CadModel("x", tmp_path / "gone.obj").load_mesh()
     with pytest.raises(DataError, match="2 keypoints, 1 names"):
         PhotoKeypoints(np.zeros((2, 2)), ("a",), np.ones(2, dtype=bool))
     color = write_photo(tmp_path / "color.png")

@@ -12,7 +12,7 @@ from support.photo_data import assert_damage_is_told, message, rigid, write_phot
 
 import cadalign.datasets
 from cadalign.datasets import Objectron
-from cadalign.datasets.photos.objectron import VideoFrame
+from cadalign.datasets.photos.objectron import read_video_frame
 from cadalign.datasets.photos.objectron_files import Field, decode, read_sequence
 from cadalign.errors import DataError, InputError
 
@@ -206,11 +206,11 @@ def test_videos_are_not_lists_of_other_files(tmp_path):
     path = tmp_path / "video.MOV"
     path.write_text("#EXTM3U\n#EXTINF:1,\n/etc/passwd\n")
     with pytest.raises(DataError, match=r"video\.MOV: not a video in QuickTime's or MP4's form"):
-        VideoFrame(path, 0).read()
+        read_video_frame(path, 0)
     os.remove(path)
     os.mkfifo(path)
     with pytest.raises(DataError, match=r"video\.MOV: not a regular file"):
-        VideoFrame(path, 0).read()
+        read_video_frame(path, 0)
 
 
 def test_files_without_frames_are_refused(tmp_path):

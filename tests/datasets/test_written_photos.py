@@ -17,7 +17,7 @@ from cadalign import Alignment, Camera
 from cadalign.datasets import CadModel, Photo, PhotoDataset, PhotoFormat, PhotoObject, Truth
 from cadalign.datasets.photos.dataset import has, parse, read_list
 from cadalign.datasets.photos.formats import PHOTO_FORMATS, open_photos, write_photos
-from cadalign.datasets.photos.photo import ModelFiles, existing
+from cadalign.datasets.photos.photo import existing
 from cadalign.datasets.photos.placed import PlacedObject, converted
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
@@ -50,7 +50,7 @@ class ToyPhotos(PhotoDataset):
     def read(self, index: int) -> Photo:
         entry: _Toy = parse(self._entries[index], _Toy, path=self.root / "toy.json", where="entry")
         pose = Alignment(np.array(entry.rotation), entry.translation, entry.scale)
-        model = CadModel("toy", ModelFiles(existing(self.root / entry.mesh)))
+        model = CadModel("toy", existing(self.root / entry.mesh))
         found = PhotoObject("0", entry.category, truth=Truth(pose, metres=1.0), model=model)
         return Photo(self.names[index], self.root / entry.image, Camera(*entry.camera), (found,))
 

@@ -145,18 +145,16 @@ def _from_predictions(data: _Predictions) -> list[ImageKeypoints]:
     by_number = data.meta_info.keypoint_id2name if data.meta_info else None
     names = None
     if by_number is not None:
-        keys = [str(number) for number in range(len(by_number))]
-        names = convert([by_number.get(key) for key in keys], list[Text], where="meta_info.names")
+        listed = [by_number.get(str(number)) for number in range(len(by_number))]
+        names = convert(listed, list[Text], where="meta_info.names")
     objects = []
     for row, entry in enumerate(data.instance_info):
-        where = f"instance_info[{row}]"
+        where, frame = f"instance_info[{row}]", entry.frame_id
         if entry.instances is None:
             objects.append(_image_keypoints(entry, where, names=names))
-            continue
-        for place, instance in enumerate(entry.instances):
+        for place, instance in enumerate(entry.instances or []):
             found = _image_keypoints(instance, f"{where}.instances[{place}]", names=names)
-            image = found.image if entry.frame_id is None else str(entry.frame_id)
-            objects.append(replace(found, image=image))
+            objects.append(replace(found, image=found.image if frame is None else str(frame)))
     return objects
 
 
@@ -240,13 +238,10 @@ class CocoObject:
         left, top, right, bottom = self.rectangle.tolist()
         pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
         rows = zip(pixels, self.flags.tolist(), strict=True)
-        further: dict[str, Any] = {}
-        if self.pose is not None:
-            further["pose"] = _written_pose(self.pose)
-        if self.track is not None:
-            further["track_id"] = self.track
+        pose, track = self.pose, self.track
         return {
-            **further,
+            **({} if pose is None else {"pose": _written_pose(pose)}),
+            **({} if track is None else {"track_id": track}),
             "id": number,
             "image_id": self.image,
             "category_id": 1 + self.category,
@@ -259,11 +254,9 @@ class CocoObject:
 
 
 def _written_pose(pose: Alignment) -> dict[str, Any]:
-    return {
-        "quat_wxyz": quat_wxyz_from_rotation(pose.rotation).tolist(),
-        "translation": pose.translation.tolist(),
-        "scale": pose.scale.tolist(),
-    }
+    turn = quat_wxyz_from_rotation(pose.rotation).tolist()
+    shift, scale = pose.translation.tolist(), pose.scale.tolist()
+    return {"quat_wxyz": turn, "translation": shift, "scale": scale}
 
 
 def coco_document(
@@ -299,11 +292,7 @@ def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
 
     Raises InputError if the camera, a pose or a model is not known.
     """
-    placed = [
-        (row, PlacedObject(photo, found))
-        for row, photo in enumerate(photos)
-        for found in photo.objects
-    ]
+    placed = [(row, PlacedObject(p, found)) for row, p in enumerate(photos) for found in p.objects]
     models = {each.model.model_id: each.names for _, each in placed}
     rows = {model_id: row for row, model_id in enumerate(models)}
     cameras = [photo.known_camera for photo in photos]

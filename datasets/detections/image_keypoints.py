@@ -103,11 +103,8 @@ def choose_object(
     if not wanted:
         listed_images = max((found.images for found in objects), default=0)
         if image is not None and listed_images > 1 and len(images) == 1:
-            raise InputError(
-                f"{listed_images} images, and no keypoints in {image!r}",
-                where="image",
-                fix=f"there are some in {images[0]}",
-            )
+            what = f"{listed_images} images, and no keypoints in {image!r}"
+            raise InputError(what, where="image", fix=f"there are some in {images[0]}")
         if len(images) != 1:
             listed = ", ".join(str(name) for name in images[:5])
             fix = f"choose one of {listed}" + (", ..." if len(images) > 5 else "")
@@ -120,11 +117,8 @@ def choose_object(
             raise InputError(what, where="number", fix="count from 0")
         return wanted[number]
     if len(wanted) > 1 and any(found.score is None for found in wanted):
-        raise InputError(
-            f"{len(wanted)} objects in the image, and no scores to choose by",
-            where="number",
-            fix=f"choose one, 0 to {len(wanted) - 1}",
-        )
+        what = f"{len(wanted)} objects in the image, and no scores to choose by"
+        raise InputError(what, where="number", fix=f"choose one, 0 to {len(wanted) - 1}")
     return max(wanted, key=lambda found: found.score or 0.0)
 
 
@@ -178,28 +172,21 @@ def join_keypoints(
     places = _places(found, model)
     unknown = [row for row in kept if places[row] is None]
     if unknown and not ignore_unknown:
-        raise DataError(
-            f"the model has no keypoint {_label(found, unknown[0])!r}",
-            where=found.source,
-            fix=f"it has {_some(model.names)}; ignore_unknown leaves out what it has not",
-        )
+        labels = found.names or found.ids or range(len(found))
+        what = f"the model has no keypoint {labels[unknown[0]]!r}"
+        fix = f"it has {_some(model.names)}; ignore_unknown leaves out what it has not"
+        raise DataError(what, where=found.source, fix=fix)
     if sigma_from_scores is not None and not 0 < sigma_from_scores < np.inf:
         raise InputError(f"{sigma_from_scores} is not positive", where="sigma_from_scores")
     pairs = [(row, place) for row in kept if (place := places[row]) is not None]
     first: dict[int, int] = {}
     for row, place in pairs:
         if first.setdefault(place, row) != row:
-            raise DataError(
-                f"keypoints {first[place]} and {row} are both {model.names[place]!r}",
-                where=found.source,
-                fix="leave one of them out",
-            )
+            what = f"keypoints {first[place]} and {row} are both {model.names[place]!r}"
+            raise DataError(what, where=found.source, fix="leave one of them out")
     if not pairs:
-        raise DataError(
-            f"none of {len(found)} keypoints is found in the image and on the model",
-            where=found.source,
-            fix=f"the model has {_some(model.names)}",
-        )
+        what = f"none of {len(found)} keypoints is found in the image and on the model"
+        raise DataError(what, where=found.source, fix=f"the model has {_some(model.names)}")
     rows, columns = [row for row, _ in pairs], [place for _, place in pairs]
     ids = [model.ids[place] for place in columns]
     scores = None if found.scores is None else found.scores[rows]
@@ -230,18 +217,10 @@ def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
         by_id = {number: row for row, number in enumerate(model.ids)}
         return [by_id.get(number) for number in found.ids]
     if len(found) != len(model):
-        raise DataError(
-            f"{len(found)} keypoints without names, but the model has {len(model)}",
-            where=found.source,
-            fix="give names, or as many keypoints as the model has, in its order",
-        )
+        what = f"{len(found)} keypoints without names, but the model has {len(model)}"
+        fix = "give names, or as many keypoints as the model has, in its order"
+        raise DataError(what, where=found.source, fix=fix)
     return list(range(len(found)))
-
-
-def _label(found: ImageKeypoints, row: int) -> str | int:
-    if found.names is not None:
-        return found.names[row]
-    return row if found.ids is None else found.ids[row]
 
 
 def _plain(name: str) -> str:

@@ -62,10 +62,7 @@ class Keypoints:
     def on_mesh(self, mesh: Mesh) -> FloatArray:
         """The same points rebuilt from faces and barycentric coordinates, (k, 3) float.
 
-        Raises
-        ------
-        InputError
-            If the mesh has fewer faces than the annotation names.
+        Raises InputError if the mesh has fewer faces than the annotation names.
         """
         return mesh.surface_points(self.face_index, self.barycentric)
 
@@ -216,11 +213,8 @@ def read_entries(path: Path) -> list[Any]:
     except DataError as error:
         raise damaged(error.what, error.where) from None
     if not isinstance(entries, list):
-        raise DataError(
-            f"{quote(entries)} is not a list of models",
-            where=str(path),
-            fix="is it one of KeypointNet's annotation files?",
-        )
+        fix = "is it one of KeypointNet's annotation files?"
+        raise DataError(f"{quote(entries)} is not a list of models", where=str(path), fix=fix)
     return entries
 
 
@@ -244,39 +238,30 @@ def parse_entry(entry: Any, *, where: str) -> Annotation:
 def _keypoints(entries: list[_Keypoint]) -> Keypoints:
     weights = np.array([entry.mesh_info.face_uv for entry in entries])
     grey = tuple(255 * value for value in GREY[:3])
-    colors = np.array([entry.rgb or grey for entry in entries]) / 255
+    clouds = [entry.pcd_info for entry in entries]
     return Keypoints(
         xyz=_frozen([entry.xyz for entry in entries]),
         ids=_frozen([entry.semantic_id for entry in entries]),
         face_index=_frozen([entry.mesh_info.face_index for entry in entries]),
         barycentric=_frozen(weights / weights.sum(axis=1, keepdims=True)),
-        point_index=_frozen(
-            [entry.pcd_info.point_index if entry.pcd_info else _NO_POINT for entry in entries]
-        ),
-        colors=_frozen(np.clip(colors, 0.0, 1.0)),
+        point_index=_frozen([_NO_POINT if each is None else each.point_index for each in clouds]),
+        colors=_frozen(np.clip(np.array([e.rgb or grey for e in entries]) / 255, 0.0, 1.0)),
     )
 
 
 def _symmetries(read: _Symmetries) -> Symmetries:
     rotations = []
     for row, item in enumerate(read.rotation):
-        where = f"symmetries.rotation[{row}].circle"
-        circle = _circle(convert(item.circle, _Circle, where=where)) if item.is_circle else None
+        circle = None
+        if item.is_circle:
+            found = convert(item.circle, _Circle, where=f"symmetries.rotation[{row}].circle")
+            normal = np.array(found.normal)
+            normal /= np.abs(normal).max()  # whose square is finite
+            normal = _frozen(normal / np.linalg.norm(normal))
+            circle = Circle(_frozen(found.center), found.radius, normal)
         rotations.append(RotationalSymmetry(keypoints=tuple(item.kp_indexes), circle=circle))
-    return Symmetries(
-        reflections=tuple((item.kp_indexes[0], item.kp_indexes[1]) for item in read.reflection),
-        rotations=tuple(rotations),
-    )
-
-
-def _circle(read: _Circle) -> Circle:
-    normal = np.array(read.normal)
-    normal /= np.abs(normal).max()  # whose square is finite
-    return Circle(
-        center=_frozen(read.center),
-        radius=read.radius,
-        normal=_frozen(normal / np.linalg.norm(normal)),
-    )
+    mirrored = ((item.kp_indexes[0], item.kp_indexes[1]) for item in read.reflection)
+    return Symmetries(tuple(mirrored), tuple(rotations))
 
 
 def _frozen(values: Any) -> Any:

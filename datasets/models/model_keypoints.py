@@ -210,11 +210,8 @@ class ModelKeypoints:
             if model_id in ids:
                 annotation = parse_entry(entry, where=f"{path}, {model_id}")
                 return cls._of_keypoints(annotation.keypoints, model, {})
-        raise DataError(
-            "has no annotations of a model whose id occurs in the model's path",
-            where=str(path),
-            fix=f"is {model} of this category?",
-        )
+        what = "has no annotations of a model whose id occurs in the model's path"
+        raise DataError(what, where=str(path), fix=f"is {model} of this category?")
 
     @classmethod
     def _from_data(cls, data: Any, folder: Path, mesh: Mesh | None) -> ModelKeypoints:

@@ -15,7 +15,7 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.load import load_mesh
 
 # Where a model's mesh lies in its folder: version 2, then version 1.
-_MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
+MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
 _SYNSET_DIGITS = 8
 # KeypointNet's folder of ShapeNet's meshes as PLY.
 _PLY_FOLDER = "ShapeNetCore.v2.ply"
@@ -87,12 +87,8 @@ class ShapeNet:
     def path(self, category: str, model_id: str) -> Path:
         """The mesh file of a model, found without listing its category.
 
-        Raises
-        ------
-        InputError
-            If there is no such category or model.
-        DataError
-            If the model's folder holds no mesh.
+        Raises InputError if there is no such category or model, DataError if the model's folder
+        holds no mesh.
         """
         name = self._require(category)
         folder = self.root / synset_of_name(name) / model_id
@@ -100,7 +96,7 @@ class ShapeNet:
             raise InputError(f"no model {model_id!r} of {name!r}", where=str(self.root))
         found = _mesh_file(folder)
         if found is None:
-            wanted = " nor ".join(file.as_posix() for file in _MESH_FILES)
+            wanted = " nor ".join(file.as_posix() for file in MESH_FILES)
             raise DataError(f"neither {wanted} is there", where=str(folder))
         return found
 
@@ -131,16 +127,17 @@ class ShapeNet:
     def _list(self, category: str) -> dict[str, ShapeNetModel]:
         if category not in self._models:
             synset = synset_of_name(category)
+            folder = self.root / synset
             self._models[category] = {
                 model_id: ShapeNetModel(category, synset, model_id, path)
-                for model_id in sorted(os.listdir(self.root / synset))
-                if (path := _mesh_file(self.root / synset / model_id)) is not None
+                for model_id in sorted(os.listdir(folder))
+                if (path := _mesh_file(folder / model_id)) is not None
             }
         return self._models[category]
 
 
 def _mesh_file(folder: Path) -> Path | None:
-    return next((folder / file for file in _MESH_FILES if (folder / file).is_file()), None)
+    return next((folder / file for file in MESH_FILES if (folder / file).is_file()), None)
 
 
 class MeshLocator:
@@ -156,11 +153,13 @@ class MeshLocator:
     def paths(self, synset: str, model_id: str) -> tuple[Path, ...]:
         """All mesh files of a model: of the given ShapeNetCore, KeypointNet's, of those below."""
         if synset not in self._listings:
-            self._listings[synset] = (
-                *(_list_models(shapenet, synset) for shapenet in self._given),
-                _list_ply(self._ply_folder / synset),
-                *(_list_models(shapenet, synset) for shapenet in self._below),
+            files = (self._ply_folder / synset).glob("*.ply")
+            ply = {path.name.removesuffix(".ply"): path for path in files}
+            given, below = (
+                [_list_models(shapenet, synset) for shapenet in places]
+                for places in (self._given, self._below)
             )
+            self._listings[synset] = (*given, ply, *below)
         return tuple(paths[model_id] for paths in self._listings[synset] if model_id in paths)
 
 
@@ -168,11 +167,3 @@ def _list_models(shapenet: ShapeNet, synset: str) -> dict[str, Path]:
     name = name_of_synset(synset)
     models = shapenet[name] if name in shapenet.categories else ()
     return {model.model_id: model.mesh_path for model in models}
-
-
-def _list_ply(folder: Path) -> dict[str, Path]:
-    try:
-        names = os.listdir(folder)
-    except OSError:
-        names = []
-    return {name.removesuffix(".ply"): folder / name for name in names if name.endswith(".ply")}

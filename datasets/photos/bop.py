@@ -158,15 +158,7 @@ class Bop(PhotoDataset):
     ``models_info.json``'s. The mask is that of the visible pixels. Categories are the models' ids,
     ``obj_000001``. A model's box is its truth's box.
 
-    Parameters
-    ----------
-    root : str or path-like
-        The folder.
-
-    Raises
-    ------
-    DataError
-        If there is no scene, or no table of a scene can be read.
+    Raises DataError if there is no scene, or no table of a scene can be read.
     """
 
     kind = "BOP"
@@ -292,11 +284,9 @@ class _Poses(PoseFile):
         scenes = {each.scene for each in estimates.poses}
         is_numbered = self._own or any("/" in name for name in dataset.names)
         if not is_numbered and len(scenes) > 1:
-            raise DataError(
-                f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number",
-                where=str(estimates.path),
-                fix="give the data set's folder, or a file of that scene alone",
-            )
+            what = f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number"
+            fix = "give the data set's folder, or a file of that scene alone"
+            raise DataError(what, where=str(estimates.path), fix=fix)
         # A file or a folder that tells no number is of the one scene there is.
         self._any_scene = not is_numbered or scenes == {""}
         self._poses: dict[tuple[str, str], list[PoseEstimate]] = defaultdict(list)

@@ -61,11 +61,9 @@ def open_photos(
     for each in formats:
         if each.is_here(folder):
             return each.open(folder)
-    raise DataError(
-        "no data set of photos is recognised in this folder",
-        where=str(folder),
-        fix=f"known are: {'; '.join(each.signature for each in formats)}",
-    )
+    what = "no data set of photos is recognised in this folder"
+    fix = f"known are: {'; '.join(each.signature for each in formats)}"
+    raise DataError(what, where=str(folder), fix=fix)
 
 
 def write_photos(

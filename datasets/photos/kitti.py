@@ -96,17 +96,8 @@ class KittiCars(PhotoDataset):
     offset in P2 is added to the labels' locations. Where a calibration file is missing, so are the
     camera and the offset.
 
-    Parameters
-    ----------
-    root : str or path-like
-        The folder.
-    categories : iterable of str
-        KITTI's types to take.
-
-    Raises
-    ------
-    DataError
-        If there is none of these files, or none can be read.
+    ``categories`` are KITTI's types to take. Raises DataError if there is none of these files, or
+    none can be read.
     """
 
     kind = "KITTI"

@@ -211,9 +211,7 @@ def list_tracks(path: Path) -> Iterator[KeypointFrame | DataError]:
     try:
         table = read_table(path)
         model = _mean_car(path, table)
-        raw = parse(table.get("tracks", Raw(b"null")), Any, path=path, where="tracks")
-        with in_file(path):
-            tracks = convert(raw, list[Any], "tracks")
+        tracks = _part(path, table, "tracks", list[Any])
     except DataError as error:
         yield error
         return
@@ -320,11 +318,8 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
     cam_from_car: FloatArray = pose.rotation @ car_from_model.T
     tilt = np.degrees(np.arccos(np.clip(cam_from_car[:, 2] @ UP, -1, 1)))
     if tilt > _MOST_TILT:
-        raise InputError(
-            f"KITTI's boxes stand upright, but this one is tilted by {tilt:.0f} degrees",
-            where=placed.photo.name,
-            fix="choose another form, such as bop",
-        )
+        what = f"KITTI's boxes stand upright, but this one is tilted by {tilt:.0f} degrees"
+        raise InputError(what, where=placed.photo.name, fix="choose another form, such as bop")
     width, length, height = np.abs(car_from_model @ placed.sides).tolist()
     image = placed.copy_image(folder / "images" / f"{number:06d}")
     keypoints = [
@@ -408,13 +403,14 @@ def car_keypoints(shape: ShapeModel, box: Box, camera: Camera) -> ImageKeypoints
 
 
 def _mean_car(path: Path, table: dict[str, Raw]) -> MeanCar:
-    raw = {
-        name: parse(table.get(name, Raw(b"null")), Any, path=path, where=name)
-        for name in ("names", "model_xyz")
-    }
+    raw = {name: _part(path, table, name, Any) for name in ("names", "model_xyz")}
     with in_file(path):
         found: MeanCar = convert(raw, MeanCar)
     return found
+
+
+def _part(path: Path, table: dict[str, Raw], name: str, kind: Any) -> Any:
+    return parse(table.get(name, Raw(b"null")), kind, path=path, where=name)
 
 
 def _numbers(path: Path, multiple: int) -> FloatArray:

@@ -180,20 +180,17 @@ class _Elements:
             raise InputError(f"an array of {count} values is cut short")
         if not count or not each:
             return _NOTHING
+
+        def inner() -> Any:
+            kind, content = self.next()
+            if kind != _MATRIX:
+                raise InputError(f"an array of the unknown type {kind}")
+            return _Elements(content, self._order).matrix(depth=depth + 1)[1]
+
         values = np.empty(count, dtype=object)
         for number in range(count):
-            values[number] = (
-                self._inner(depth)
-                if fields is None
-                else {name: self._inner(depth) for name in fields}
-            )
+            values[number] = inner() if fields is None else {name: inner() for name in fields}
         return values.reshape(shape, order="F").squeeze()[()]
-
-    def _inner(self, depth: int) -> Any:
-        kind, content = self.next()
-        if kind != _MATRIX:
-            raise InputError(f"an array of the unknown type {kind}")
-        return _Elements(content, self._order).matrix(depth=depth + 1)[1]
 
     def _field_names(self) -> list[str]:
         length = self._integers()[0]

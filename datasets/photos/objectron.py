@@ -105,15 +105,7 @@ class Objectron(PhotoDataset):
     metres. The keypoints are the box's centre and corners, also those that the object hides. Photos
     are upright, while the annotated camera is the sensor's, which lies on its side.
 
-    Parameters
-    ----------
-    root : str or path-like
-        The folder.
-
-    Raises
-    ------
-    DataError
-        If there are no annotation files, or none can be read.
+    Raises DataError if there are no annotation files, or none can be read.
     """
 
     kind = "Objectron"

@@ -72,15 +72,7 @@ class Pascal3D(PhotoDataset):
     without a continuous viewpoint (distance 0) have no pose. Anchors that are visible are the
     keypoints. In PASCAL3D+ only the objects of the folder's category are taken.
 
-    Parameters
-    ----------
-    root : str or path-like
-        The folder.
-
-    Raises
-    ------
-    DataError
-        If there are no annotations.
+    Raises DataError if there are no annotations.
     """
 
     kind = "PASCAL3D+"
@@ -281,15 +273,7 @@ class Pascal3DDetections(PhotoDataset):
     There are no poses, and the file's squares around the objects are crops, no rectangles of
     theirs. Photos that are listed but not there are problems.
 
-    Parameters
-    ----------
-    root : str or path-like
-        The folder.
-
-    Raises
-    ------
-    DataError
-        If there are no lists of photos, or one cannot be read.
+    Raises DataError if there are no lists of photos, or one cannot be read.
     """
 
     kind = "PASCAL3D+ photos with detected keypoints"

@@ -77,15 +77,7 @@ class Pix3D(PhotoDataset):
     their numbers: of several annotators' the mean of those who marked them. Pixels are counted
     from the corner of the image there, from the corner pixel's centre here.
 
-    Parameters
-    ----------
-    root : str or path-like
-        The folder of ``pix3d.json``.
-
-    Raises
-    ------
-    DataError
-        If the file is missing or cannot be read.
+    Raises DataError if ``pix3d.json`` in the folder ``root`` is missing or cannot be read.
     """
 
     kind = "Pix3D"
@@ -179,11 +171,8 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
     middle = (camera.width - 1) / 2, (camera.height - 1) / 2
     is_off = max(abs(camera.cx - middle[0]), abs(camera.cy - middle[1])) > _NEAR_MIDDLE
     if is_off or abs(camera.fy / camera.fx - 1) > _SAME_FOCAL:
-        raise InputError(
-            "Pix3D has the principal point in the image's middle, and square pixels",
-            where=placed.photo.name,
-            fix="choose another form, such as bop",
-        )
+        what = "Pix3D has the principal point in the image's middle, and square pixels"
+        raise InputError(what, where=placed.photo.name, fix="choose another form, such as bop")
     bbox = placed.bbox + PIXEL_CENTRE
     model = folder / "model" / category / f"{number:06d}"
     placed.write_model(model / "model.obj", is_stretched=True)

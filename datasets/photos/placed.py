@@ -159,11 +159,9 @@ class PlacedObject:
     def require_plain_camera(self, format: str) -> None:
         """Refuse lens distortion, for which a format has no place."""
         if self.camera.distortion:
-            raise InputError(
-                f"{format} has no place for lens distortion",
-                where=self.photo.name,
-                fix="undistort the photo and annotate it again",
-            )
+            what = f"{format} has no place for lens distortion"
+            fix = "undistort the photo and annotate it again"
+            raise InputError(what, where=self.photo.name, fix=fix)
 
     def copy_image(self, stem: Path) -> Path:
         """Copy the photo, upright; a file that is so already is copied as it is."""

@@ -39,15 +39,7 @@ class _Entry(ForeignDocument):
 class PosedPhotos(PhotoDataset):
     """Photos of one object each, as ``poses.json`` lists them; see docs/formats/photo_files.md.
 
-    Parameters
-    ----------
-    root : str or path-like
-        The folder of ``poses.json``.
-
-    Raises
-    ------
-    DataError
-        If the file is missing or cannot be read.
+    Raises DataError if ``poses.json`` in the folder ``root`` is missing or cannot be read.
     """
 
     kind = "posed photos (BOP's units)"

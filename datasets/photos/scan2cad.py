@@ -16,6 +16,7 @@ from msgspec import Meta, Raw
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.categories import name_of_synset
+from cadalign.datasets.models.shapenet import MESH_FILES
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     PhotoFormat,
@@ -51,7 +52,6 @@ FULL = "full_annotations.json"
 _SAMPLES = ("example_annotation.json", "annot.json", "samples/annot.json")
 _FRAME_FOLDERS = (".", "scans", "scannet", "ScanNet", "ScanNet/scans", "samples")
 _MODEL_FOLDERS = ("ShapeNetCore.v2", "shapenet", "ShapeNet", "Meshes", "samples/Meshes", ".")
-_MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
 _UP = (0.0, 1.0, 0.0)
 # Corners nearer than this are as good as behind the camera [m].
 _NEAR = 0.05
@@ -218,7 +218,7 @@ def _object(
         place / file
         for folder in folders
         for place in (folder / found.catid_cad / found.id_cad, folder / found.id_cad)
-        for file in _MESH_FILES
+        for file in MESH_FILES
     )
     keypoints, points = _keypoints(found, world_from_model, cam_from_world, camera)
     return PhotoObject(
@@ -347,7 +347,7 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
     scene, category = f"scene{number:04d}_00", placed.category
     model_id = f"{number:06d}-{placed.model_id}"
     models = folder / _MODEL_FOLDERS[0] / category / model_id
-    placed.write_model(models / _MESH_FILES[0], is_stretched=False)
+    placed.write_model(models / MESH_FILES[0], is_stretched=False)
     pose, turn, scan_from_cam = placed.pose, upright_rotation(placed.up), np.eye(4)
     scan_from_cam[:3, :3] = turn
     place = folder / "scans" / scene

@@ -8,8 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.sample.model import Draft
-from cadalign.datasets.sample.solids import Color, Point, Solid, lathe, palette, pick
+from cadalign.datasets.sample.model import (
+    Color,
+    Draft,
+    Point,
+    Solid,
+    lathe,
+    palette,
+    pick,
+)
 
 _EDGE = 0.022  # radius of the rounded edge of the bottom
 

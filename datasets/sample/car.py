@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.solids import (
+from cadalign.datasets.sample.model import (
     Color,
+    Draft,
     Level,
     Solid,
     beam,
@@ -18,6 +18,7 @@ from cadalign.datasets.sample.solids import (
     ellipsoid,
     lathe,
     loft,
+    mirrored_places,
     palette,
     stack,
 )

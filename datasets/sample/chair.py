@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.solids import (
+from cadalign.datasets.sample.model import (
     Color,
+    Draft,
     Point,
     Solid,
     beam,
@@ -16,6 +16,7 @@ from cadalign.datasets.sample.solids import (
     box,
     ellipsoid,
     lathe,
+    mirrored_places,
     palette,
     pick,
 )

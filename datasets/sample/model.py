@@ -1,19 +1,198 @@
-"""Sample models: solids joined to one mesh, with keypoints on its surface."""
+"""Sample models: closed solids of one colour, joined to one mesh with keypoints on its surface.
+
+The solids are boxes, lathes and extrusions. All but sharp boxes are lofts, surfaces through a row
+of closed outlines, because a part around the plane x = 0 must be exactly mirror symmetric, also in
+its tessellation.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import trimesh
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.sample.solids import Point, Solid
 from cadalign.geometry.mesh import Mesh
 
+Color = tuple[int, int, int]
+"""Red, green and blue, 0 to 255."""
+Point = tuple[float, float, float]
+Level = tuple[float, float, float, float]
+"""A rectangle across a body: height y, width, z of its front and of its rear."""
+
+_WELD_DECIMALS = 8
+_TINY_AREA = 1e-12
 _CREASE_DEGREES = 35.0
+
+
+def palette(text: str) -> tuple[Color, ...]:
+    """Colours by their hexadecimal digits, such as ``"b02428 202228"``."""
+    return tuple((red, green, blue) for red, green, blue in map(bytes.fromhex, text.split()))
+
+
+def pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
+    return colors[int(rng.integers(len(colors)))]
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A closed surface of one colour."""
+
+    vertices: FloatArray  # (n, 3), all different
+    faces: IntArray  # (m, 3), counter-clockwise as seen from outside
+    color: Color
+
+    @classmethod
+    def from_triangles(cls, vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Solid:
+        """Weld coinciding vertices, drop triangles without area, turn the surface outward."""
+        points = np.round(np.asarray(vertices, dtype=float), _WELD_DECIMALS) + 0.0
+        welded, inverse = np.unique(points, axis=0, return_inverse=True)
+        triangles = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)]
+        a, b, c = welded[triangles].transpose(1, 0, 2)
+        doubled_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        solid = cls(welded, triangles[doubled_area > _TINY_AREA], color)
+        return solid if solid.volume >= 0 else replace(solid, faces=solid.faces[:, ::-1])
+
+    @property
+    def volume(self) -> float:
+        """The enclosed volume; negative where the faces look inward."""
+        corners = self.vertices[self.faces] - self.vertices.mean(axis=0)
+        return float(np.linalg.det(corners).sum() / 6)
+
+
+def both_sides(*solids: Solid) -> list[Solid]:
+    """The solids together with their mirror images under x -> -x."""
+    return [
+        *solids,
+        *(replace(s, vertices=s.vertices * (-1, 1, 1), faces=s.faces[:, ::-1]) for s in solids),
+    ]
+
+
+def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
+    """Join a row of closed outlines (k, n, 3), n even, by a surface and close its two ends.
+
+    Point ``j`` of one is joined with point ``j`` of the next. An end is closed by strips between
+    the points ``j`` and ``n - j`` and a spine in the middle of them, so outlines should be
+    symmetric in that order. An outline may shrink to a line or a point.
+    """
+    rings = np.asarray(outlines, dtype=float)
+    # An end is one more outline that has collapsed onto its spine.
+    spines = (rings[[0, -1]] + rings[[0, -1]][:, -np.arange(rings.shape[1])]) / 2
+    rings = np.concatenate([spines[:1], rings, spines[1:]])
+    index = np.arange(rings.shape[0] * rings.shape[1]).reshape(rings.shape[:2])
+    after = np.roll(index, -1, axis=1)
+    a, b, c, d = (each.reshape(-1) for each in (index[:-1], after[:-1], after[1:], index[1:]))
+    vertices = rings.reshape(-1, 3)
+    # Quads are cut along the other diagonal on the other side of x = 0.
+    right = (vertices[a] + vertices[b] + vertices[c] + vertices[d])[:, 0] > 0
+    first = np.stack([a, b, np.where(right, d, c)], axis=1)
+    second = np.stack([np.where(right, b, a), c, d], axis=1)
+    return Solid.from_triangles(vertices, np.concatenate([first, second]), color)
+
+
+def rectangle(width: float, height: float, *, radius: float, steps: int) -> FloatArray:
+    """An outline (n, 2) with round corners of ``steps`` pieces, from the middle of its top."""
+    radius = max(min(radius, 0.499 * width, 0.499 * height), 0.0)
+    angle = np.linspace(0, np.pi / 2, steps + 1)
+    arc = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+    upper = np.array([width, height]) / 2 - radius + radius * arc
+    top = np.array([[0.0, height / 2]])
+    right = np.concatenate([upper, [[width / 2, 0.0]], upper[::-1] * (1, -1)])
+    return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
+
+
+def stack(levels: Sequence[Level], color: Color, *, radius: float) -> Solid:
+    """A body through rectangles with round corners, from the lowest up."""
+    rings = [
+        np.insert(rectangle(width, rear - front, radius=radius, steps=3), 1, y, axis=1)
+        + (0, 0, (front + rear) / 2)
+        for y, width, front, rear in levels
+    ]
+    return loft(rings, color)
+
+
+def box(
+    center: npt.ArrayLike, size: Point, color: Color, *, radius: float = 0.0, steps: int = 2
+) -> Solid:
+    """A box; ``steps`` flat pieces make a quarter circle of its rounded edges."""
+    middle, (width, height, depth) = np.asarray(center, dtype=float), size
+    if radius == 0:
+        block = trimesh.creation.box(extents=size)
+        return Solid.from_triangles(block.vertices + middle, block.faces, color)
+    radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
+    angle = np.linspace(0, np.pi / 2, steps + 1)
+    lower = np.stack([1 - np.sin(angle), 1 - np.cos(angle)], axis=1) * radius - (0, height / 2)
+    rings = [
+        np.insert(rectangle(width - 2 * i, depth - 2 * i, radius=radius - i, steps=steps), 1, y, 1)
+        for i, y in np.concatenate([lower, lower[::-1] * (1, -1)])
+    ]
+    return loft(np.array(rings) + middle, color)
+
+
+def beam(
+    path: npt.ArrayLike | Sequence[npt.ArrayLike],
+    size: tuple[float, float],
+    color: Color,
+    *,
+    scales: Sequence[float | tuple[float, float]] = (1.0,),
+    side: Point | None = None,
+    radius: float | None = None,
+) -> Solid:
+    """Extrude a rectangle along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
+
+    ``size`` is along ``side``, made perpendicular to the path, and across it; by default ``side``
+    is x, or z where the path runs along x.
+    """
+    points = np.asarray(path, dtype=float)
+    tangent = trimesh.unitize(np.gradient(points, axis=0))
+    along = side or ((1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1))
+    first = trimesh.unitize(along - (tangent @ along)[:, None] * tangent)
+    section = rectangle(*size, radius=radius or 0.18 * min(size), steps=2 if radius else 1)
+    outlines = section * np.reshape(scales, (len(scales), 1, -1))
+    rings = (
+        outlines[..., :1] * first[:, None] + outlines[..., 1:] * np.cross(tangent, first)[:, None]
+    )
+    return loft(points[:, None] + rings, color)
+
+
+def lathe(
+    profile: npt.ArrayLike,
+    color: Color,
+    *,
+    center: npt.ArrayLike = (0, 0, 0),
+    count: int = 24,
+    depth: npt.ArrayLike = 1.0,
+    exponent: npt.ArrayLike = 2.0,
+    sideways: bool = False,
+) -> Solid:
+    """Turn a profile (k, 2) of radius and height around a vertical axis, in ``count`` = 4 i points.
+
+    ``depth``, one or (k,), is the extent along z relative to x; ``exponent`` is 2 for circles, more
+    for rounded squares: sections are superellipses ``|x/a|^exponent + |z/b|^exponent = 1``. The
+    axis of a ``sideways`` solid is along x, its heights are distances outward.
+    """
+    radius, height = np.asarray(profile, dtype=float).T[..., None]
+    angle = 2 * np.pi * np.arange(count) / count
+    unit = np.round([np.sin(angle), np.cos(angle)], 12)[:, None]
+    across, along = radius * np.sign(unit) * np.abs(unit) ** (2 / np.reshape(exponent, (-1, 1)))
+    axis = np.broadcast_to(height, across.shape)
+    along = along * np.reshape(depth, (-1, 1))
+    rings = np.stack([axis, across, along] if sideways else [across, axis, along], axis=2)
+    return loft(rings + np.asarray(center, dtype=float), color)
+
+
+def ellipsoid(center: Point, size: Point, color: Color, *, count: int) -> Solid:
+    """An ellipsoid of the given full extents (3,)."""
+    angle = np.linspace(0, np.pi, count // 2 + 1)
+    profile = np.stack([size[0] * np.sin(angle), -size[1] * np.cos(angle)], axis=1) / 2
+    return lathe(profile, color, center=center, count=count, depth=size[2] / size[0])
+
+
+# Models -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.sample.model import Draft, mirrored_places
-from cadalign.datasets.sample.solids import (
+from cadalign.datasets.sample.model import (
     Color,
+    Draft,
     Level,
     Point,
     Solid,
@@ -19,6 +19,7 @@ from cadalign.datasets.sample.solids import (
     box,
     lathe,
     loft,
+    mirrored_places,
     palette,
     pick,
     stack,

@@ -65,7 +65,17 @@ def sample_models(
     ('sample_bottle_000', 17)
     """
     names = _check_arguments(per_category, categories, seed)
-    return (_make(category, index, seed) for category in names for index in range(per_category))
+
+    def make(category: str, index: int) -> SampleModel:
+        rng = np.random.default_rng([seed, int(SYNSETS[category]), index])
+        # Real models are not centred either; x stays, so that x = 0 remains the mirror plane.
+        offset = rng.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, size=3) * (0, 1, 1)
+        if category == "bottle":
+            offset[2] = 0.0
+        draft, model_id = MAKERS[category](rng, index), f"sample_{category}_{index:03d}"
+        return finish(draft, category=category, model_id=model_id, offset=offset)
+
+    return (make(category, index) for category in names for index in range(per_category))
 
 
 def write_sample_dataset(
@@ -148,16 +158,6 @@ def _check_arguments(
     return tuple(categories)
 
 
-def _make(category: str, index: int, seed: int) -> SampleModel:
-    rng = np.random.default_rng([seed, int(SYNSETS[category]), index])
-    # Real models are not centred either; x stays, so that x = 0 remains the mirror plane.
-    offset = rng.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, size=3) * (0, 1, 1)
-    if category == "bottle":
-        offset[2] = 0.0
-    draft, model_id = MAKERS[category](rng, index), f"sample_{category}_{index:03d}"
-    return finish(draft, category=category, model_id=model_id, offset=offset)
-
-
 def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> None:
     splits: dict[str, list[str]] = {name: [] for name in _SPLITS}
     annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
@@ -179,20 +179,17 @@ def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> No
 def _annotation(model: SampleModel) -> dict[str, Any]:
     """A model's entry in KeypointNet's ``annotations/<category>.json``."""
     row = {keypoint.semantic_id: i for i, keypoint in enumerate(model.keypoints)}
-    mirrored = [[row[semantic_id] for semantic_id in pair] for pair in model.mirrored]
-    turned = [[row[semantic_id] for semantic_id in group] for group in model.turned]
-    circles = [_circle(model, rows) if model.round else {} for rows in turned]
+    mirrored = [{"kp_indexes": [row[number] for number in pair]} for pair in model.mirrored]
+    turned = []
+    for group in model.turned:
+        rows = [row[semantic_id] for semantic_id in group]
+        circle = _circle(model, rows) if model.round else {}
+        turned.append({"kp_indexes": rows, "is_circle": model.round, "circle": circle})
     return {
         "class_id": SYNSETS[model.category],
         "model_id": model.model_id,
         "keypoints": [_keypoint_entry(keypoint) for keypoint in model.keypoints],
-        "symmetries": {
-            "reflection": [{"kp_indexes": rows} for rows in mirrored],
-            "rotation": [
-                {"kp_indexes": rows, "is_circle": model.round, "circle": circle}
-                for rows, circle in zip(turned, circles, strict=True)
-            ],
-        },
+        "symmetries": {"reflection": mirrored, "rotation": turned},
     }
 
 

@@ -116,11 +116,9 @@ class Bundler(CorrespondenceSet):
             what = (
                 f"observations reach {reach[0]:.1f} and {reach[1]:.1f} px from the middle, outside"
             )
-            raise DataError(
-                f"{what} an image of {size[0]} x {size[1]}",
-                where=f"{self.source}, image {name}",
-                fix="give the sizes of the photos that the model was made from",
-            )
+            what = f"{what} an image of {size[0]} x {size[1]}"
+            fix = "give the sizes of the photos that the model was made from"
+            raise DataError(what, where=f"{self.source}, image {name}", fix=fix)
         return size
 
 

@@ -75,11 +75,9 @@ class Correspondences:
             if length != len(points_3d):
                 raise InputError(f"{length} rows, but points_3d has {len(points_3d)}", where=name)
         if (self.cam_from_world.scale != 1).any():
-            raise InputError(
-                f"the scale is {self.cam_from_world.scale.tolist()}",
-                where="cam_from_world",
-                fix="a true pose does not stretch the scene: give the scale (1, 1, 1)",
-            )
+            what = f"the scale is {self.cam_from_world.scale.tolist()}"
+            fix = "a true pose does not stretch the scene: give the scale (1, 1, 1)"
+            raise InputError(what, where="cam_from_world", fix=fix)
         object.__setattr__(self, "points_3d", read_only(points_3d))
         object.__setattr__(self, "points_2d", read_only(points_2d))
 
@@ -89,22 +87,13 @@ class Correspondences:
     def residuals(self) -> FloatArray:
         """Projected minus observed points [px] under the true pose, (n, 2) float.
 
-        Raises
-        ------
-        InputError
-            If the true pose has points behind the camera.
+        Raises InputError if the true pose has points behind the camera.
         """
         projected = self.camera.project(self.cam_from_world.apply(self.points_3d))
         return np.asarray(projected - self.points_2d)
 
     def subset(self, rows: npt.ArrayLike) -> Correspondences:
-        """Keep some of the points.
-
-        Parameters
-        ----------
-        rows : (n,) bool or (k,) int
-            A mask, or the rows to keep.
-        """
+        """Keep some of the points: ``rows`` is a mask (n,), or the rows to keep (k,)."""
         chosen = np.asarray(rows)
         is_mask = chosen.dtype.kind == "b" and chosen.shape == (len(self),)
         if not is_mask and chosen.dtype.kind not in "iu":
@@ -131,12 +120,9 @@ class CameraView:
     def rigid(self, where: str) -> Alignment:
         """The pose; raises InputError, which names the place, where it has a scale."""
         if (self.cam_from_world.scale != 1).any():
-            raise InputError(
-                f"the pose has the scale {self.cam_from_world.scale.tolist()}",
-                where=where,
-                fix="camera files hold rigid poses: stretch the model and give the pose with scale "
-                "1",
-            )
+            what = f"the pose has the scale {self.cam_from_world.scale.tolist()}"
+            fix = "camera files hold rigid poses: stretch the model and give the pose with scale 1"
+            raise InputError(what, where=where, fix=fix)
         return self.cam_from_world
 
 
@@ -194,18 +180,20 @@ class CorrespondenceSet(ABC):
     def __getitem__(self, key: int | str | slice) -> Correspondences | tuple[Correspondences, ...]:
         """One image by position or id, or a slice of them.
 
-        Raises
-        ------
-        InputError
-            If there is no such image.
-        DataError
-            If the file describes it wrongly.
+        Raises InputError if there is no such image, DataError if the file describes it wrongly.
         """
         if isinstance(key, slice):
             return tuple(self[position] for position in range(*key.indices(len(self))))
-        position = self._position(key)
+        position = key if not isinstance(key, str) else self._positions.get(key, key)
+        if isinstance(position, str):
+            known = ", ".join(self.ids[:5]) + (", ..." if len(self) > 5 else "")
+            where, fix = str(self.source), f"known are {known}"
+            raise InputError(f"no image {key!r}", where=where, fix=fix)
+        if not isinstance(key, str | int | np.integer) or not -len(self) <= position < len(self):
+            what, fix = f"no image {key!r} among {len(self)}", "give a position from 0, or an id"
+            raise InputError(what, where=str(self.source), fix=fix)
         self._prepare()
-        return self._read_checked(position)
+        return self._read_checked(int(position) % len(self))
 
     def __iter__(self) -> Iterator[Correspondences]:
         self._prepare()
@@ -225,23 +213,6 @@ class CorrespondenceSet(ABC):
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.source)!r}, {len(self)} images)"
 
-    def _position(self, key: int | str) -> int:
-        if isinstance(key, str):
-            position = self._positions.get(key)
-            if position is None:
-                known = ", ".join(self.ids[:5]) + (", ..." if len(self) > 5 else "")
-                raise InputError(
-                    f"no image {key!r}", where=str(self.source), fix=f"known are {known}"
-                )
-            return position
-        if not isinstance(key, int | np.integer) or not -len(self) <= key < len(self):
-            raise InputError(
-                f"no image {key!r} among {len(self)}",
-                where=str(self.source),
-                fix="give a position from 0, or an id",
-            )
-        return int(key) % len(self)
-
     def _read_checked(self, position: int) -> Correspondences:
         try:
             # Numbers that overflow are refused by what they are given to.
@@ -249,8 +220,7 @@ class CorrespondenceSet(ABC):
                 return self._read(position)
         except InputError as error:
             where = f"{self.source}, image {self.ids[position][:200]}"
-            if error.where is not None:
-                where = f"{where}, {error.where}"
+            where += "" if error.where is None else f", {error.where}"
             raise DataError(error.what, where=where, fix=error.fix) from None
 
 

@@ -138,11 +138,8 @@ class _PlainUnpickler(pickle.Unpickler):
         # Python 2 and NumPy 1 call the same modules otherwise.
         current = module.replace("__builtin__", "builtins").replace("numpy.core.", "numpy._core.")
         if (current, name) not in self._allowed:
-            raise DataError(
-                f"the pickle asks for {quote(f'{module}.{name}')[1:-1]}, which is refused",
-                where=self._where,
-                fix=_FIX,
-            )
+            what = f"the pickle asks for {quote(f'{module}.{name}')[1:-1]}, which is refused"
+            raise DataError(what, where=self._where, fix=_FIX)
         return self._allowed[current, name]
 
 

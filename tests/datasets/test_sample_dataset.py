@@ -15,8 +15,7 @@ from scipy.spatial import cKDTree
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample import SampleModel, sample_models, write_sample_dataset
-from cadalign.datasets.sample.model import closest_barycentric, split_creases
-from cadalign.datasets.sample.solids import box, ellipsoid
+from cadalign.datasets.sample.model import box, closest_barycentric, ellipsoid, split_creases
 from cadalign.datasets.sample.writer import MAKERS
 from cadalign.errors import CadalignError, DataError, InputError
 

@@ -20,7 +20,7 @@ from cadalign.datasets import (
     join_keypoints,
     read_image_keypoints,
 )
-from cadalign.datasets.detections.coco_masks import decode_segmentation
+from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file

@@ -1,10 +1,11 @@
-"""COCO: keypoints in images, read from its JSON and what detectors make of it, and written.
+"""COCO: keypoints in images, read from its JSON and what detectors make of it, written; masks.
 
 The forms that are read are described in docs/formats/detections.md.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
-from cadalign.io.documents import Finite, ForeignDocument, Text, convert, in_file, read_json
+from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
 from cadalign.io.files import write_json
 
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keypoints of detectors"
@@ -74,8 +75,6 @@ class _Category(ForeignDocument):
 
 
 class _Annotations(ForeignDocument):
-    """COCO annotations."""
-
     annotations: list[_Object]
     images: list[_Image] | None = None
     categories: list[_Category] | None = None
@@ -215,6 +214,110 @@ def _scores(third: FloatArray) -> FloatArray:
     return third
 
 
+# Masks ------------------------------------------------------------------------------------------
+
+_MASK_FIX = "give COCO polygons, or the run lengths of a mask of this image"
+_FIRST, _LAST = 48, 111  # characters of compressed run lengths
+_MOST_BITS = 35  # of a length: more than any image has pixels
+_MOST_PIXELS = 2**28
+_Polygon = Annotated[list[Finite], Meta(min_length=6)]
+
+
+class _Runs(ForeignDocument):
+    """A mask as lengths of runs of pixels outside and inside in turn, column by column."""
+
+    size: tuple[Count, Count]
+    counts: list[Count] | str
+
+
+def decode_segmentation(segmentation: Any, *, width: int, height: int) -> BoolArray:
+    """Decode the ``segmentation`` of a COCO annotation or result, (height, width) bool.
+
+    It is, as in the JSON, a list of polygons ``[x, y, x, y, ...]`` in a frame whose origin is the
+    top-left corner of the image, or ``{"size": [height, width], "counts": ...}``: lengths of runs
+    as a list or as COCO's text, which holds the difference of every length from the last but one
+    in groups of five bits. Raises DataError if it is neither, or of another image size, or the
+    mask is empty.
+
+    Examples
+    --------
+    >>> square = [[1.0, 0.0, 3.0, 0.0, 3.0, 2.0, 1.0, 2.0]]
+    >>> decode_segmentation(square, width=4, height=2).astype(int).tolist()
+    [[0, 1, 1, 0], [0, 1, 1, 0]]
+    >>> runs = {"size": [2, 4], "counts": [2, 4, 2]}
+    >>> decode_segmentation(runs, width=4, height=2).astype(int).tolist()
+    [[0, 1, 1, 0], [0, 1, 1, 0]]
+    """
+    if width * height > _MOST_PIXELS:
+        raise DataError(f"an image of {width} x {height} pixels is too large for a mask")
+    if isinstance(segmentation, dict):
+        mask = _decode_runs(convert(segmentation, _Runs, "segmentation"), width, height)
+    else:
+        polygons = convert(segmentation, list[_Polygon], "segmentation")
+        mask = _fill(polygons, width, height)
+    if not mask.any():
+        raise DataError("the mask is empty", where="segmentation", fix=_MASK_FIX)
+    return mask
+
+
+def _decode_runs(runs: _Runs, width: int, height: int) -> BoolArray:
+    if runs.size != (height, width):
+        what = f"the mask is {runs.size[1]} x {runs.size[0]}, the image {width} x {height}"
+        raise DataError(what, where="segmentation.size", fix=_MASK_FIX)
+    hint, counts = "", runs.counts
+    if isinstance(counts, str):
+        hint, counts = "; is the text whole?", _decompress(counts)
+    if sum(counts) != width * height or min(counts, default=0) < 0:
+        what = f"the runs have {sum(counts)} pixels, the image {width * height}{hint}"
+        raise DataError(what, where="segmentation.counts", fix=_MASK_FIX)
+    inside = np.arange(len(counts)) % 2 == 1
+    return np.ascontiguousarray(np.repeat(inside, counts).reshape(width, height).T)
+
+
+def _decompress(text: str) -> list[int]:
+    """Run lengths of COCO's text; see ``rleFrString`` in its ``maskApi.c``."""
+    counts: list[int] = []
+    value = shift = 0
+    for place, character in enumerate(text):
+        bits = ord(character) - _FIRST
+        if not 0 <= bits <= _LAST - _FIRST or shift > _MOST_BITS:
+            what = f"character {place} is not of compressed run lengths"
+            raise DataError(what, where="segmentation.counts", fix=_MASK_FIX)
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if bits & 0x20:
+            continue
+        if bits & 0x10:
+            value -= 1 << shift
+        counts.append(value + (counts[-2] if len(counts) > 2 else 0))
+        value = shift = 0
+    if shift:
+        raise DataError("the text is cut short", where="segmentation.counts", fix=_MASK_FIX)
+    return counts
+
+
+def _fill(polygons: Sequence[Sequence[float]], width: int, height: int) -> BoolArray:
+    """Pixels (height, width) inside any of the polygons."""
+    from pycocotools import mask  # takes a while to import
+
+    for number, polygon in enumerate(polygons):
+        where = f"segmentation[{number}]"
+        if len(polygon) % 2:
+            what = f"{len(polygon)} numbers are not x, y of points"
+            raise DataError(what, where=where, fix=_MASK_FIX)
+        points = np.reshape(polygon, (-1, 2))
+        # Its memory grows with the polygon's length, which far points would make large.
+        if (np.abs(points) > 2 * max(width, height)).any():
+            raise DataError("has points far outside of the image", where=where, fix=_MASK_FIX)
+    if not polygons:
+        return np.zeros((height, width), dtype=bool)
+    runs = mask.merge(
+        mask.frPyObjects([list(map(float, each)) for each in polygons], height, width)
+    )
+    with warnings.catch_warnings(action="ignore"):  # its of NumPy's newer conventions
+        return np.asarray(mask.decode(runs) != 0)
+
+
 # Writing ----------------------------------------------------------------------------------------
 
 
@@ -238,10 +341,17 @@ class CocoObject:
         left, top, right, bottom = self.rectangle.tolist()
         pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
         rows = zip(pixels, self.flags.tolist(), strict=True)
-        pose, track = self.pose, self.track
+        further: dict[str, Any] = {}
+        if self.pose is not None:
+            further["pose"] = {
+                "quat_wxyz": quat_wxyz_from_rotation(self.pose.rotation).tolist(),
+                "translation": self.pose.translation.tolist(),
+                "scale": self.pose.scale.tolist(),
+            }
+        if self.track is not None:
+            further["track_id"] = self.track
         return {
-            **({} if pose is None else {"pose": _written_pose(pose)}),
-            **({} if track is None else {"track_id": track}),
+            **further,
             "id": number,
             "image_id": self.image,
             "category_id": 1 + self.category,
@@ -251,12 +361,6 @@ class CocoObject:
             "area": (right - left) * (bottom - top),
             "iscrowd": 0,
         }
-
-
-def _written_pose(pose: Alignment) -> dict[str, Any]:
-    turn = quat_wxyz_from_rotation(pose.rotation).tolist()
-    shift, scale = pose.translation.tolist(), pose.scale.tolist()
-    return {"quat_wxyz": turn, "translation": shift, "scale": scale}
 
 
 def coco_document(

@@ -53,7 +53,7 @@ class ImageKeypoints:
     """The calibrated camera, where the file has it."""
     segmentation: Any = field(default=None, kw_only=True)
     """The object's mask as COCO writes it, unchecked; see
-    `cadalign.datasets.detections.coco_masks.decode_segmentation`."""
+    `cadalign.datasets.detections.coco.decode_segmentation`."""
 
     def __post_init__(self) -> None:
         points = as_points(self.points_2d, name=f"{self.source}: keypoints", dimension=2)

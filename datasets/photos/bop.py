@@ -181,10 +181,7 @@ class Bop(PhotoDataset):
             prefix = "" if scene == folder else f"{scene.relative_to(folder).as_posix()}/"
             self._photos += [(scene, key) for key in keys]
             names += [f"{prefix}{key}" for key in keys]
-        if not names and bad:
-            raise next(iter(bad.values()))
-        super().__init__(folder, names)
-        self.problems |= bad
+        super().__init__(folder, names, bad)
         self._scene: _Scene | None = None
         self._models: BopModels | None = None
         self._known: dict[int, tuple[CadModel, Symmetry]] = {}

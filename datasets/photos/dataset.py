@@ -71,8 +71,10 @@ class PhotoDataset(ABC):
     ----------
     root : Path
         The folder.
-    names : sequence of str
+    names : iterable of str
         The photos' names.
+    problems : dict of str to DataError, optional
+        Why parts of the annotations could not be listed; the first is raised where nothing could.
 
     Examples
     --------
@@ -84,12 +86,16 @@ class PhotoDataset(ABC):
     kind: str = "photos"
     """Name of the format."""
 
-    def __init__(self, root: Path, names: Iterable[str]) -> None:
+    def __init__(
+        self, root: Path, names: Iterable[str], problems: dict[str, DataError] | None = None
+    ) -> None:
         self.root = root
         self.names = tuple(names)
         """The photos' names, in the annotations' order."""
-        self.problems: dict[str, DataError] = {}
+        self.problems = problems or {}
         """Why records or objects could not be read, of those read so far, by name."""
+        if self.problems and not self.names:
+            raise next(iter(self.problems.values()))
 
     @abstractmethod
     def read(self, index: int) -> Photo:

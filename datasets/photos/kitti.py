@@ -114,12 +114,10 @@ class KittiCars(PhotoDataset):
                 bad[str(found.where)] = found
             else:
                 self._frames.append(found)
-        if not self._frames:
+        if not self._frames and not bad:
             fix = f"give a folder of {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}"
-            nothing = DataError("no KITTI labels are here", where=str(folder), fix=fix)
-            raise next(iter(bad.values()), nothing)
-        super().__init__(folder, [frame.name for frame in self._frames])
-        self.problems |= bad
+            raise DataError("no KITTI labels are here", where=str(folder), fix=fix)
+        super().__init__(folder, [frame.name for frame in self._frames], bad)
         self._sequence: tuple[Path, dict[int, list[KittiLabel | DataError]]] | None = None
 
     def read(self, index: int) -> Photo:

@@ -127,12 +127,9 @@ class Objectron(PhotoDataset):
             stem = path.relative_to(folder).with_suffix("").as_posix()
             self._frames += [(path, number) for number in range(count)]
             names += [f"{stem}/{number}" for number in range(count)]
-        if bad and not names:
-            raise next(iter(bad.values()))
-        if not names:
+        if not names and not bad:
             raise DataError("the annotation files have no frames", where=str(folder))
-        super().__init__(folder, names)
-        self.problems |= bad
+        super().__init__(folder, names, bad)
         self._sequence: Sequence | None = None
 
     def read(self, index: int) -> Photo:

@@ -154,12 +154,11 @@ class Scan2CAD(PhotoDataset):
             for frame in list_frames(frames, scene)[::every]:
                 self._records.append((number, frame))
                 names.append(f"{scene}/{frame.frame_id}")
-        super().__init__(folder, names)
-        self.problems |= bad
         if not names:
             what = f"no frame of the {len(self._entries) - len(bad)} annotated scans is here"
             fix = "give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)"
             raise DataError(what, where=str(self.annotations), fix=fix)
+        super().__init__(folder, names, bad)
 
     def open_poses(self, path: Path) -> PoseFile:
         """Open annotations in the form of these, such as an estimate's, seen from these frames."""

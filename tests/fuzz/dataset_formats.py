@@ -19,7 +19,7 @@ from support.photo_sets import WRITERS
 
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
 from cadalign.datasets import load_mesh
-from cadalign.datasets.detections.coco_masks import decode_segmentation
+from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.photos.bop_files import RESULT_COLUMNS, read_bop_results, read_scene_gt
 from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.io.camera_file import read_camera

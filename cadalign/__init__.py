@@ -9,8 +9,7 @@ if TYPE_CHECKING:
     from cadalign.batch.fits import fit_many, stream_fits
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
-    from cadalign.estimation.detector_calibration import calibrate_detector
-    from cadalign.estimation.detector_noise import DetectorNoise
+    from cadalign.estimation.detector_noise import DetectorNoise, calibrate_detector
     from cadalign.estimation.fit import fit, fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model

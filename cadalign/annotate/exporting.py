@@ -16,7 +16,7 @@ from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.session import Session
 from cadalign.datasets.detections.coco import CocoObject, coco_document
 from cadalign.errors import InputError
-from cadalign.estimation.exporting import object_of
+from cadalign.estimation.outputs import object_of
 from cadalign.export import AlignedObject, export_object
 from cadalign.export.aligned_object import AnnotatedPhoto, write_photo_set
 from cadalign.io.files import write_text

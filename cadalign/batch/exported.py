@@ -13,9 +13,9 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.exporting import object_of
 from cadalign.estimation.observed import model_of, own_ids, shape_ids
 from cadalign.estimation.options import FitOptions
+from cadalign.estimation.outputs import object_of
 from cadalign.estimation.result import Result
 from cadalign.export.aligned_object import AlignedObject
 from cadalign.geometry.mesh import Mesh

@@ -17,12 +17,12 @@ if TYPE_CHECKING:
         register_evidence,
         remove_evidence,
     )
-    from cadalign.estimation.exporting import object_of
     from cadalign.estimation.fit import fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
     from cadalign.estimation.observed import model_of, views_from, views_of
     from cadalign.estimation.options import FitOptions, RansacOptions
+    from cadalign.estimation.outputs import object_of
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any, Literal, TypeVar
 
@@ -34,12 +34,20 @@ from cadalign.io.documents import (
 VERSION = 2
 Matrix = list[list[Finite]]
 Kind = TypeVar("Kind", bound=ResultData)
+Read = TypeVar("Read")
+Made = TypeVar("Made")
 _BEHIND = (math.inf, math.inf)
 _UNKNOWN = (math.nan, math.nan)
-_PLAIN = (
-    *("method", "component", "sigma", "cost", "known_axis", "stretched_axes", "focal"),
+_PLAIN = [
+    "method",
+    "component",
+    "sigma",
+    "cost",
+    "known_axis",
+    "stretched_axes",
+    "focal",
     "principal_std",
-)
+]
 """Fields of a result that are numbers and words, in its JSON form as they are."""
 
 
@@ -67,6 +75,17 @@ class _Options(ForeignDocument):
     principal_sigma: Positive | None = None  # older files lack it
 
 
+def _check_lengths(
+    document: ForeignDocument, names: Sequence[str], count: int, than: str, link: str = " "
+) -> None:
+    """Refuse lists that are not of a length; None is no list."""
+    for name in names:
+        entries = getattr(document, name)
+        if entries is not None and len(entries) != count:
+            what = f"{len(entries)} entries{link}{than.format(count)}"
+            raise InputError(what, where=name)
+
+
 class _View(ForeignDocument):
     camera: Any
     alignment: Any
@@ -77,11 +96,8 @@ class _View(ForeignDocument):
     covariance: Matrix | None
 
     def __post_init__(self) -> None:
-        for name in ("ids", "points_2d", "inliers"):
-            entries = getattr(self, name)
-            if entries is not None and len(entries) != len(self.residuals):
-                what = f"{len(entries)} entries for {len(self.residuals)} residuals"
-                raise InputError(what, where=name)
+        count = len(self.residuals)
+        _check_lengths(self, ("ids", "points_2d", "inliers"), count, "for {} residuals")
         for row, (residual, kept) in enumerate(zip(self.residuals, self.inliers, strict=True)):
             if kept and not (residual and math.isfinite(sum(residual))):
                 raise InputError("an inlier's residual is not finite", where=f"residuals[{row}]")
@@ -125,10 +141,8 @@ class _Mask(ForeignDocument):
     is_used: bool
 
     def __post_init__(self) -> None:
-        for name in ("normals", "residuals", "inliers"):
-            if len(getattr(self, name)) != len(self.points):
-                what = f"{len(getattr(self, name))} entries for {len(self.points)} points"
-                raise InputError(what, where=name)
+        names = ("normals", "residuals", "inliers")
+        _check_lengths(self, names, len(self.points), "for {} points")
 
 
 class _Result(ForeignDocument):
@@ -167,14 +181,10 @@ class _Result(ForeignDocument):
     def __post_init__(self) -> None:
         if not self.views:
             raise InputError("there are none", where="views")
-        if self.mask_residuals and len(self.mask_residuals) != len(self.views):
-            what = f"{len(self.mask_residuals)} entries for {len(self.views)} views"
-            raise InputError(what, where="mask_residuals")
-        for name in ("ids", "points_covariance", "points_cam_covariance"):
-            entries = getattr(self, name)
-            if entries is not None and len(entries) != len(self.points_3d):
-                what = f"{len(entries)} entries, but points_3d has {len(self.points_3d)}"
-                raise InputError(what, where=name)
+        if self.mask_residuals:
+            _check_lengths(self, ("mask_residuals",), len(self.views), "for {} views")
+        names = ("ids", "points_covariance", "points_cam_covariance")
+        _check_lengths(self, names, len(self.points_3d), "but points_3d has {}", ", ")
 
 
 def write_result(result: ResultData) -> dict[str, Any]:
@@ -192,7 +202,18 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "ids": list(result.ids),
         "points_3d": result.points_3d.tolist(),
         "bounds": _plain(result.own_bounds),
-        "views": [_written_view(view) for view in result.views],
+        "views": [
+            {
+                "camera": view.camera.to_dict(),
+                "alignment": view.alignment.to_dict(),
+                "ids": list(view.ids) if len(view.ids) == len(view.residuals) else None,
+                "points_2d": _finite_rows(view.points_2d),
+                "residuals": _finite_rows(view.residuals),
+                "inliers": view.inliers.tolist(),
+                "covariance": _plain(view.covariance),
+            }
+            for view in result.views
+        ],
         "covariance": _plain(result.covariance),
         "fisher_covariance": _plain(result.fisher_covariance),
         "points_covariance": _plain(statistics.points_covariance),
@@ -209,33 +230,17 @@ def write_result(result: ResultData) -> dict[str, Any]:
             }
             for other in result.alternatives
         ],
-        "evidence": [_written_summary(each) for each in result.evidence],
-        "misfit": None if misfit is None else misfit.to_dict(),
-        "options": None if result.options is None else _plain_options(result.options),
-        "symmetry": None if result.symmetry is None else result.symmetry.to_dict(),
+        "evidence": [  # only a photo's outline has a share
+            {name: value for name, value in vars(each).items() if (name, value) != ("share", None)}
+            for each in result.evidence
+        ],
+        "misfit": misfit and misfit.to_dict(),
+        "options": result.options and _plain_options(result.options),
+        "symmetry": result.symmetry and result.symmetry.to_dict(),
         "equal_under_symmetry": result.equal_under_symmetry,
         "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
         "mask_residuals": [each and _written_mask(each) for each in result.mask_residuals],
         "stats": {**vars(result.stats)},
-    }
-
-
-def _written_view(view: ViewResult) -> dict[str, Any]:
-    return {
-        "camera": view.camera.to_dict(),
-        "alignment": view.alignment.to_dict(),
-        "ids": list(view.ids) if len(view.ids) == len(view.residuals) else None,
-        "points_2d": _finite_rows(view.points_2d),
-        "residuals": _finite_rows(view.residuals),
-        "inliers": view.inliers.tolist(),
-        "covariance": _plain(view.covariance),
-    }
-
-
-def _written_summary(summary: EvidenceSummary) -> dict[str, Any]:
-    """A piece of evidence; only a photo's outline has a share."""
-    return {
-        key: value for key, value in vars(summary).items() if key != "share" or value is not None
     }
 
 
@@ -254,10 +259,9 @@ def _plain(value: Any) -> Any:
 
 
 def _plain_options(options: FitOptions) -> dict[str, Any]:
-    sigma = options.sigma
-    plain = sigma if sigma is None else np.asarray(sigma, dtype=float).tolist()
-    prior = options.focal_prior
-    return {**vars(options), "sigma": plain, "focal_prior": _plain_prior(prior)}
+    sigma = None if options.sigma is None else np.asarray(options.sigma, dtype=float).tolist()
+    prior = _plain_prior(options.focal_prior)
+    return {**vars(options), "sigma": sigma, "focal_prior": prior}
 
 
 def _plain_prior(prior: PriorOption) -> Any:
@@ -274,7 +278,8 @@ def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
             if isinstance(data, Mapping) and "version" not in data:
                 from cadalign.estimation.older_document import completed, upgraded
 
-                return completed(_result(convert(upgraded(data, VERSION), _Result), kind))
+                form = {"version": VERSION, **upgraded(data)}
+                return completed(_result(convert(form, _Result), kind))
             return _result(convert(data, _Result), kind)
     except CadalignError as error:
         place = f"result: {error.where}" if error.where else "result"
@@ -283,10 +288,7 @@ def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
 
 def _result(read: _Result, kind: type[Kind]) -> Kind:
     unknowns = 10 if read.focal == "estimate" else 9
-    views = []
-    for row, view in enumerate(read.views):
-        with within(f"views[{row}]"):
-            views.append(_view(view, unknowns))
+    views = _each("views", read.views, lambda view: _view(view, unknowns))
     in_camera = read.points_cam_covariance
     statistics = Stated(
         views[0].covariance,
@@ -307,10 +309,7 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         statistics=statistics,
         focal_prior=read.focal_prior,
         **{name: getattr(read, name) for name in _PLAIN},
-        alternatives=tuple(
-            _alternative(entry, f"alternatives[{row}]")
-            for row, entry in enumerate(read.alternatives)
-        ),
+        alternatives=tuple(_each("alternatives", read.alternatives, _alternative)),
         stats=read.stats,
         options=None if read.options is None else _options(read.options, count),
         symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
@@ -382,12 +381,20 @@ def _options(read: _Options, count: int) -> FitOptions:
         return FitOptions(**given | ({} if earlier is None else {"stretch_sigma": earlier}))
 
 
-def _alternative(entry: _Alternative, where: str) -> Alternative:
-    with within(where):
-        return Alternative(
-            Alignment.from_dict(entry.alignment),
-            entry.relative_likelihood,
-            Camera.from_dict(entry.camera),
-            np.array(entry.points_3d).reshape(-1, 3),
-            _array(entry.bounds, "bounds", 2, 3),
-        )
+def _alternative(entry: _Alternative) -> Alternative:
+    return Alternative(
+        Alignment.from_dict(entry.alignment),
+        entry.relative_likelihood,
+        Camera.from_dict(entry.camera),
+        np.array(entry.points_3d).reshape(-1, 3),
+        _array(entry.bounds, "bounds", 2, 3),
+    )
+
+
+def _each(name: str, entries: Sequence[Read], read: Callable[[Read], Made]) -> list[Made]:
+    """Entries of a list, read one by one; errors name the entry."""
+    made = []
+    for row, entry in enumerate(entries):
+        with within(f"{name}[{row}]"):
+            made.append(read(entry))
+    return made

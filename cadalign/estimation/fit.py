@@ -232,7 +232,8 @@ def fit_batch(
     >>> batch.scale.shape
     (2, 3)
     """
-    from cadalign.estimation.results import Results, SolvedTable  # only here: one fit has no table
+    # Only here: one fit has no table.
+    from cadalign.estimation.results import Results, results_of_solutions
 
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
@@ -266,7 +267,9 @@ def fit_batch(
             solutions = solve(some, options, own)
             solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
             seconds = (time.perf_counter() - start) / max(len(some), 1)
-            return SolvedTable(some, solutions, options, own, symmetry, seconds).results
+            return results_of_solutions(
+                some, solutions, options, sigmas=own, symmetry=symmetry, seconds=seconds
+            )
         trusted = None if scores is None else scores[part[0] : part[1]]
         fits = _fits(some, options, ransac, own, trusted, symmetry)
         return Results.of(

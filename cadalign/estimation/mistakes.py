@@ -1,4 +1,4 @@
-"""Usual mistakes in keypoints: each is undone, and named where the keypoints then agree."""
+"""What keypoints that disagree with an estimate say: support by chance, usual mistakes named."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import NoConsensusError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
+from cadalign.solvers.minimal import MAX_SOLUTIONS
 
 OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
 """Usual sizes of other images of a photo, over that of its camera."""
@@ -19,6 +21,9 @@ _DECISIVE = 12.0  # the same where nothing is rejected
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 _MOST_INSIDE = 0.8  # of the keypoints lie in their image
+SOLUTIONS_OF_FOUR = 2.3  # valid alignments to 4 points, in the mean
+LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
+_MOST_NAMED = 5  # keypoints, in a message
 _SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
 
 
@@ -220,3 +225,94 @@ def _doubts_of_camera(camera: Camera, where: str) -> tuple[str, ...]:
         f"{where}the camera's principal point {own} lies outside of its image of {size}, which is "
         "right only for a photo cut out of a larger one: compare the camera with the photo's size",
     )
+
+
+class Support(NamedTuple):
+    """Keypoints that support one pose.
+
+    Their ``errors`` (k,) [px], the number of ``given`` keypoints, and the ``area`` [px^2] over
+    which outliers are scattered.
+    """
+
+    errors: FloatArray
+    given: int
+    area: float
+
+
+def area_of(points_2d: FloatArray, camera: Camera, max_reproj_error: float) -> float:
+    """The area [px^2] over which the outliers among keypoints (n, 2) are scattered."""
+    extent = np.ptp(points_2d, axis=0) + 2 * max_reproj_error
+    return min(float(np.prod(extent)), float(camera.width) * float(camera.height))
+
+
+def check_support(
+    supports: Sequence[Support],
+    size: int,
+    *,
+    max_reproj_error: float,
+    score: float,
+    where: str,
+    solutions: float = MAX_SOLUTIONS,
+    chance: float = 0.1,
+    disagreeing: str = "",
+) -> None:
+    """Refuse an estimate whose poses have no more support together than chance gives.
+
+    ``size`` keypoints determine a pose, with so many ``solutions``; ``score`` is the truncated sum
+    of squares [px^2], which the NoConsensusError carries. ``chance`` bounds the expected number of
+    models with as much support; ``disagreeing`` are words about keypoints that disagree.
+    """
+    logarithm = sum(min(0.0, log_expected_by_chance(each, size, solutions)) for each in supports)
+    if np.isfinite(score) and logarithm <= math.log(chance):
+        return
+    inliers, count = sum(len(each.errors) for each in supports), sum(n for _, n, _ in supports)
+    raise NoConsensusError(
+        f"no alignment is supported: the best has {inliers} of {count} keypoints within "
+        f"{max_reproj_error:g} px, which chance gives as well (score {score:.4g} px^2)"
+        + (f"; {disagreeing}" if disagreeing else ""),
+        where=where,
+        fix="check the correspondences and the camera, raise max_reproj_error or max_iterations, "
+        'or use loss="cauchy" for a model that is only similar',
+        score=score,
+        inliers=inliers,
+    )
+
+
+def disagreeing(errors: FloatArray, kept: BoolArray) -> str:
+    """Words about the keypoints with the largest errors (n,) [px] of those that are not kept."""
+    rows = [row for row in np.argsort(-errors).tolist() if not kept[row]]
+    if not rows:
+        return ""
+    listed = ", ".join(
+        f"{row} ({errors[row]:.3g} px)" if np.isfinite(errors[row]) else f"{row}"
+        for row in rows[:_MOST_NAMED]
+    )
+    more = f" and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else ""
+    return f"keypoints that disagree: {listed}{more}"
+
+
+def log_expected_by_chance(support: Support, size: int, solutions: float) -> float:
+    """Log of the expected number of models as well supported among keypoints scattered at random.
+
+    Moisan, Stival, "A probabilistic criterion to detect rigid point matches between two images and
+    estimate the fundamental matrix", 2004: for the k best supported keypoints, each a sample of
+    ``size`` keypoints, all choices of k keypoints and of a sample among them are counted, and the
+    chance that the others lie within the largest of the k errors; the least such number over k
+    (over the smallest dozen and all of them, which is where it lies).
+    """
+    errors, count, area = support
+    if len(errors) <= size:
+        return math.inf
+    radii = np.maximum(np.sort(errors), LEAST_ERROR)
+    logarithms = [
+        math.log(solutions * (count - size))
+        + _log_choose(count, k)
+        + _log_choose(k, size)
+        + (k - size) * min(0.0, math.log(math.pi * radii[k - 1] ** 2 / area))
+        for k in {*range(size + 1, min(size + 12, len(errors) + 1)), len(errors)}
+    ]
+    return float(min(logarithms))
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)

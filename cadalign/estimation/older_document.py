@@ -8,48 +8,45 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from cadalign.estimation.options import AXES
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.uncertainty.stated import KeypointStatistics
 
 Kind = TypeVar("Kind", bound=ResultData)
-_AXES = ("x", "y", "z")
 
 
-def upgraded(data: Mapping[str, Any], version: int) -> dict[str, Any]:
-    """The form of today; what is invalid stays, and is refused by its reader."""
-    defaults = {"version": version, "warnings": [], "fisher_covariance": None}
-    return {**defaults, **(_alignment(data) if data.get("method") == "align" else _fit(data))}
+def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A form of version 0.1.0, of a fit or an alignment, as today's.
+
+    What is invalid stays, and is refused by its reader.
+    """
+    defaults = {"warnings": [], "fisher_covariance": None}
+    return {
+        **defaults,
+        **data,
+        **(_alignment(data) if data.get("method") == "align" else _fit(data)),
+    }
 
 
 def _fit(data: Mapping[str, Any]) -> dict[str, Any]:
     points, covariance = data.get("points_3d"), data.get("covariance")
     ids = list(range(len(points))) if isinstance(points, list) else []
-    if isinstance(covariance, list) and data.get("known_axis") in _AXES:
-        covariance = _with_held(covariance, 6 + _AXES.index(data["known_axis"]))
-    own = {name: data[name] for name in ("camera", "alignment", "residuals", "inliers")
-           if name in data}  # fmt: skip
+    if isinstance(covariance, list) and data.get("known_axis") in AXES:
+        place = 6 + AXES.index(data["known_axis"])  # of the known scale, whose row and column are 0
+        rows = [[*r[:place], 0.0, *r[place:]] if isinstance(r, list) else r for r in covariance]
+        covariance = [*rows[:place], [0.0] * (len(rows) + 1), *rows[place:]]
+    names = ("camera", "alignment", "residuals", "inliers")
+    own = {name: data[name] for name in names if name in data}
     own |= {"ids": ids, "points_2d": [None] * len(ids), "covariance": covariance}
-    return {
-        **data,
-        "ids": ids,
-        "views": [own],
-        "fisher_covariance": covariance,
-        "alternatives": _with(data.get("alternatives"), points_3d=points),
-    }
-
-
-def _with_held(covariance: list[Any], place: int) -> list[Any]:
-    """A covariance with a zero row and column for the scale that is known."""
-    rows = [
-        [*row[:place], 0.0, *row[place:]] if isinstance(row, list) else row for row in covariance
-    ]
-    return [*rows[:place], [0.0] * (len(rows) + 1), *rows[place:]]
+    others = _with(data.get("alternatives"), points_3d=points)
+    return {"ids": ids, "views": [own], "fisher_covariance": covariance, "alternatives": others}
 
 
 def _alignment(data: Mapping[str, Any]) -> dict[str, Any]:
+    added: dict[str, Any] = {"known_axis": None, "stretched_axes": "", "focal": "known"}
     views = data.get("views")
     if not isinstance(views, list) or not views or not isinstance(views[0], Mapping):
-        return {**data, "known_axis": None, "stretched_axes": "", "focal": "known"}
+        return added
     given = [
         {"ids": None, "covariance": None if row else data.get("covariance"), **view}
         | ({"points_2d": view["observed"]} if "observed" in view else {})
@@ -57,14 +54,8 @@ def _alignment(data: Mapping[str, Any]) -> dict[str, Any]:
         else view
         for row, view in enumerate(views)
     ]
-    return {
-        **data,
-        "views": given,
-        "known_axis": None,
-        "stretched_axes": "",
-        "focal": "known",
-        "alternatives": _with(data.get("alternatives"), camera=views[0].get("camera")),
-    }
+    others = _with(data.get("alternatives"), camera=views[0].get("camera"))
+    return added | {"views": given, "alternatives": others}
 
 
 def _with(entries: Any, **fields: Any) -> Any:
@@ -77,7 +68,7 @@ def completed(result: Kind) -> Kind:
     """A result that was read from an upgraded form, with what follows from its other fields."""
     if result.method == "align":
         diagonal = np.zeros(9) if result.covariance is None else result.covariance.diagonal()
-        free = "".join(axis for axis, value in zip(_AXES, diagonal[6:], strict=True) if value > 0)
+        free = "".join(axis for axis, value in zip(AXES, diagonal[6:], strict=True) if value > 0)
         return replace(result, stretched_axes=free)
     (view,), statistics = result.views, result.statistics
     observed = view.camera.project_where_ahead(view.alignment.apply(result.points_3d))

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_points, is_number
+from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_number
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
 from cadalign.geometry.camera import Camera
@@ -98,6 +98,13 @@ class Problems:
             self.points_2d[start:end],
             self.offsets[first : last + 1] - start,
             self.cameras[first:last] if len(self.cameras) > 1 else self.cameras,
+        )
+
+    def chosen(self, rows: BoolArray) -> Problems:
+        """The only problem with some of its rows, marked (n,)."""
+        offsets = np.array([0, int(rows.sum())])
+        return replace(
+            self, points_3d=self.points_3d[rows], points_2d=self.points_2d[rows], offsets=offsets
         )
 
 

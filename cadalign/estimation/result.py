@@ -120,7 +120,7 @@ class Result(ResultData):
         )
 
     def _repr_html_(self) -> str:
-        from cadalign.estimation.drawing import result_html
+        from cadalign.estimation.outputs import result_html
 
         return result_html(self)
 
@@ -167,7 +167,7 @@ class Result(ResultData):
         >>> [float(y) for y in axes.get_ylim()]
         [479.5, -0.5]
         """
-        from cadalign.estimation.drawing import plot_result
+        from cadalign.estimation.outputs import plot_result
 
         return plot_result(self, image, mesh, view=view, axes=axes)
 
@@ -189,13 +189,13 @@ class Result(ResultData):
             As for `cadalign.export.export_object`.
         **of_the_object
             ``mesh``, ``image`` or ``images``, ``world_from_cam``, ``name`` and ``metres`` of
-            `cadalign.estimation.exporting.object_of`.
+            `cadalign.estimation.object_of`.
 
         Examples
         --------
         >>> result.export("chair.glb", mesh=mesh, image="chair.jpg")  # doctest: +SKIP
         """
-        from cadalign.estimation.exporting import object_of
+        from cadalign.estimation.outputs import object_of
         from cadalign.export import export_object
 
         exported = object_of(self, **of_the_object)

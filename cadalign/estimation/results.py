@@ -13,6 +13,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.assemble import canonical_result, result_of_solution
 from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.problems import Problems, Solutions, full_covariances
 from cadalign.estimation.result import Result
@@ -24,11 +25,6 @@ from cadalign.solvers.constants import POSE_SIZE
 
 if TYPE_CHECKING:
     import pandas as pd
-
-_STACKED = (
-    *("rotation", "translation", "scale", "rms", "focal_length", "fisher_covariance"),
-    *("residuals", "inliers"),
-)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -218,13 +214,11 @@ class Results(Sequence[Result | CadalignError]):
         >>> results = Results.open("runs/fit")  # doctest: +SKIP
         >>> results[0].alignment, results.to_dataframe()  # doctest: +SKIP
         """
+        path = Path(folder)
         from cadalign.estimation.results_file import StoredResults, read_arrays
 
-        path = Path(folder)
-        arrays, stored = read_arrays(path), StoredResults.open(path)
-        if in_memory:
-            stored.load()
-        return cls(**arrays, single=stored.single)
+        arrays = read_arrays(path)
+        return cls(**arrays, single=StoredResults.open(path, in_memory=in_memory).single)
 
     @classmethod
     def of(
@@ -272,22 +266,19 @@ class Results(Sequence[Result | CadalignError]):
     @classmethod
     def joined(cls, parts: Sequence[Results]) -> Results:
         """Put the results of successive parts of a batch together."""
-        sizes = np.concatenate([np.diff(part.offsets) for part in parts])
-        firsts = np.cumsum([0, *map(len, parts)])
-        columns = {name: [getattr(part, name) for part in parts] for name in _STACKED}
+        names = "rotation translation scale rms focal_length fisher_covariance residuals inliers"
+        columns = {name: [getattr(part, name) for part in parts] for name in names.split()}
         arrays: dict[str, Any] = {
             name: None if each[0] is None else np.concatenate(each)
             for name, each in columns.items()
         }
+        sizes = np.concatenate([np.diff(part.offsets) for part in parts])
+        places = [(part, b) for part in parts for b in range(len(part))]
         return cls(
             **arrays,
             offsets=np.concatenate([[0], np.cumsum(sizes)]),
-            errors={
-                int(first) + b: error
-                for part, first in zip(parts, firsts, strict=False)
-                for b, error in part.errors.items()
-            },
-            single=partial(_single, parts, firsts),
+            errors={k: part.errors[b] for k, (part, b) in enumerate(places) if b in part.errors},
+            single=partial(_single, places),
             is_single=all(part.is_single for part in parts),
         )
 
@@ -296,90 +287,78 @@ BatchResult = Results
 """Name of earlier versions."""
 
 
-@dataclass(frozen=True, eq=False)
-class SolvedTable:
-    """Solutions of a batch, from which single results are made one at a time.
+def results_of_solutions(
+    problems: Problems,
+    solutions: Solutions,
+    options: FitOptions,
+    *,
+    sigmas: Sequence[Sigma] | None,
+    symmetry: Symmetry | None,
+    seconds: float,
+) -> Results:
+    """Arrange the solutions of a batch; single results are made one at a time.
 
     ``sigmas``, one for each problem, take the place of the options' sigma; ``seconds`` is the time
     of one problem.
     """
-
-    problems: Problems
-    solutions: Solutions
-    options: FitOptions
-    sigmas: Sequence[Sigma] | None
-    symmetry: Symmetry | None
-    seconds: float
-
-    def single(self, b: int) -> Result:
-        """The result of one problem, as `cadalign.fit` gives it."""
-        from cadalign.estimation.assemble import canonical_result, result_of_solution
-
-        all_of_them, rows = self.solutions, self.problems.rows(b)
-        of_problem: dict[str, Any] = {
-            name: None if value is None else value[b : b + 1].copy()
-            for name, value in all_of_them._asdict().items()
-            if name not in ("residuals", "errors")
-        }
-        own = Solutions(**of_problem, residuals=all_of_them.residuals[rows].copy())
-        options = self.options
-        if self.sigmas is not None:
-            options = replace(options, sigma=self.sigmas[b])
-        result = result_of_solution(self.problems.part(b, b + 1), own, options, self.seconds)
-        return result if self.symmetry is None else canonical_result(result, self.symmetry)
-
-    @property
-    def results(self) -> Results:
-        """The arrays of all problems."""
-        problems, solutions = self.problems, self.solutions
-        failed = np.zeros(len(problems), dtype=bool)
-        failed[list(solutions.errors)] = True
-        focals = np.broadcast_to(problems.calibrations[:, 0], len(problems))
-        if solutions.focals is not None:
-            focals = solutions.focals[:, 0]
-        poses, residuals = solutions.poses[:, 0].copy(), solutions.residuals
-        covariance = None
-        if solutions.covariances is not None:
-            covariance = full_covariances(solutions.covariances, self.options.known_axis)
-        inliers = np.repeat(~failed, problems.counts)
-        if failed.any():
-            poses = np.where(failed[:, None], np.nan, poses)
-            residuals = np.where(inliers[:, None], residuals, np.nan)
-            if covariance is not None:
-                covariance[failed] = np.nan
-        if self.symmetry is not None:
-            self._make_canonical(self.symmetry, poses, covariance, np.flatnonzero(~failed).tolist())
-        squares = np.append((residuals**2).sum(axis=1), 0.0)
-        means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
-        return Results(
-            *_split(poses),
-            rms=np.where(failed, np.nan, np.sqrt(means)),
-            focal_length=np.where(failed, np.nan, focals),
-            fisher_covariance=covariance,
-            residuals=residuals,
-            inliers=inliers,
-            offsets=problems.offsets,
-            errors=dict(solutions.errors),
-            single=self.single,
-        )
-
-    def _make_canonical(
-        self,
-        symmetry: Symmetry,
-        poses: FloatArray,
-        covariance: FloatArray | None,
-        solved: Sequence[int],
-    ) -> None:
-        """Replace packed poses, and their covariances, by those of the canonical alignments."""
-        group, held = group_of(symmetry), held_axes(self.options.stretched_axes)
-        if group.is_trivial:
-            return
-        for b in solved:
+    failed = np.zeros(len(problems), dtype=bool)
+    failed[list(solutions.errors)] = True
+    focals = np.broadcast_to(problems.calibrations[:, 0], len(problems))
+    if solutions.focals is not None:
+        focals = solutions.focals[:, 0]
+    poses, residuals = solutions.poses[:, 0].copy(), solutions.residuals
+    covariance = None
+    if solutions.covariances is not None:
+        covariance = full_covariances(solutions.covariances, options.known_axis)
+    inliers = np.repeat(~failed, problems.counts)
+    if failed.any():
+        poses = np.where(failed[:, None], np.nan, poses)
+        residuals = np.where(inliers[:, None], residuals, np.nan)
+        if covariance is not None:
+            covariance[failed] = np.nan
+    if symmetry is not None and not (group := group_of(symmetry)).is_trivial:
+        held = held_axes(options.stretched_axes)
+        for b in np.flatnonzero(~failed).tolist():
             given = Alignment.from_packed(poses[b].copy())
             best = group.canonical(given, held=held)
             poses[b] = best.alignment.packed
             if covariance is not None:
                 covariance[b] = carried(covariance[b], given, best, held)
+    squares = np.append((residuals**2).sum(axis=1), 0.0)
+    means = np.add.reduceat(squares, problems.offsets[:-1]) / np.maximum(problems.counts, 1)
+    return Results(
+        *_split(poses),
+        rms=np.where(failed, np.nan, np.sqrt(means)),
+        focal_length=np.where(failed, np.nan, focals),
+        fisher_covariance=covariance,
+        residuals=residuals,
+        inliers=inliers,
+        offsets=problems.offsets,
+        errors=dict(solutions.errors),
+        single=partial(_solved, problems, solutions, options, sigmas, symmetry, seconds),
+    )
+
+
+def _solved(
+    problems: Problems,
+    solutions: Solutions,
+    options: FitOptions,
+    sigmas: Sequence[Sigma] | None,
+    symmetry: Symmetry | None,
+    seconds: float,
+    b: int,
+) -> Result:
+    """The result of one problem of a batch, as `cadalign.fit` gives it."""
+    of_problem: dict[str, Any] = {
+        name: None if value is None else value[b : b + 1].copy()
+        for name, value in solutions._asdict().items()
+        if name not in ("residuals", "errors")
+    }
+    own = Solutions(**of_problem, residuals=solutions.residuals[problems.rows(b)].copy())
+    if sigmas is not None:
+        options = replace(options, sigma=sigmas[b])
+    result = result_of_solution(problems.part(b, b + 1), own, options, seconds)
+    return result if symmetry is None else canonical_result(result, symmetry)
 
 
 def to_dataframe(results: Sequence[Result | CadalignError]) -> pd.DataFrame:
@@ -421,9 +400,9 @@ def to_dataframe(results: Sequence[Result | CadalignError]) -> pd.DataFrame:
     return results.to_dataframe()
 
 
-def _single(parts: Sequence[Results], firsts: IntArray, k: int) -> Result:
-    number = int(np.searchsorted(firsts, k, side="right")) - 1
-    return parts[number].single(k - int(firsts[number]))
+def _single(places: Sequence[tuple[Results, int]], k: int) -> Result:
+    part, b = places[k]
+    return part.single(b)
 
 
 def _split(poses: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

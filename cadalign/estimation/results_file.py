@@ -1,14 +1,13 @@
 """Results of a run over many observations, read from the run's folder.
 
-The tables are those of `cadalign.batch.table`; arrays are read at once, single results when they
-are asked for.
+The tables are those of `cadalign.batch.table`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -29,60 +28,47 @@ _FIX = "give a folder that `cadalign fit` or `cadalign.fit_many` has written"
 
 @dataclass(eq=False)
 class StoredResults:
-    """Single results of a run, each read when it is asked for.
-
-    Of the file one row group is kept; ``whole`` is all of it, for a folder that goes away.
-    """
+    """Single results of a run, read when they are asked for; one row group of the file is kept."""
 
     path: Path
     starts: list[int]
-    whole: pa.Table | None = None
-    _group: int = -1
-    _kept: Any = field(default=None, repr=False)
+    number: int = -1
+    group: Any = None
 
     @classmethod
-    def open(cls, folder: Path) -> Self:
-        """Open the table of records of a run's folder."""
+    def open(cls, folder: Path, *, in_memory: bool) -> Self:
+        """The results in a run's folder; the whole table for a folder that goes away."""
         import pyarrow.parquet as pq
 
         earlier, path = (folder / name for name in _RECORDS)
         path = earlier if earlier.exists() else path
         with _reading(path):
+            if in_memory:
+                return cls(path, [0], 0, pq.read_table(path, use_threads=False))
             metadata = pq.read_metadata(path)
         sizes = [metadata.row_group(k).num_rows for k in range(metadata.num_row_groups)]
         return cls(path, np.concatenate([[0], np.cumsum(sizes)]).astype(int).tolist())
 
-    def record(self, row: int) -> dict[str, Any]:
-        """The record of an observation: its number, and observation and result as JSON."""
-        import pyarrow.parquet as pq
-
-        if self.whole is not None:
-            return dict(self.whole.slice(row, 1).to_pylist()[0])
-        group = int(np.searchsorted(self.starts, row, side="right")) - 1
-        if group != self._group:
-            with _reading(self.path), pq.ParquetFile(self.path) as file:
-                self._kept, self._group = file.read_row_group(group, use_threads=False), group
-        return dict(self._kept.slice(row - self.starts[group], 1).to_pylist()[0])
-
     def single(self, row: int) -> Result:
         """The result of an observation that has one."""
-        with in_file(f"{self.path}, row {row}"):
-            return Result.from_json(self.record(row)["result"])
-
-    def load(self) -> None:
-        """Read the whole table."""
         import pyarrow.parquet as pq
 
-        with _reading(self.path):
-            self.whole = pq.read_table(self.path, use_threads=False)
+        number = int(np.searchsorted(self.starts, row, side="right")) - 1
+        if number != self.number:
+            with _reading(self.path), pq.ParquetFile(self.path) as file:
+                self.group, self.number = file.read_row_group(number, use_threads=False), number
+        record = self.group.slice(row - self.starts[number], 1).to_pylist()[0]
+        with in_file(f"{self.path}, row {row}"):
+            return Result.from_json(record["result"])
 
 
 def read_arrays(folder: Path) -> dict[str, Any]:
     """The arguments of `Results` for a run's folder, without ``single``.
 
-    Raises DataError if it is not the folder of a finished run of fits.
+    The table is that of `cadalign.batch.table`.
     """
     import pyarrow.parquet as pq
+    from scipy.spatial.transform import Rotation
 
     path = folder / TABLE
     if not path.is_file():
@@ -102,10 +88,16 @@ def read_arrays(folder: Path) -> dict[str, Any]:
         row: DataError(reasons[row]) for row in np.flatnonzero(~solved).tolist()
     }
     counts = np.where(solved, _numbers(table, "keypoints"), 0).astype(np.int64)
-    flat = table["residuals"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
-    inliers = table["is_inlier"].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+    flat, inliers = (
+        table[name].combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        for name in ("residuals", "is_inlier")
+    )
+    rotations = np.full((len(table), 3, 3), np.nan)
+    if solved.any():
+        xyzw = np.column_stack([_numbers(table, f"q{axis}") for axis in "xyzw"])
+        rotations[solved] = Rotation.from_quat(xyzw[solved]).as_matrix()
     return {
-        "rotation": _rotations(table, solved),
+        "rotation": rotations,
         "translation": np.column_stack([_numbers(table, f"t{axis}") for axis in "xyz"]),
         "scale": np.column_stack([_numbers(table, f"scale_{axis}") for axis in "xyz"]),
         "rms": _numbers(table, "rms_px"),
@@ -122,16 +114,6 @@ def read_arrays(folder: Path) -> dict[str, Any]:
 
 def _numbers(table: pa.Table, name: str) -> FloatArray:
     return np.asarray(table[name].to_numpy().astype(np.float64))
-
-
-def _rotations(table: pa.Table, solved: Any) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
-    xyzw = np.column_stack([_numbers(table, f"q{axis}") for axis in "xyzw"])
-    rotations = np.full((len(table), 3, 3), np.nan)
-    if solved.any():
-        rotations[solved] = Rotation.from_quat(xyzw[solved]).as_matrix()
-    return rotations
 
 
 def _covariances(table: pa.Table, solved: Any) -> FloatArray | None:

@@ -16,12 +16,12 @@ from cadalign.estimation.joint_robust import (
     whitened_lengths,
     with_sightings,
 )
+from cadalign.estimation.mistakes import Support, area_of, check_support
 from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import LENS_ROUNDS, Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.starts import Start, Starts, starts_of
-from cadalign.estimation.support import Support, area_of, check_support
 from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment

@@ -1,8 +1,9 @@
-"""Pictures of results: on matplotlib axes, and small ones in the tables of notebooks."""
+"""Outputs of results: pictures on axes and in notebooks, and aligned objects for export."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,11 +12,13 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
+from cadalign.estimation.result_parts import ViewResult
+from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.images import read_photo
+from cadalign.io.images import ByteImage, read_photo
 from cadalign.notebook import card, draw_picture, photo_axes
 
 if TYPE_CHECKING:
@@ -24,13 +27,17 @@ if TYPE_CHECKING:
     from cadalign.estimation.result_data import ResultData
     from cadalign.estimation.uncertainty.summary import Uncertainty
 
-
-Photo = npt.ArrayLike | str | os.PathLike[str]
+Photo = Path | str | ByteImage | None
+_LONGEST_SIDE = 480  # of the grid of rays through a drawn model
+_MODEL_COLOR = (0.94, 0.2, 0.2)
+_MODEL_OPACITY = 0.45
+_BOX_COLOR = "#f03232"
+_LINE_POINTS = 17  # lens distortion bends the edges of a box
 
 
 def plot_result(
     result: ResultData,
-    image: Photo | None = None,
+    image: npt.ArrayLike | str | os.PathLike[str] | None = None,
     mesh: Mesh | None = None,
     *,
     view: int = 0,
@@ -73,26 +80,18 @@ def _pose_rows(
 ) -> list[tuple[str, str]]:
     """Rows of position, stretch and, where known, their standard deviations."""
     shift = ", ".join(f"{value:.4g}" for value in translation)
+    stretch = ", ".join(
+        f"{axis} {value:.4g}" + (f" ± {100 * spread:.2g} %" if spread else "")
+        for axis, value, spread in zip("xyz", scale, std.scale if std else (0, 0, 0), strict=True)
+    )
     if std is None:
-        scales = [f"{axis} {value:.4g}" for axis, value in zip("xyz", scale, strict=True)]
-        return [("translation", shift), ("stretch", ", ".join(scales))]
-    scales = [
-        f"{axis} {value:.4g}" + (f" ± {100 * deviation:.2g} %" if deviation else "")
-        for axis, value, deviation in zip("xyz", scale, std.scale, strict=True)
-    ]
+        return [("translation", shift), ("stretch", stretch)]
     known_to = ", ".join(f"{value:.2g}" for value in std.translation)
     return [
         ("rotation", f"± {std.rotation_deg:.2g}°"),
         ("translation", f"({shift}) ± ({known_to})"),
-        ("stretch", ", ".join(scales)),
+        ("stretch", stretch),
     ]
-
-
-_LONGEST_SIDE = 480  # of the grid of rays through a drawn model
-_MODEL_COLOR = (0.94, 0.2, 0.2)
-_MODEL_OPACITY = 0.45
-_BOX_COLOR = "#f03232"
-_LINE_POINTS = 17  # lens distortion bends the edges of a box
 
 
 def _plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> None:
@@ -165,3 +164,59 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
     shade = np.full(len(rays), np.nan)
     shade[hit] = 0.25 + 0.75 * towards
     return shade.reshape(height, width)
+
+
+def object_of(
+    result: ResultData,
+    *,
+    mesh: Mesh | str | os.PathLike[str] | None = None,
+    image: Photo = None,
+    images: Sequence[Photo] = (),
+    world_from_cam: FloatArray | None = None,
+    name: str = "model",
+    metres: float = 1.0,
+) -> AlignedObject:
+    """The object of a result.
+
+    Parameters
+    ----------
+    result : Result
+    mesh : Mesh or path, optional
+        The model's as given; it is warped where the result knows its model, see `Result.mesh`.
+    image : path or (h, w, 3) uint8, optional
+        The photo of the only view.
+    images : sequence
+        The photos of several views, in the place of ``image``.
+    world_from_cam, name, metres
+        As for `AlignedObject`.
+
+    Raises
+    ------
+    InputError
+        If there are more or fewer images than the result has views.
+    """
+    photos: list[Photo] = list(images) or [image] + [None] * (len(result.views) - 1)
+    if len(photos) != len(result.views):
+        what = f"{len(photos)}, but the result has {len(result.views)} views"
+        raise InputError(what, where="images", fix="give one or None for each")
+    return AlignedObject(
+        tuple(_exported(view, photo) for view, photo in zip(result.views, photos, strict=True)),
+        result.points_3d,
+        result.ids,
+        result.known_mesh(mesh),
+        result.rig_from_model,
+        world_from_cam,
+        name,
+        metres,
+    )
+
+
+object_of_fit = object_of_align = object_of
+"""Names of earlier versions."""
+
+
+def _exported(view: ViewResult, photo: Photo) -> ExportView:
+    """A view without the keypoints behind its camera, and those whose ids an older file lacks."""
+    ahead = np.flatnonzero(np.isfinite(view.residuals).all(axis=1))[: len(view.ids)]
+    ids = tuple(view.ids[row] for row in ahead.tolist())
+    return ExportView(view.camera, view.alignment, photo, view.points_2d[ahead], ids)

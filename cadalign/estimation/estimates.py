@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
-from cadalign.shapes.box_margins import BoxMargins
+from cadalign.shapes.parts import BoxMargins
 from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.marginal.equations import force_of

@@ -55,7 +55,7 @@ from cadalign.geometry.rotations import nearest_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.tails import inflation_with
+from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.joint.covariance import JointCovariance, joint_covariance
 from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.linalg import cholesky, solve_cholesky

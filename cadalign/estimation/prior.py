@@ -22,9 +22,8 @@ from cadalign.estimation.focal import (
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
-from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.tails import FewKeypoints
+from cadalign.shapes.parts import BoxMargins, FewKeypoints
 from cadalign.solvers.constants import ScalePrior
 from cadalign.solvers.joint.evidence import Evidence, Focals, ScalePriors, Shape, State
 

@@ -302,7 +302,7 @@ class ResultData:
         InputError
             If the probability is not between 0 and 1, or the dimension is not positive.
         """
-        from cadalign.shapes.tails import radius_of
+        from cadalign.shapes.parts import radius_of
 
         if not 0 < probability < 1:
             raise InputError(f"{probability!r} is not between 0 and 1", where="probability")

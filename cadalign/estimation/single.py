@@ -31,7 +31,7 @@ from cadalign.estimation.uncertainty.shape_posterior import SeenShape, ShapeTail
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.tails import inflation_with
+from cadalign.shapes.parts import inflation_with
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.marginal.equations import POSE, force_of
 from cadalign.solvers.marginal.posterior import posteriors_of

@@ -20,14 +20,21 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.shapes.gaussians import Gaussians
-from cadalign.shapes.parts import BOX_ROWS
-from cadalign.shapes.tails import FEW, FewKeypoints, probability_within
+from cadalign.shapes.parts import (
+    BOX_ROWS,
+    FEW,
+    OUTWARD,
+    BoxMargins,
+    FewKeypoints,
+    probability_within,
+)
 
 _FACTORS = np.geomspace(1.0, 3.0, 12)  # deviations are never narrowed; the first is no factor
 _DEGREES_OF_FREEDOM = (None, 20.0, 10.0, 7.0, 5.0, 4.0, 3.0)
 _LEAST_KEYPOINTS = 4
 _NOMINAL = np.array([0.68, 0.95])
 _TOLERANCE = np.array([0.08, 0.05])  # of these shares of truths
+_EXCEEDED = 95.0  # percentile of the linear box's errors
 _POSE = 6  # a rotation vector, a translation in the image, the logarithm of the scale
 
 
@@ -213,3 +220,41 @@ def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray,
     turned = turn * np.linalg.solve(of_turn, np.broadcast_to(turn, (len(of_turn), 3, 1)))
     solved = np.linalg.solve(of_points, np.broadcast_to(gaps, (*of_points.shape[:-1], 1)))
     return turned.sum(axis=(1, 2)), (gaps * solved).sum(axis=(2, 3))
+
+
+def margins_of(rows: FloatArray) -> FloatArray:
+    """Distances of the faces beyond the outermost keypoints of models (N, m + 2, 3); (N, 2, 3)."""
+    points, boxes = rows[:, :-BOX_ROWS], rows[:, -BOX_ROWS:]
+    reached = np.stack([np.nanmin(points, axis=1), np.nanmax(points, axis=1)], axis=1)
+    return np.asarray(OUTWARD * (boxes - reached))
+
+
+def excesses_of(rows: FloatArray, mixture: Gaussians) -> FloatArray:
+    """Distances of linear boxes beyond the true faces of models that were held out, (N, 2, 3)."""
+    found = np.full((len(rows), BOX_ROWS, 3), np.nan)
+    first = rows[0].size - 3 * BOX_ROWS
+    for place, row in enumerate(rows):
+        entries = np.flatnonzero(np.isfinite(row.ravel()[:first]))
+        best, linear = -np.inf, np.full(3 * BOX_ROWS, np.nan)
+        for weight, mean, covariance in zip(
+            mixture.weights, mixture.means, mixture.covariances, strict=True
+        ):
+            gap = row.ravel()[entries] - mean[entries]
+            own = covariance[entries[:, None], entries]
+            solved = np.linalg.solve(own, gap)
+            score = 2 * np.log(weight) - gap @ solved - np.linalg.slogdet(own)[1]
+            if score > best:
+                best, linear = score, mean[first:] + covariance[first:, entries] @ solved
+        found[place] = OUTWARD * (linear.reshape(BOX_ROWS, 3) - row[-BOX_ROWS:])
+    return found
+
+
+def learn_margins(rows: FloatArray, excesses: FloatArray) -> BoxMargins | None:
+    """Margins from models and their linear boxes' errors; None where no model has a box."""
+    has_box = np.isfinite(rows[:, -BOX_ROWS:]).all(axis=(1, 2))
+    if not has_box.any():
+        return None
+    return BoxMargins(
+        np.median(margins_of(rows[has_box]), axis=0),
+        np.maximum(np.percentile(excesses[has_box], _EXCEEDED, axis=0), 0.0),
+    )

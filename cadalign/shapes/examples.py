@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
+from cadalign.arrays import FloatArray, as_floats, as_points, read_only
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids
@@ -55,15 +55,6 @@ class Example:
                 what = f"the least corner {bounds[0].tolist()} exceeds {bounds[1].tolist()}"
                 raise InputError(what, where=f"{where}, bounds")
             object.__setattr__(self, "bounds", read_only(bounds))
-
-
-class AnnotatedKeypoints(Protocol):
-    """Keypoints of a `DatasetModel`."""
-
-    @property
-    def xyz(self) -> FloatArray: ...
-    @property
-    def ids(self) -> IntArray: ...
 
 
 class DatasetModel(Protocol):

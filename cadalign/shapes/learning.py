@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -19,8 +19,7 @@ from threadpoolctl import threadpool_limits
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
-from cadalign.shapes.box_margins import BoxMargins, excesses_of, learn_margins
-from cadalign.shapes.calibration import Calibration, calibrate
+from cadalign.shapes.calibration import Calibration, calibrate, excesses_of, learn_margins
 from cadalign.shapes.gaussians import (
     Gaussians,
     Vectors,
@@ -28,7 +27,7 @@ from cadalign.shapes.gaussians import (
     learn_mixture,
     log_likelihoods,
 )
-from cadalign.shapes.parts import KeypointId, Reflection, ShapeComponent
+from cadalign.shapes.parts import BoxMargins, KeypointId, Reflection, ShapeComponent
 
 LEAST_MODELS = 4
 # Lengths relative to the models' median diagonal.
@@ -50,30 +49,11 @@ _STEPS = _FOLDS * (len(_STRENGTHS) + 3 + _MOST_COMPONENTS) + 1
 _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
 
 
-@dataclass(frozen=True)
-class LearnOptions:
-    """Options of `cadalign.ShapeModel.learn`."""
-
-    components: int | None = None
-    modes: int | None = None
-    reflection: bool = True
-
-    def __post_init__(self) -> None:
-        for name in ("components", "modes"):
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool)
-            if value is not None and (not whole or value < 1):
-                raise InputError(f"{value!r} is not a whole number >= 1", where=name)
-
-
-@dataclass(frozen=True, eq=False)
-class Learned:
-    """Result of `learn_components`."""
-
-    components: tuple[ShapeComponent, ...]
-    reflection: Reflection | None
-    calibration: Calibration
-    box_margins: BoxMargins | None = None
+def check_count(value: object, name: str) -> None:
+    """Refuse what is no whole number of at least 1; None is not given."""
+    whole = isinstance(value, int) and not isinstance(value, bool)
+    if value is not None and (not whole or cast(int, value) < 1):
+        raise InputError(f"{value!r} is not a whole number >= 1", where=name)
 
 
 @dataclass(frozen=True)
@@ -145,7 +125,7 @@ class _Trial:
     scores: FloatArray  # (N,), log-likelihood of each model under what was learned without its fold
 
 
-class _Choice(NamedTuple):
+class Choice(NamedTuple):
     """Choices made by held-out models, and figures learned from them."""
 
     recipe: _Recipe
@@ -162,14 +142,14 @@ class _CrossValidation:
         self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
         self._on_progress, self._done = on_progress, 0
 
-    def choose(self, options: LearnOptions) -> _Choice:
+    def choose(self, components: int | None, modes: int | None, reflection: bool) -> Choice:
         """Choose a recipe and the number of modes, and calibrate what they give."""
         best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
-        if options.reflection:
+        if reflection:
             best = self._with_reflection(best)
-        best = self._with_components(best, options.components)
-        modes = options.modes or self._modes(best)
-        return _Choice(best.recipe, modes, self._calibration(best, modes), self._margins(best))
+        best = self._with_components(best, components)
+        modes = modes or self._modes(best)
+        return Choice(best.recipe, modes, self._calibration(best, modes), self._margins(best))
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
@@ -227,12 +207,18 @@ class _CrossValidation:
 def learn_components(
     ids: Sequence[KeypointId],
     rows: FloatArray,
-    options: LearnOptions,
     on_progress: Callable[[int, int], object],
-) -> Learned:
-    """Learn the components of models' rows, (N, m + 2, 3) float with NaN for what is missing."""
-    if (options.components or 1) > len(rows):
-        what = f"{options.components} are more than the {len(rows)} models"
+    *,
+    components: int | None,
+    modes: int | None,
+    reflection: bool,
+) -> tuple[tuple[ShapeComponent, ...], Choice]:
+    """Learn the components of models' rows, (N, m + 2, 3) float with NaN for what is missing.
+
+    Options are those of `cadalign.ShapeModel.learn`.
+    """
+    if (components or 1) > len(rows):
+        what = f"{components} are more than the {len(rows)} models"
         raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
@@ -241,13 +227,22 @@ def learn_components(
     import_module("scipy.linalg.lapack")
     with threadpool_limits(1):
         if len(rows) < _LEAST_TO_CHOOSE:
-            choice = _Choice(_Recipe(components=options.components or 1), options.modes)
+            choice = Choice(_Recipe(components=components or 1), modes)
         else:
-            choice = _CrossValidation(models, on_progress).choose(options)
+            tried = _CrossValidation(models, on_progress)
+            choice = tried.choose(components, modes, reflection)
         mixture = models.mixture(choice.recipe)
     on_progress(_STEPS, _STEPS)
-    components = _components(mixture, choice.modes)
-    return Learned(components, choice.recipe.reflection, choice.calibration, choice.margins)
+    weights = mixture.weights / mixture.weights.sum()
+    parts = sorted(
+        zip(weights, mixture.means, mixture.covariances, strict=True), key=lambda part: -part[0]
+    )
+    return tuple(
+        component_of_covariance(
+            mean.reshape(-1, 3), covariance, weight=float(weight), modes=choice.modes
+        )
+        for weight, mean, covariance in parts
+    ), choice
 
 
 def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[KeypointId]) -> Vectors:
@@ -274,17 +269,6 @@ def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
     labels = min(tries)[2].astype(np.int64)
     labels[np.arange(count) % len(labels)] = np.arange(count)  # none is left out
     return np.asarray(labels)
-
-
-def _components(mixture: Gaussians, modes: int | None) -> tuple[ShapeComponent, ...]:
-    weights = mixture.weights / mixture.weights.sum()
-    return tuple(
-        component_of_covariance(mean.reshape(-1, 3), covariance, weight=float(weight), modes=modes)
-        for weight, mean, covariance in sorted(
-            zip(weights, mixture.means, mixture.covariances, strict=True),
-            key=lambda part: -float(part[0]),
-        )
-    )
 
 
 def _truncated(mixture: Gaussians, modes: int) -> Gaussians:

@@ -6,20 +6,20 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
-from cadalign.io.documents import in_file
 from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
-from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.examples import Dataset, Example, Table, examples_of
-from cadalign.shapes.learning import LEAST_MODELS, LearnOptions, learn_components
+from cadalign.shapes.learning import LEAST_MODELS, check_count, learn_components
 from cadalign.shapes.parts import (
     BOX_ROWS,
+    BoxMargins,
+    FewKeypoints,
     KeypointId,
     NearestShape,
     Reflection,
@@ -29,9 +29,7 @@ from cadalign.shapes.parts import (
     check_axis,
     check_ids,
 )
-from cadalign.shapes.plots import shape_html
-from cadalign.shapes.shape_file import ShapeFields, read_shape, write_shape
-from cadalign.shapes.tails import FewKeypoints
+from cadalign.shapes.shape_file import read_shape, write_shape
 
 OnProgress = Callable[[int, int], object]
 """Called with the number of steps that are done and that of all."""
@@ -169,21 +167,25 @@ class ShapeModel:
             If there are too few models, a model id occurs twice, the models' ids are partly numbers
             and partly names, or an option is out of range.
         """
-        options = LearnOptions(components=components, modes=modes, reflection=reflection)
+        check_count(components, "components")
+        check_count(modes, "modes")
         table = Table.of(list(models), least=LEAST_MODELS)
-        learned = learn_components(table.ids, table.rows, options, on_progress)
+        wanted: dict[str, Any] = {
+            "components": components,
+            "modes": modes,
+            "reflection": reflection,
+        }
+        learned, choice = learn_components(table.ids, table.rows, on_progress, **wanted)
         return cls(
             category=category,
             ids=table.ids,
-            components=learned.components,
+            components=learned,
             up_axis=up_axis,
-            reflection=learned.reflection,
+            reflection=choice.recipe.reflection,
             training=table.shapes,
             unit=unit,
-            inflation=learned.calibration.inflation,
-            degrees_of_freedom=learned.calibration.degrees_of_freedom,
-            box_margins=learned.box_margins,
-            few_keypoints=learned.calibration.few_keypoints,
+            box_margins=choice.margins,
+            **choice.calibration._asdict(),
         )
 
     @classmethod
@@ -366,17 +368,11 @@ class ShapeModel:
         DataError
             If the file is missing, truncated, damaged, of another version, or of another format.
         """
-        fields = read_shape(path)
-        with in_file(os.fspath(path)):
-            return cls(**fields._asdict())
+        return read_shape(path, cls)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the model to a file atomically; raises DataError on failure."""
-        write_shape(path, self._values)
-
-    @property
-    def _values(self) -> ShapeFields:
-        return ShapeFields(**{name: getattr(self, name) for name in ShapeFields._fields})
+        write_shape(path, self)
 
     def __repr__(self) -> str:
         count = len(self.components)
@@ -385,7 +381,9 @@ class ShapeModel:
         return f"ShapeModel({self.category!r}, {text}{models})"
 
     def _repr_html_(self) -> str:
-        return shape_html(self._values)
+        from cadalign.shapes.plots import shape_html
+
+        return shape_html(self)
 
     @property
     def mean(self) -> FloatArray:

@@ -1,11 +1,12 @@
-"""Parts of a shape model: Gaussian components, the reflection, the shapes it was learned from."""
+"""Parts of a shape model: components, reflection, training, box, and the tails of its errors."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,9 @@ KeypointId = int | str
 
 AXES = ("x", "y", "z")
 BOX_ROWS = 2  # the box's least and greatest corner, after the keypoints
+FEW = 6  # keypoints with which the inflation is least
+OUTWARD = np.array([[-1.0], [1.0]])
+"""Signs of the directions out of a box, at its least and greatest faces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +160,123 @@ class NearestShape:
     distance: float
     """Root of the mean squared distance of the keypoints [model units]; for those that the model
     lacks the distance expected in the category."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoxMargins:
+    """Distances between the faces of objects' boxes, their keypoints, and linear boxes.
+
+    Raises InputError if a shape is wrong, or a value is NaN, infinite or, of the tolerances,
+    negative.
+
+    Examples
+    --------
+    A face a little beyond the keypoints is where these end; one that is far beyond is another
+    part's:
+
+    >>> rule = BoxMargins(np.zeros((2, 3)), np.full((2, 3), 0.1))
+    >>> seen = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    >>> rule.bounds(np.array([[-0.05, 0.0, -0.5], [1.0, 1.05, 1.0]]), seen).tolist()
+    [[-0.0, -0.0, -0.5], [1.0, 1.0, 1.0]]
+    """
+
+    margins: FloatArray
+    """(2, 3), median distance of the least and the greatest face along x, y, z beyond the outermost
+    keypoint [model units]."""
+    tolerances: FloatArray
+    """(2, 3), how far beyond the true face the linear box, given all keypoints, lies in one
+    held-out object of twenty [model units]."""
+
+    def __post_init__(self) -> None:
+        for name in ("margins", "tolerances"):
+            value = as_floats(getattr(self, name), name=name, shape=(2, 3))
+            object.__setattr__(self, name, read_only(value))
+        if (self.tolerances < 0).any():
+            raise InputError("a distance is negative", where="tolerances")
+
+    def bounds(self, linear: FloatArray, seen: FloatArray) -> FloatArray:
+        """The box (2, 3) of an object, from the linear box and the given keypoints (n, 3)."""
+        reached = OUTWARD * np.array([seen.min(axis=0), seen.max(axis=0)]) + self.margins
+        outward = OUTWARD * linear
+        return np.asarray(OUTWARD * np.where(outward > reached + self.tolerances, outward, reached))
+
+
+def probability_within(
+    squares: npt.ArrayLike, dimension: int, degrees_of_freedom: float | None = None
+) -> Any:
+    """Probability of the region about an estimate that reaches as far as given errors.
+
+    ``squares`` are squared errors of ``dimension`` coordinates in stated standard deviations;
+    ``degrees_of_freedom`` are more than 2, None for Gaussian errors.
+
+    Examples
+    --------
+    >>> round(float(probability_within(1.0, 1)), 4), round(float(probability_within(1.0, 1, 5)), 4)
+    (0.6827, 0.7468)
+    """
+    from scipy.special import fdtr, gammainc
+
+    if degrees_of_freedom is None:
+        return gammainc(dimension / 2, np.asarray(squares) / 2)  # the distribution of chi-square
+    share = degrees_of_freedom / (degrees_of_freedom - 2)
+    return fdtr(dimension, degrees_of_freedom, np.asarray(squares) / dimension * share)
+
+
+def radius_of(
+    probability: float, dimension: int = 1, degrees_of_freedom: float | None = None
+) -> float:
+    """Radius, in stated deviations, of the region that holds the truth with a probability.
+
+    The inverse of `probability_within`.
+
+    Examples
+    --------
+    >>> round(radius_of(0.95), 2), round(radius_of(0.95, 3), 2), round(radius_of(0.95, 1, 5), 2)
+    (1.96, 2.8, 1.99)
+    """
+    from scipy.special import fdtri, gammaincinv
+
+    if degrees_of_freedom is None:
+        return float(np.sqrt(2 * gammaincinv(dimension / 2, probability)))
+    share = (degrees_of_freedom - 2) / degrees_of_freedom
+    return float(np.sqrt(dimension * share * fdtri(dimension, degrees_of_freedom, probability)))
+
+
+@dataclass(frozen=True)
+class FewKeypoints:
+    """Share of the inflation that is left where few keypoints are given.
+
+    The directions of shape that many keypoints determine vary little, and their variances are the
+    least well learned; where few are given, errors are those along the main modes.
+
+    Raises InputError if a number is out of range.
+
+    Examples
+    --------
+    >>> FewKeypoints(typical=12.0, share=0.81).share_of(6)
+    0.81
+    """
+
+    typical: float  # number of keypoints from which on the inflation is the whole one
+    share: float  # its share with `FEW` keypoints or less, in (0, 1]
+
+    def __post_init__(self) -> None:
+        if not is_number(self.typical) or self.typical <= FEW:
+            raise InputError(f"{self.typical!r} is not a number above {FEW}", where="typical")
+        if not is_number(self.share) or not 0 < self.share <= 1:
+            raise InputError(f"{self.share!r} is not a number in (0, 1]", where="share")
+        object.__setattr__(self, "typical", float(self.typical))
+        object.__setattr__(self, "share", float(self.share))
+
+    def share_of(self, count: float) -> float:
+        """Share of the inflation with a number of keypoints."""
+        position = math.log(max(count, FEW) / FEW) / math.log(self.typical / FEW)
+        return math.pow(self.share, 1 - min(position, 1.0))
+
+
+def inflation_with(count: float, inflation: float, few_keypoints: FewKeypoints | None) -> float:
+    """Inflation where a number of keypoints is given."""
+    return inflation if few_keypoints is None else inflation * few_keypoints.share_of(count)
 
 
 def check_axis(axis: object, where: str) -> None:

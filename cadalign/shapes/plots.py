@@ -8,10 +8,11 @@ import numpy as np
 
 from cadalign.notebook import card, draw_picture
 from cadalign.shapes.parts import BOX_ROWS
-from cadalign.shapes.shape_file import ShapeFields
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+    from cadalign.shapes.model import ShapeModel
 
 _SHOWN_MODES = 5
 # Rows are the picture's right and up for each up axis, seen obliquely.
@@ -19,7 +20,7 @@ _OBLIQUE = {"x": ((0, 1, 0.4), (1, 0, 0.3)), "y": ((1, 0, 0.4), (0, 1, 0.3)),
             "z": ((1, 0.4, 0), (0, 0.3, 1))}  # fmt: skip
 
 
-def shape_html(model: ShapeFields) -> str:
+def shape_html(model: ShapeModel) -> str:
     """HTML of a shape model: its mean keypoints and their standard deviations, and a table."""
     largest = max(model.components, key=lambda component: component.weight)
     total = max(float(np.trace(largest.covariance)), 1e-300)
@@ -36,7 +37,7 @@ def shape_html(model: ShapeFields) -> str:
     return card("ShapeModel", rows, picture=draw_picture(lambda axes: _draw(axes, model)))
 
 
-def _draw(axes: Axes, model: ShapeFields) -> None:
+def _draw(axes: Axes, model: ShapeModel) -> None:
     """Draw mean keypoints with bars of one standard deviation, seen obliquely."""
     largest = max(model.components, key=lambda component: component.weight)
     view = np.array(_OBLIQUE[model.up_axis or "y"], dtype=float)

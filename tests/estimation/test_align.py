@@ -13,9 +13,8 @@ from cadalign import Alignment, Camera, Model, RansacOptions, Size, View, align,
 from cadalign.errors import CadalignError, DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.result import Result
 from cadalign.metrics import rotation_error
-from cadalign.shapes.box_margins import BoxMargins
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.tails import FewKeypoints
+from cadalign.shapes.parts import BoxMargins, FewKeypoints
 
 CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
 LOOK = np.array([[0.8, 0.0, 0.6], [0.36, -0.8, -0.48], [0.48, 0.6, -0.64]])

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from cadalign.errors import InputError
-from cadalign.shapes.box_margins import BoxMargins, excesses_of, learn_margins, margins_of
+from cadalign.shapes.calibration import excesses_of, learn_margins, margins_of
 from cadalign.shapes.gaussians import Gaussians
+from cadalign.shapes.parts import BoxMargins
 
 SEEN = np.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5]])
 OUTWARD = np.array([[-1.0], [1.0]])

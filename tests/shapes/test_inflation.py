@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cadalign.errors import InputError
-from cadalign.shapes.tails import FEW, FewKeypoints, inflation_with
+from cadalign.shapes.parts import FEW, FewKeypoints, inflation_with
 
 
 def test_the_whole_inflation_stands_from_the_typical_number_on() -> None:

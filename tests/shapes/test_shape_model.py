@@ -21,9 +21,8 @@ from cadalign.errors import DataError, InputError
 from cadalign.io.files import Seal
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.parts import Reflection, ShapeComponent
+from cadalign.shapes.parts import FewKeypoints, Reflection, ShapeComponent
 from cadalign.shapes.shape_file import SEAL
-from cadalign.shapes.tails import FewKeypoints
 
 TABLE = np.array(
     [[-1, 0, -2], [1, 0, -2], [-1, 0, 2], [1, 0, 2], [-1, 1, -2], [1, 1, -2], [0, 1.5, 0]],

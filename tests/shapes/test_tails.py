@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.shapes.tails import probability_within, radius_of
+from cadalign.shapes.parts import probability_within, radius_of
 
 
 @pytest.mark.parametrize("freedom", [None, 3.0, 5.0, 20.0])

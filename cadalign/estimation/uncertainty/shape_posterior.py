@@ -29,7 +29,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.pixels import perspective
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.tails import probability_within
+from cadalign.shapes.parts import probability_within
 from cadalign.solvers.projection import ray_derivatives
 
 if TYPE_CHECKING:

@@ -7,18 +7,17 @@ from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, worker_count
+from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.assemble import canonical_result, result_of_solution
 from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
-from cadalign.estimation.problems import Problems, each_of, pack_many, pack_one
+from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.solve import solve, solve_one
 from cadalign.geometry.camera import Camera
@@ -140,27 +139,16 @@ def fit(
     150.0
     """
     start = time.perf_counter()
-    shape = (stretch, stretch_sigma, known_axis)
-    chosen: tuple[Any, ...] = (
-        method,
-        sigma,
-        loss,
-        loss_scale,
-        *shape,
-        focal,
-        focal_prior,
-        principal_sigma,
-    )
+    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior, principal_sigma)
+    others: tuple[Any, ...] = (loss, loss_scale, *shape, *lens)
     try:
-        options = _checked_options(*chosen)
+        options = _checked_options(method, sigma, *others)
     except InputError:
         raise
     except (TypeError, ValueError):  # an array as sigma has no hash
-        options = FitOptions(method, _copied(sigma), *chosen[2:])
+        options = FitOptions(method, _copied(sigma), *others)
     problems = pack_one(points_3d, points_2d, camera)
-    _check_ransac(ransac, scores)
-    if symmetry is not None:
-        _check_symmetry(symmetry)
+    _check(ransac, scores, symmetry)
     return _fit_one(problems, options, ransac, scores, symmetry, start)
 
 
@@ -237,51 +225,46 @@ def fit_batch(
 
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
-    shape = (stretch, stretch_sigma, known_axis)
-    options = FitOptions(
-        method, given, loss, loss_scale, *shape, focal, focal_prior, principal_sigma
-    )
+    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior, principal_sigma)
+    options = FitOptions(method, given, loss, loss_scale, *shape, *lens)
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
     if per_problem:
         sigmas = list(each_of(sigma, "sigma", len(problems), "values"))
-    _check_ransac(ransac, scores)
+    _check(ransac, scores, symmetry)
     if scores is not None:
         scores = each_of(scores, "scores", len(problems), "sets")
-    if symmetry is not None:
-        _check_symmetry(symmetry)
-    bounds = np.linspace(0, len(problems), worker_count(workers) + 1).astype(int).tolist()
-    parts = [(a, b) for a, b in pairwise(bounds) if a < b]
-    sizes = {(each.width, each.height) for each in problems.cameras}
-    if len(sizes) == 1:
+    if len({(each.width, each.height) for each in problems.cameras}) == 1:
         options = options.for_camera(problems.cameras[0])
     is_solved_at_once = ransac is None and options.focal_prior != USUAL
-    is_solved_at_once &= principal_sigma is None
+    is_solved_at_once &= principal_sigma is None and not options.estimates_in_rounds
 
     @np.errstate(all="ignore")  # holds for one thread only
-    def run(part: tuple[int, int]) -> Results:
-        some = problems.part(*part)
-        own = None if sigmas is None else sigmas[part[0] : part[1]]
-        if is_solved_at_once and not options.estimates_in_rounds:
-            start = time.perf_counter()
+    def run(first: int, last: int) -> Results:
+        some, start = problems.part(first, last), time.perf_counter()
+        own = None if sigmas is None else sigmas[first:last]
+        if is_solved_at_once:
             solutions = solve(some, options, own)
             solutions = solutions._replace(errors=dict(solutions.errors))  # which can be pickled
             seconds = (time.perf_counter() - start) / max(len(some), 1)
             return results_of_solutions(
                 some, solutions, options, sigmas=own, symmetry=symmetry, seconds=seconds
             )
-        trusted = None if scores is None else scores[part[0] : part[1]]
-        fits = _fits(some, options, ransac, own, trusted, symmetry)
-        return Results.of(
-            fits, counts=some.counts, unknowns=10 if options.focal == "estimate" else 9
-        )
+        fits: list[Result | CadalignError] = []
+        for b in range(first, last):
+            start, one = time.perf_counter(), options
+            if sigmas is not None:
+                one = replace(options, sigma=sigmas[b])
+            trusted = None if scores is None else scores[b]
+            try:
+                part = problems.part(b, b + 1)
+                fits.append(_fit_one(part, one, ransac, trusted, symmetry, start))
+            except CadalignError as error:
+                fits.append(error)
+        unknowns = 10 if options.focal == "estimate" else 9
+        return Results.of(fits, counts=some.counts, unknowns=unknowns)
 
-    if len(parts) < 2:
-        return run((0, len(problems)))
-    from concurrent.futures import ThreadPoolExecutor
-
-    with ThreadPoolExecutor(len(parts)) as pool:
-        return Results.joined(list(pool.map(run, parts)))
+    return Results.joined(in_threads(run, len(problems), workers))
 
 
 def _copied(sigma: Any) -> Any:
@@ -292,43 +275,17 @@ def _copied(sigma: Any) -> Any:
         return np.array(sigma)
 
 
-def _check_symmetry(symmetry: object) -> None:
-    from cadalign.estimation.symmetry import check_symmetry  # most models have none
-
-    check_symmetry(symmetry)
-
-
-def _check_ransac(ransac: object, scores: object) -> None:
+def _check(ransac: object, scores: object, symmetry: object) -> None:
     if ransac is not None and not isinstance(ransac, RansacOptions):
         what = f"expected a cadalign.RansacOptions, got {type(ransac).__name__}"
         raise InputError(what, where="ransac")
     if ransac is None and scores is not None:
-        raise InputError(
-            "given without ransac",
-            where="scores",
-            fix="give ransac=RansacOptions(...), or the keypoints' sigma instead",
-        )
+        fix = "give ransac=RansacOptions(...), or the keypoints' sigma instead"
+        raise InputError("given without ransac", where="scores", fix=fix)
+    if symmetry is not None:
+        from cadalign.estimation.symmetry import check_symmetry  # most models have none
 
-
-def _fits(
-    problems: Problems,
-    options: FitOptions,
-    ransac: RansacOptions | None,
-    sigmas: Sequence[Sigma] | None,
-    scores: Sequence[npt.ArrayLike] | None,
-    symmetry: Symmetry | None,
-) -> list[Result | CadalignError]:
-    """Fits of all problems, one by one; an error takes the place of a result."""
-    fits: list[Result | CadalignError] = []
-    for b in range(len(problems)):
-        own = options if sigmas is None else replace(options, sigma=sigmas[b])
-        trusted = None if scores is None else scores[b]
-        start, one = time.perf_counter(), problems.part(b, b + 1)
-        try:
-            fits.append(_fit_one(one, own, ransac, trusted, symmetry, start))
-        except CadalignError as error:
-            fits.append(error)
-    return fits
+        check_symmetry(symmetry)
 
 
 def _fit_one(

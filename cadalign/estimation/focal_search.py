@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -91,16 +90,6 @@ class _Task:
         return replace(self, points=points, points_2d=pixels, sigma=sigma)
 
 
-class _Minima(NamedTuple):
-    """Minima, the best first: poses (k, 15), focal lengths (k,) [px], costs (k,); the effort."""
-
-    poses: FloatArray
-    focals: FloatArray
-    costs: FloatArray
-    iterations: int
-    hypotheses: int
-
-
 def search_focal(
     problems: Problems,
     options: FitOptions,
@@ -131,19 +120,19 @@ def search_focal(
             statuses[b] = TOO_FEW
             continue
         try:
-            minima, undetermined = _minima(task), -1
-            found = len(minima.poses)
+            minima, iterations, hypotheses = _minima(task)
+            found, undetermined = len(minima[0]), -1
             if found:
-                system = task.system(float(minima.focals[0]))
-                undetermined = focal_covariance(system, minima.poses[0], covariances[b])
+                system = task.system(float(minima[1][0]))
+                undetermined = focal_covariance(system, minima[0][0], covariances[b])
         except InputError as error:  # the lens model cannot be undone
             errors[b] = error
             continue
         except np.linalg.LinAlgError:
             statuses[b] = OUT_OF_RANGE
             continue
-        poses[b, :found], focals[b, :found], costs[b, :found] = minima[:3]
-        info[b] = found, minima.iterations, minima.hypotheses, undetermined
+        poses[b, :found], focals[b, :found], costs[b, :found] = minima
+        info[b] = found, iterations, hypotheses, undetermined
         if not found:
             statuses[b] = NOT_FOUND
         elif undetermined >= 0:
@@ -153,11 +142,15 @@ def search_focal(
     return Solutions(poses, costs, covariances, statuses, info, focals=focals, errors=errors)
 
 
-def _minima(task: _Task) -> _Minima:
+def _minima(task: _Task) -> tuple[tuple[FloatArray, FloatArray, FloatArray], int, int]:
+    """Minima, the best first, and the iterations and hypotheses that they took.
+
+    Poses (k, 15), focal lengths (k,) [px] and costs (k,).
+    """
     center = task.points.mean(axis=0)
     unit = float(np.sqrt(((task.points - center) ** 2).sum(axis=1).mean()))
     if not unit > 0:
-        return _Minima(np.empty((0, POSE_SIZE)), np.empty(0), np.empty(0), 0, 0)
+        return (np.empty((0, POSE_SIZE)), np.empty(0), np.empty(0)), 0, 0
     local = replace(task, points=(task.points - center) / unit)
     coarse = local.thinned(_COARSE_POINTS)
     reference, starts, iterations, hypotheses = _starts(coarse)
@@ -172,7 +165,7 @@ def _minima(task: _Task) -> _Minima:
         orthonormalize(pose)
         uncenter(pose, center, unit)
     focals, costs = reference * np.exp(states[:, POSE_SIZE]), minima.costs[: len(states)]
-    return _Minima(poses, focals, costs, iterations + int(minima.counts[1]), hypotheses)
+    return (poses, focals, costs), iterations + int(minima.counts[1]), hypotheses
 
 
 def _count_likely(minima: Minima, count: int) -> int:

@@ -6,26 +6,22 @@ leaves. The backward pass solves one linear system for each problem, vectorised 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, worker_count
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions
-from cadalign.estimation.problems import Problems, rays_of
+from cadalign.estimation.problems import Problems, in_threads, rays_of
 from cadalign.estimation.solve import solve
 from cadalign.estimation.uncertainty.derivatives import UNKNOWNS, Optima, lens_slopes
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotations_from_vectors
 from cadalign.solvers.constants import OK
-
-T = TypeVar("T")
 
 _LARGEST_POLISH = 0.02  # turn [rad] or change of a logarithm beyond which a step is no polish
 _AT_BOUND = 1e-9
@@ -141,16 +137,9 @@ class BatchFits:
         """Minima of the search, from which the fits follow without another one."""
         return BatchMinima(*_joined(part.minima for part in self.parts))
 
-    def pulled_back(
-        self,
-        by_rotation: FloatArray,
-        by_translation: FloatArray,
-        by_scale: FloatArray,
-        by_focal: FloatArray,
-    ) -> tuple[FloatArray, ...]:
-        """Slopes by points, pixels and sigmas from those by `FitValues`."""
+    def pulled_back(self, *slopes: FloatArray) -> tuple[FloatArray, ...]:
+        """Slopes by points, pixels and sigmas from those by rotation, translation, scale, focal."""
         ends = np.cumsum([len(part.minima.found) for part in self.parts])[:-1]
-        slopes = by_rotation, by_translation, by_scale, by_focal
         given = zip(self.parts, *(np.split(each, ends) for each in slopes), strict=True)
         return _joined(part.pulled_back(*own) for part, *own in given)
 
@@ -161,7 +150,7 @@ def _joined(parts: Iterable[tuple[Any, ...]]) -> tuple[Any, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Fits of some problems, their optima before the polish, and which of them are valid (B,).
+    """Fits of some problems, and their optima before the polish.
 
     ``by_pixels`` (B, n, 2, 2) are the derivatives of the optima's rays by the pixels.
     """
@@ -170,20 +159,7 @@ class _Part:
     optima: Optima
     by_pixels: FloatArray
     sigmas: FloatArray
-    rotation: FloatArray
-    translation: FloatArray
-    scale: FloatArray
-    focals: FloatArray
-    valid: BoolArray
-
-    @property
-    def values(self) -> FitValues:
-        free = self.optima.free
-        covariance = np.zeros((len(self.valid), UNKNOWNS, UNKNOWNS))
-        covariance[:, free[:, None], free] = self.optima.solved[0]
-        covariance[~self.valid] = 0.0
-        pose = self.rotation, self.translation, self.scale
-        return FitValues(*pose, self.focals, covariance, self.valid)
+    values: FitValues
 
     def pulled_back(
         self,
@@ -192,12 +168,12 @@ class _Part:
         by_scale: FloatArray,
         by_focal: FloatArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        slopes = np.empty((len(by_focal), UNKNOWNS))
-        slopes[:, :3] = np.cross(self.rotation, by_rotation, axis=1).sum(axis=2)
+        values, slopes = self.values, np.empty((len(by_focal), UNKNOWNS))
+        slopes[:, :3] = np.cross(values.rotation, by_rotation, axis=1).sum(axis=2)
         slopes[:, 3:6] = by_translation
-        slopes[:, 6:9] = by_scale * self.scale
-        slopes[:, 9] = by_focal * self.focals
-        slopes[~self.valid] = 0.0
+        slopes[:, 6:9] = by_scale * values.scale
+        slopes[:, 9] = by_focal * values.focal
+        slopes[~values.valid] = 0.0
         by_rays, by_log_sigma, by_points = self.optima.pull_back(slopes)
         by_pixels = (by_rays[..., None, :] @ self.by_pixels)[..., 0, :]
         return by_points, by_pixels, by_log_sigma / self.sigmas
@@ -284,17 +260,19 @@ def _polished(
     step = optima.newton_step
     size = np.abs(step[:, [0, 1, 2, 6, 7, 8, 9]]).max(axis=1)
     step[~(valid & (size < _LARGEST_POLISH))] = 0.0
-    return _Part(
-        minima,
-        optima,
-        by_pixels,
-        batch.sigmas,
+    valid, free = valid & optima.solved[1], optima.free
+    covariance = np.zeros((len(valid), UNKNOWNS, UNKNOWNS))
+    covariance[:, free[:, None], free] = optima.solved[0]  # the Hessian's inverse
+    covariance[~valid] = 0.0
+    values = FitValues(
         rotations_from_vectors(step[:, :3]) @ pose[0],
         pose[1] + step[:, 3:6],
         pose[2] * np.exp(step[:, 6:9]),
         focals * np.exp(step[:, 9]),
-        valid & optima.solved[1],
+        covariance,
+        valid,
     )
+    return _Part(minima, optima, by_pixels, batch.sigmas, values)
 
 
 def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> BatchMinima:
@@ -315,13 +293,3 @@ def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> 
     if found.focals is not None:
         focals = np.where(valid, found.focals[:, 0], focals)
     return BatchMinima(poses, focals, valid)
-
-
-def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T]:
-    """Results of ``run(first, last)`` over parts of so many problems, shared among threads."""
-    bounds = np.linspace(0, count, min(worker_count(workers), max(count, 1)) + 1).astype(int)
-    parts = list(pairwise(bounds.tolist()))
-    if len(parts) == 1:
-        return [run(*parts[0])]
-    with ThreadPoolExecutor(len(parts)) as pool:
-        return list(pool.map(run, *zip(*parts, strict=True)))

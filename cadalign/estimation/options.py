@@ -96,20 +96,25 @@ class FitOptions(AlignmentOptions):
         _check_known("loss", self.loss, LOSSES)
         _check_known("known_axis", self.known_axis, AXES)
         _check_known("focal", self.focal, FOCALS)
-        object.__setattr__(self, "loss_scale", as_positive(self.loss_scale, name="loss_scale"))
-        if self.stretch_sigma is not None:
-            stretch_sigma = as_positive(self.stretch_sigma, name="stretch_sigma")
-            object.__setattr__(self, "stretch_sigma", stretch_sigma)
-        if self.principal_sigma is not None:
-            principal_sigma = as_positive(self.principal_sigma, name="principal_sigma")
-            object.__setattr__(self, "principal_sigma", principal_sigma)
+        _set_positive(self, "loss_scale")
+        for name in ("stretch_sigma", "principal_sigma"):
+            if getattr(self, name) is not None:
+                _set_positive(self, name)
         if self.sigma is not None and not is_number(self.sigma):
             try:
                 np.ndim(self.sigma)
             except ValueError:
                 raise InputError("its entries are not of one shape", where="sigma") from None
         if self.stretch is not None:
-            self._check_stretch(self.stretch)
+            axes = [axis for axis in "xyz" if axis != self.known_axis]
+            allowed = ("".join(axes), axes[0], axes[1], "none")
+            if not isinstance(self.stretch, str) or self.stretch not in allowed:
+                raise InputError(
+                    f"{quote(self.stretch)} are not axes that can stretch where {self.known_axis} "
+                    "is known",
+                    where="stretch",
+                    fix=f"give one of {', '.join(allowed)}",
+                )
         if self.focal == "estimate" and self.method != "optimal":
             raise InputError(
                 f"the method {self.method!r} needs a known focal length",
@@ -130,16 +135,6 @@ class FitOptions(AlignmentOptions):
                 "principal point",
                 where="method",
                 fix="use the method 'optimal', or leave these options at their defaults",
-            )
-
-    def _check_stretch(self, stretch: object) -> None:
-        axes = [axis for axis in "xyz" if axis != self.known_axis]
-        allowed = ("".join(axes), axes[0], axes[1], "none")
-        if not isinstance(stretch, str) or stretch not in allowed:
-            raise InputError(
-                f"{quote(stretch)} are not axes that can stretch where {self.known_axis} is known",
-                where="stretch",
-                fix=f"give one of {', '.join(allowed)}",
             )
 
     def for_camera(self, camera: Camera) -> FitOptions:
@@ -250,8 +245,7 @@ class RansacOptions:
 
     def __post_init__(self) -> None:
         if self.max_reproj_error is not None:
-            error = as_positive(self.max_reproj_error, name="max_reproj_error")
-            object.__setattr__(self, "max_reproj_error", error)
+            _set_positive(self, "max_reproj_error")
         for name, least in (("max_iterations", 1), ("min_iterations", 0), ("seed", 0)):
             value = getattr(self, name)
             if not is_whole(value) or not least <= value < 2**63:
@@ -279,6 +273,10 @@ def _check_known(name: str, value: object, known: Collection[str]) -> None:
     if not isinstance(value, str) or value not in known:
         fix = f"known are {', '.join(known)}"
         raise InputError(f"unknown {name} {quote(value)}", where=name, fix=fix)
+
+
+def _set_positive(options: FitOptions | RansacOptions, name: str) -> None:
+    object.__setattr__(options, name, as_positive(getattr(options, name), name=name))
 
 
 SIGMA_HELP = (

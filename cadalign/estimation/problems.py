@@ -6,16 +6,17 @@ Pixels become rays, and the keypoints' uncertainties the weights of the residual
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from types import MappingProxyType
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_number
+from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_number, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
 from cadalign.geometry.camera import Camera
@@ -23,6 +24,8 @@ from cadalign.geometry.pixels import check_pixels
 from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
 from cadalign.solvers.linear import aepnp_error, describe_plane, out_of_range_error
 from cadalign.solvers.projection import all_finite, pinhole_rays
+
+T = TypeVar("T")
 
 _NO_RESIDUALS = np.empty((0, 2))
 _NO_ERRORS: Mapping[int, CadalignError] = MappingProxyType({})
@@ -131,29 +134,22 @@ def pack_many(
         _check_camera(single)
     if not count:
         return Problems(np.empty((0, 3)), np.empty((0, 2)), np.zeros(1, dtype=np.int64), cameras)
+    problems = None
     if _is_stack(points_3d, 3) and _is_stack(points_2d, 2):
         model = np.array(points_3d, dtype=np.float64, order="C").reshape(-1, 3)
         image = np.array(points_2d, dtype=np.float64, order="C").reshape(-1, 2)
         if len(model) == len(image) and all_finite(model, image):
             offsets = np.arange(count + 1) * (len(model) // count)
-            return _checked(Problems(model, image, offsets, cameras))
-    pairs = [
-        _check_pair(points_3d[b], points_2d[b], f"points_3d[{b}]", f"points_2d[{b}]")
-        for b in range(count)
-    ]
-    offsets = np.concatenate([[0], np.cumsum([len(model) for model, _ in pairs])])
-    problems = Problems(
-        np.concatenate([model for model, _ in pairs]),
-        np.concatenate([image for _, image in pairs]),
-        offsets.astype(np.int64),
-        cameras,
-    )
-    return _checked(problems)
-
-
-def _checked(problems: Problems) -> Problems:
-    """The problems, none of whose keypoints are normalised coordinates."""
-    for b in range(len(problems)):
+            problems = Problems(model, image, offsets, cameras)
+    if problems is None:
+        pairs = [
+            _check_pair(points_3d[b], points_2d[b], f"points_3d[{b}]", f"points_2d[{b}]")
+            for b in range(count)
+        ]
+        models, images = zip(*pairs, strict=True)
+        offsets = np.cumsum([0, *map(len, models)], dtype=np.int64)
+        problems = Problems(np.concatenate(models), np.concatenate(images), offsets, cameras)
+    for b in range(count):
         camera, image = problems.camera(b), problems.points_2d[problems.rows(b)]
         check_pixels(image, camera.width, camera.height, where=f"points_2d[{b}]")
     return problems
@@ -177,6 +173,18 @@ def each_of(value: Any, name: str, count: int | None, entries: str) -> Any:
     if count is not None and len(each) != count:
         raise InputError(f"{count} problems but {len(each)} {entries}", where=name)
     return each
+
+
+def in_threads(run: Callable[[int, int], T], count: int, workers: int) -> list[T]:
+    """Results of ``run(first, last)`` over parts of so many problems, shared among threads."""
+    bounds = np.linspace(0, count, min(worker_count(workers), max(count, 1)) + 1).astype(int)
+    parts = list(pairwise(bounds.tolist()))
+    if len(parts) == 1:
+        return [run(*parts[0])]
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(len(parts)) as pool:
+        return list(pool.map(run, *zip(*parts, strict=True)))
 
 
 def _is_stack(value: object, last: int) -> bool:

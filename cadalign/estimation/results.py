@@ -266,6 +266,8 @@ class Results(Sequence[Result | CadalignError]):
     @classmethod
     def joined(cls, parts: Sequence[Results]) -> Results:
         """Put the results of successive parts of a batch together."""
+        if len(parts) == 1:
+            return parts[0]
         names = "rotation translation scale rms focal_length fisher_covariance residuals inliers"
         columns = {name: [getattr(part, name) for part in parts] for name in names.split()}
         arrays: dict[str, Any] = {

@@ -110,7 +110,7 @@ def align_single(
     start = time.perf_counter()
     prior = prior_of(model)
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
-    means, covariances, weights = model.gaussians
+    weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
     seen = seen_keypoints(view, cast(FloatArray, view.points_2d), rows, options)
     minima, hypotheses = search_view(mixture, seen, _given(init))

@@ -12,7 +12,7 @@ than a Gaussian of that covariance says, and few far away.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +71,9 @@ def calibrate(
     of the image's noise [model units]; ``rng`` draws directions, given keypoints and noise. The
     factor is 1 or more; without a model of enough keypoints it is 1, and errors are Gaussian.
     """
-    every, few, counts = _Errors([], []), _Errors([], []), []
+    every: list[tuple[FloatArray, FloatArray]] = []
+    few: list[tuple[FloatArray, FloatArray]] = []
+    counts = []
     for rows, mixture in parts:
         for row in rows:
             known = np.flatnonzero(np.isfinite(row[:-BOX_ROWS]).all(axis=1))
@@ -85,10 +87,10 @@ def calibrate(
                 few.append(_squares(view, mixture, sigma))
     if not counts:
         return Calibration()
-    gaps, typical = every.departures()[:, :, None], float(np.mean(counts))
-    if few.turned and typical > FEW:
+    gaps, typical = _departures(every)[:, :, None], float(np.mean(counts))
+    if few and typical > FEW:
         is_less = np.tri(len(_FACTORS), dtype=bool)  # or as large
-        gaps = np.where(is_less, gaps + few.departures()[:, None], np.inf)
+        gaps = np.where(is_less, gaps + _departures(few)[:, None], np.inf)
     freedom, row, lower = np.unravel_index(np.argmin(gaps), gaps.shape)
     factor, of_few = float(_FACTORS[row]), None
     if gaps.shape[2] > 1:
@@ -96,26 +98,16 @@ def calibrate(
     return Calibration(factor, _DEGREES_OF_FREEDOM[freedom], of_few)
 
 
-class _Errors(NamedTuple):
-    """Squared errors in stated deviations: (F,) of rotations and (F, n) of keypoints per view."""
-
-    turned: list[FloatArray]
-    moved: list[FloatArray]
-
-    def append(self, squares: tuple[FloatArray, FloatArray]) -> None:
-        """Add those of a view."""
-        self.turned.append(squares[0])
-        self.moved.append(squares[1])
-
-    def departures(self) -> FloatArray:
-        """Squared departures of coverage by degrees of freedom and factor."""
-        turned, moved = np.array(self.turned), np.concatenate(self.moved, axis=1).T
-        return np.array(
-            [
-                _departure(turned, freedom) + _departure(moved, freedom)
-                for freedom in _DEGREES_OF_FREEDOM
-            ]
-        )
+def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """Squared departures of coverage by degrees of freedom and factor; see `_squares`."""
+    turned = np.array([each for each, _ in squares])
+    moved = np.concatenate([each for _, each in squares], axis=1).T
+    return np.array(
+        [
+            _departure(turned, freedom) + _departure(moved, freedom)
+            for freedom in _DEGREES_OF_FREEDOM
+        ]
+    )
 
 
 def _departure(squares: FloatArray, degrees_of_freedom: float | None) -> FloatArray:

@@ -97,43 +97,38 @@ def examples_of(
     return examples
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
-    """Models as rows of one array."""
+def tabulated(
+    examples: Sequence[Example], *, least: int
+) -> tuple[tuple[KeypointId, ...], FloatArray, TrainingShapes]:
+    """Models as rows of one array: all ids that a model has, sorted, and the rows.
 
-    ids: tuple[KeypointId, ...]  # all ids that a model has, sorted
-    rows: FloatArray  # (N, m + 2, 3), keypoints and box corners; NaN for what a model lacks
-    shapes: TrainingShapes  # the models' ids, keypoints and meshes
-
-    @classmethod
-    def of(cls, examples: Sequence[Example], *, least: int) -> Table:
-        """Tabulate models; see `ShapeModel.learn` for the errors raised.
-
-        If less than half of the models have bounds, the boxes are those of the keypoints.
-        """
-        if len(examples) < least:
-            raise InputError(
-                f"{len(examples)} models are too few to learn a shape from",
-                where="models",
-                fix=f"give at least {least}",
-            )
-        _check_names(examples)
-        ids = tuple(sorted({label for each in examples for label in each.ids}))
-        column = {label: row for row, label in enumerate(ids)}
-        rows = np.full((len(examples), len(ids) + BOX_ROWS, 3), np.nan)
-        measured = 2 * sum(each.bounds is not None for each in examples) >= len(examples)
-        for row, each in zip(rows, examples, strict=True):
-            row[[column[label] for label in each.ids]] = each.points_3d
-            if not measured:
-                row[-BOX_ROWS:] = each.points_3d.min(axis=0), each.points_3d.max(axis=0)
-            elif each.bounds is not None:
-                row[-BOX_ROWS:] = each.bounds
-        shapes = TrainingShapes(
-            tuple(each.model_id for each in examples),
-            rows[:, :-BOX_ROWS].astype(np.float32),
-            tuple(each.mesh_path for each in examples),
+    Rows (N, m + 2, 3) are keypoints and box corners, NaN for what a model lacks. If less than half
+    of the models have bounds, the boxes are those of the keypoints. For the errors raised see
+    `ShapeModel.learn`.
+    """
+    if len(examples) < least:
+        raise InputError(
+            f"{len(examples)} models are too few to learn a shape from",
+            where="models",
+            fix=f"give at least {least}",
         )
-        return cls(ids, rows, shapes)
+    _check_names(examples)
+    ids = tuple(sorted({label for each in examples for label in each.ids}))
+    column = {label: row for row, label in enumerate(ids)}
+    rows = np.full((len(examples), len(ids) + BOX_ROWS, 3), np.nan)
+    measured = 2 * sum(each.bounds is not None for each in examples) >= len(examples)
+    for row, each in zip(rows, examples, strict=True):
+        row[[column[label] for label in each.ids]] = each.points_3d
+        if not measured:
+            row[-BOX_ROWS:] = each.points_3d.min(axis=0), each.points_3d.max(axis=0)
+        elif each.bounds is not None:
+            row[-BOX_ROWS:] = each.bounds
+    shapes = TrainingShapes(
+        tuple(each.model_id for each in examples),
+        rows[:, :-BOX_ROWS].astype(np.float32),
+        tuple(each.mesh_path for each in examples),
+    )
+    return ids, rows, shapes
 
 
 def _check_names(examples: Sequence[Example]) -> None:

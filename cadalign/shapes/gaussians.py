@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,13 +19,12 @@ from cadalign.arrays import FloatArray, IntArray
 _UNSEEN = 1e-6  # weight of the previous mean: a component without vectors stays where it is
 
 
-@dataclass(frozen=True, eq=False)
-class Gaussians:
-    """A mixture of Gaussians."""
+class Gaussians(NamedTuple):
+    """A mixture of Gaussians: weights (g,), which sum to 1, means (g, d), covariances (g, d, d)."""
 
-    weights: FloatArray  # (g,), sum to 1
-    means: FloatArray  # (g, d)
-    covariances: FloatArray  # (g, d, d)
+    weights: FloatArray
+    means: FloatArray
+    covariances: FloatArray
 
     def widened(self, sigma: float) -> Gaussians:
         """The distribution of the vectors with independent noise in every entry."""
@@ -32,23 +32,28 @@ class Gaussians:
         return Gaussians(self.weights, self.means, self.covariances + noise)
 
 
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Prior on the covariances."""
+class Prior(NamedTuple):
+    """Prior on the covariances.
 
-    covariance: FloatArray  # (d, d), what the covariances are drawn towards
-    strength: float  # how many vectors it counts as
-    floor: float  # standard deviation that no direction falls below
+    They are drawn towards ``covariance`` (d, d), which counts as ``strength`` vectors; no direction
+    falls below the standard deviation ``floor``.
+    """
+
+    covariance: FloatArray
+    strength: float
+    floor: float
 
 
-@dataclass(frozen=True, eq=False)
-class Pattern:
-    """Vectors that have the same entries."""
+class Pattern(NamedTuple):
+    """Vectors, by their ``rows`` (r,), that have the same entries ``seen`` (n,), and no others.
 
-    rows: IntArray  # (r,), which vectors
-    seen: IntArray  # (n,), the entries that they have
-    missing: IntArray  # (d - n,), the entries that they lack
-    values: FloatArray  # (r, n), what they have
+    ``values`` (r, n) are what they have, ``missing`` (d - n,) the entries that they lack.
+    """
+
+    rows: IntArray
+    seen: IntArray
+    missing: IntArray
+    values: FloatArray
 
 
 @dataclass(frozen=True, eq=False)

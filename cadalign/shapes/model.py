@@ -1,4 +1,4 @@
-"""`cadalign.ShapeModel`: the shapes of a category as a mixture of ShapeGaussians."""
+"""`cadalign.ShapeModel`: the shapes of a category as a mixture of Gaussians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
 from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
-from cadalign.shapes.examples import Dataset, Example, Table, examples_of
+from cadalign.shapes.examples import Dataset, Example, examples_of, tabulated
+from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.learning import LEAST_MODELS, check_count, learn_components
 from cadalign.shapes.parts import (
     BOX_ROWS,
@@ -24,7 +25,6 @@ from cadalign.shapes.parts import (
     NearestShape,
     Reflection,
     ShapeComponent,
-    ShapeGaussians,
     TrainingShapes,
     check_axis,
     check_ids,
@@ -152,7 +152,7 @@ class ShapeModel:
         category, up_axis, unit
             See `ShapeModel`.
         components : int, optional
-            Number of ShapeGaussians.
+            Number of Gaussians.
         modes : int, optional
             Number of modes of each.
         reflection : bool
@@ -169,20 +169,20 @@ class ShapeModel:
         """
         check_count(components, "components")
         check_count(modes, "modes")
-        table = Table.of(list(models), least=LEAST_MODELS)
+        given, rows, training = tabulated(list(models), least=LEAST_MODELS)
         wanted: dict[str, Any] = {
             "components": components,
             "modes": modes,
             "reflection": reflection,
         }
-        learned, choice = learn_components(table.ids, table.rows, on_progress, **wanted)
+        learned, choice = learn_components(given, rows, on_progress, **wanted)
         return cls(
             category=category,
-            ids=table.ids,
+            ids=given,
             components=learned,
             up_axis=up_axis,
             reflection=choice.recipe.reflection,
-            training=table.shapes,
+            training=training,
             unit=unit,
             box_margins=choice.margins,
             **choice.calibration._asdict(),
@@ -391,12 +391,12 @@ class ShapeModel:
         return np.asarray(sum(each.weight * each.mean for each in self.components))
 
     @cached_property
-    def gaussians(self) -> ShapeGaussians:
-        """The components as arrays, computed once."""
-        return ShapeGaussians(
+    def gaussians(self) -> Gaussians:
+        """The components as arrays: means (G, m + 2, 3), covariances of the stacked rows."""
+        return Gaussians(
+            np.array([each.weight for each in self.components]),
             np.array([each.mean for each in self.components]),
             np.array([each.covariance for each in self.components]),
-            np.array([each.weight for each in self.components]),
         )
 
     def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:

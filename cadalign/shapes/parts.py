@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -73,14 +73,6 @@ class ShapeComponent:
     def variance(self) -> FloatArray:
         """Sum of the rows' variances along each mode, (K,) float [model units squared]."""
         return np.asarray((self.modes**2).sum(axis=(1, 2)))
-
-
-class ShapeGaussians(NamedTuple):
-    """A mixture's means (G, m + 2, 3), covariances (G, 3 (m + 2), 3 (m + 2)) and weights (G,)."""
-
-    means: FloatArray
-    covariances: FloatArray
-    weights: FloatArray
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, PriorOption
-from cadalign.estimation.layers import FitTask, KeypointBatch, fits_of, in_threads
+from cadalign.estimation.layers import FitTask, KeypointBatch, fits_of
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import prior_of
+from cadalign.estimation.problems import in_threads
 from cadalign.geometry.camera import Camera
 from cadalign.names import renamed
 from cadalign.shapes.model import ShapeModel
@@ -223,7 +224,7 @@ def align(
         what = f"{len(names)} ids for {points_2d.shape[1]} keypoints"
         raise InputError(what, where="ids", fix="give the id of each keypoint")
     rows = np.array(prior_of(model).rows_of(names, "ids"), dtype=np.int64)
-    means, covariances, weights = model.gaussians
+    weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
 
     def solve(pixels: FloatArray, sigmas: FloatArray) -> _Solved:

@@ -380,7 +380,7 @@ def car_keypoints(shape: ShapeModel, box: Box, camera: Camera) -> ImageKeypoints
 
     Raises InputError if the shape is no single Gaussian, or the car is behind the camera.
     """
-    means, covariances, _ = shape.gaussians
+    _, means, covariances = shape.gaussians
     if len(means) != 1:
         raise InputError("a mixture has no single mean", where="shape")
     mean, covariance, count = means[0].ravel(), covariances[0], len(shape.ids)

@@ -140,13 +140,13 @@ def fit(
     """
     start = time.perf_counter()
     shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior, principal_sigma)
-    others: tuple[Any, ...] = (loss, loss_scale, *shape, *lens)
+    chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, *lens)
     try:
-        options = _checked_options(method, sigma, *others)
+        options = _checked_options(*chosen)
     except InputError:
         raise
     except (TypeError, ValueError):  # an array as sigma has no hash
-        options = FitOptions(method, _copied(sigma), *others)
+        options = FitOptions(method, _copied(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
     _check(ransac, scores, symmetry)
     return _fit_one(problems, options, ransac, scores, symmetry, start)

@@ -20,7 +20,7 @@ def upgraded(data: Mapping[str, Any]) -> dict[str, Any]:
 
     What is invalid stays, and is refused by its reader.
     """
-    defaults = {"warnings": [], "fisher_covariance": None}
+    defaults: dict[str, Any] = {"warnings": [], "fisher_covariance": None}
     return {
         **defaults,
         **data,

@@ -17,7 +17,7 @@ from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-from cadalign.shapes.tails import probability_within
+from cadalign.shapes.parts import probability_within
 
 _LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25
 _COVERED = 0.95

@@ -13,7 +13,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.shapes.tails import probability_within
+from cadalign.shapes.parts import probability_within
 from cadalign.solvers.alignment import covariance_of, keypoint_objective
 from cadalign.solvers.constants import UNKNOWNS
 from cadalign.solvers.evidence import LogFocalPrior

@@ -26,7 +26,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import by_rotation
 
 if TYPE_CHECKING:
-    from cadalign.estimation.robust import RobustSearch
+    from cadalign.estimation.consensus import RobustSearch
     from cadalign.estimation.uncertainty.evidence import AnyBasis
 
 
@@ -132,7 +132,7 @@ class KeypointStatistics(FittedKeypoints):
             from cadalign.estimation.uncertainty.misfit import mistake_in_fit
 
             return mistake_in_fit(self, self.misfit)
-        from cadalign.estimation.robust import mistake_in  # with the kernels of the search
+        from cadalign.estimation.consensus import mistake_in  # with the kernels of the search
 
         return mistake_in(self.search, self.search.explained(self.alignment, self.residuals))
 

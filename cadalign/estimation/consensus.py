@@ -1,0 +1,245 @@
+"""Consensus of one view's keypoints, by LO-RANSAC over the minimal solver."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cadalign.arrays import BoolArray, FloatArray, as_floats
+from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign.estimation.facing import faced, turned_poses
+from cadalign.estimation.focal import check_estimable, log_focal_range
+from cadalign.estimation.focal_search import focal_views
+from cadalign.estimation.mistakes import (
+    SOLUTIONS_OF_FOUR,
+    Explained,
+    Mistake,
+    Support,
+    area_of,
+    check_support,
+    disagreeing,
+    find_mistake,
+    larger_sizes,
+)
+from cadalign.estimation.options import (
+    MINIMAL_SOLVERS,
+    FitOptions,
+    RansacOptions,
+    pixel_information,
+)
+from cadalign.estimation.problems import (
+    Problems,
+    are_in_one_plane,
+    rays_of,
+    whitening_of,
+)
+from cadalign.estimation.solve import solve_one
+from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
+from cadalign.solvers.alignment import Objective
+from cadalign.solvers.constants import LINEAR, POSE_SIZE, SAMPLE_SIZES
+from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, Views
+from cadalign.solvers.ransac import Settings, ransac_kernel
+
+_MOST_EXHAUSTIVE = 1000  # subsets that are all tried rather than drawn from
+_CHANCE = 0.2  # bound on the expected number of models; 1 in 50 such problems has one
+_SIGMAS = 3.0  # that the threshold of inliers is taken to be where the noise is not known
+_STRETCH_SIGMA = 1.0  # of log scales, by which alignments are compared: outliers invite extremes
+
+
+class Consensus(NamedTuple):
+    """An alignment with the keypoints (n,) that support it, and the residuals (n, 2) [px] of all.
+
+    ``score`` is the truncated sum of squares [px^2].
+    """
+
+    alignment: Alignment
+    camera: Camera
+    inliers: BoolArray
+    residuals: FloatArray
+    iterations: int
+    hypotheses: int
+    score: float
+
+
+@dataclass(frozen=True, eq=False)
+class RobustSearch:
+    """The only problem, and how to search for the keypoints that agree."""
+
+    problems: Problems
+    options: FitOptions
+    ransac: RansacOptions
+    scores: npt.ArrayLike | None
+
+    @property
+    def area(self) -> float:
+        """The area [px^2] over which outliers are scattered."""
+        return area_of(self.problems.points_2d, self.problems.cameras[0], self.threshold)
+
+    @property
+    def threshold(self) -> float:
+        """Largest reprojection error of an inlier [px]."""
+        return self.ransac.threshold(self.options.sigma)
+
+    def without(self, mistake: Mistake) -> RobustSearch:
+        """The search with a mistake undone."""
+        given = self.problems
+        points_3d = mistake.undo_3d(given.points_3d)
+        points_2d = mistake.undo_2d(given.points_2d, given.cameras[0])
+        return replace(self, problems=replace(given, points_3d=points_3d, points_2d=points_2d))
+
+    def residuals_of(self, alignment: Alignment, camera: Camera) -> FloatArray:
+        """Projected minus observed keypoints (n, 2) [px]; infinite behind the camera."""
+        projected = camera.project_where_ahead(alignment.apply(self.problems.points_3d))
+        return projected - self.problems.points_2d
+
+    def check(self, best: Consensus) -> None:
+        """Refuse a hypothesis that has no more support than chance gives: NoConsensusError.
+
+        It carries the best score reached.
+        """
+        errors = np.linalg.norm(best.residuals[best.inliers], axis=1)
+        size = SAMPLE_SIZES[MINIMAL_SOLVERS[self.ransac.minimal]]
+        check_support(
+            [Support(errors, len(best.inliers), self.area)],
+            size + (self.options.focal == "estimate"),  # which half a keypoint determines
+            max_reproj_error=self.threshold,
+            score=best.score,
+            where="points_2d",
+            solutions=SOLUTIONS_OF_FOUR,
+            chance=_CHANCE,
+            disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
+        )
+
+    @np.errstate(all="ignore")  # residuals that overflow are outliers'
+    def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:
+        """Likelihood of all keypoints with residuals (n, 2) [px]: an outlier lies anywhere."""
+        sigma, limit = self.options.sigma, self.threshold
+        if sigma is None:
+            sigma = limit / _SIGMAS
+        information = pixel_information(sigma, len(residuals))
+        kept = np.linalg.norm(residuals, axis=1) < limit
+        finite = np.where(kept[:, None], residuals, 0.0)
+        squares = np.einsum("ni,nij,nj->n", finite, information, finite)
+        normal = squares + math.log(4 * math.pi**2) - np.log(np.linalg.det(information))
+        uniform = 2 * math.log(self.area)
+        score = np.where(kept, np.minimum(normal, uniform), uniform).sum()
+        score += (np.log(alignment.scale) ** 2).sum() / _STRETCH_SIGMA**2
+        return Explained(float(score), int(kept.sum()), -float(alignment.rotation[1, 1]))
+
+
+@np.errstate(all="ignore")  # what is not finite explains nothing
+def mistake_in(search: RobustSearch, found: Explained) -> str | None:
+    """Name the mistake without which the keypoints agree better; see `find_mistake`.
+
+    ``found`` is what the estimate explains.
+    """
+    given = len(search.problems.points_2d)
+
+    def explain(mistake: Mistake) -> Explained | None:
+        own = search.without(mistake)
+        try:
+            if found.inliers == given:  # which samples need not be drawn for
+                solved = solve_one(own.problems, own.options)
+                return own.explained(Alignment.from_packed(solved.poses[0, 0]), solved.residuals)
+            best = find_consensus(own)
+            own.check(best)
+            return own.explained(best.alignment, best.residuals)
+        except CadalignError:
+            return None
+
+    sizes = larger_sizes(search.problems.points_2d, search.problems.cameras[0])
+    return find_mistake(found, given, explain, sizes)
+
+
+def find_consensus(search: RobustSearch) -> Consensus:
+    """Find the best hypothesis of LO-RANSAC, which chance may give as well.
+
+    Raises InputError if the keypoints are fewer than the minimal solver needs, or options don't go
+    together; DegenerateError if all keypoints lie in one plane.
+    """
+    problems, options, ransac = search.problems, search.options, search.ransac
+    camera, points = problems.cameras[0], problems.points_3d[:, options.axis_order]
+    count, minimal = len(points), MINIMAL_SOLVERS[ransac.minimal]
+    size = SAMPLE_SIZES[minimal]
+    if count < size:
+        raise InputError(
+            f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
+        )
+    if options.focal == "estimate" and ransac.minimal != "ap4p":
+        raise InputError(
+            f"{ransac.minimal!r} does not estimate the focal length",
+            where="minimal",
+            fix="leave it at 'ap4p'",
+        )
+    by_score = _order_of_scores(search.scores, count)
+    order = np.random.default_rng(ransac.seed).permutation(count)
+    ranked = np.arange(count) if by_score is None else np.argsort(order)[by_score]
+    facing = faced(camera, problems.points_2d)
+    if options.focal == "estimate":
+        check_estimable([facing])
+        views = focal_views(problems.points_2d[order], facing, options.focal_prior, None)
+    else:
+        facing.require_focal()
+        rays = rays_of(problems.points_2d[order], facing, clips=True)
+        weights = whitening_of(1.0, rays, facing)
+        views = Views(np.array([facing.fx]), rays[None], weights[None])
+    first = np.ascontiguousarray(points[order])
+    keypoints = KeypointEvidence(first, views.rays[0], views.whitening[0], LINEAR, 1.0)
+    exhaustive = math.comb(count, size) <= _MOST_EXHAUSTIVE
+    pose = np.zeros(POSE_SIZE)
+    inliers = np.zeros(count, dtype=bool)
+    score, log_focal, iterations, hypotheses = ransac_kernel(
+        Objective(options.free, keypoints, options.scale_prior),
+        views,
+        np.log(views.focals),
+        LogFocalPrior(*log_focal_range(camera, options.focal_prior)),
+        ranked,
+        Settings(
+            threshold=search.threshold,
+            minimal=minimal,
+            size=size,
+            max_iterations=_MOST_EXHAUSTIVE if exhaustive else int(ransac.max_iterations),
+            min_iterations=_MOST_EXHAUSTIVE if exhaustive else int(ransac.min_iterations),
+            success_prob=float(ransac.success_prob),
+            seed=int(ransac.seed),
+            exhaustive=exhaustive,
+            guided=by_score is not None,
+            optimize=ransac.refine,
+            estimate_focal=options.focal == "estimate",
+        ),
+        pose,
+        inliers,
+    )
+    if not hypotheses and are_in_one_plane(points):
+        raise DegenerateError(
+            "all keypoints lie in one plane, where the samples of ransac determine nothing",
+            where="points_3d",
+            fix="leave ransac away: use loss='cauchy', with stretch= or stretch_sigma=",
+        )
+    if options.focal == "estimate":
+        camera = camera.with_focal(math.exp(log_focal))
+    pose = turned_poses(options.in_model_axes(pose), facing.lens_from_camera)
+    alignment = Alignment.from_packed(pose)
+    kept = np.empty(count, dtype=bool)
+    kept[order] = inliers
+    residuals, effort = search.residuals_of(alignment, camera), (int(iterations), int(hypotheses))
+    return Consensus(alignment, camera, kept, residuals, *effort, float(score))
+
+
+def _order_of_scores(scores: npt.ArrayLike | None, count: int) -> npt.NDArray[np.intp] | None:
+    """The order of falling scores; None where there are none, or all are alike."""
+    if scores is None:
+        return None
+    values = as_floats(scores, name="scores", shape=(count,))
+    if (values < 0).any():
+        raise InputError(
+            f"keypoint {int(np.argmax(values < 0))} has the score {values.min():g}",
+            where="scores",
+            fix="give numbers that are not negative",
+        )
+    return np.argsort(-values, kind="stable") if np.ptp(values) > 0 else None

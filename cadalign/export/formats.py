@@ -18,7 +18,6 @@ from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, quote
 from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame, photos_of
 from cadalign.export.camera_files import write_nerf, write_open3d
-from cadalign.export.glb import write_line_set
 from cadalign.export.usd import write_usd
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
@@ -93,7 +92,7 @@ class Format:
 
 
 def _glb(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.glb import write_glb
+    from cadalign.export.glb import write_glb  # with trimesh
 
     write_glb(path, exported, frame=options.frame)
 
@@ -115,6 +114,8 @@ def _mesh_in_metres(exported: AlignedObject, options: ExportOptions) -> Mesh:
 
 
 def _lines(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.glb import write_line_set  # with trimesh
+
     write_line_set(path, exported, frame=options.frame)
 
 

@@ -195,7 +195,7 @@ class _Routes:
         return JSONResponse({"revision": state.history.revision, "elsewhere": elsewhere})
 
     def data(self, answer: Callable[..., dict[str, Any]], request: Request) -> Response:
-        """What one of `_OF_OBJECT` says of an object."""
+        """Answer with what a function of `_OF_OBJECT` returns for an object."""
         number, slot = _place(request)
         return JSONResponse(answer(self._session, number, slot=slot))
 

@@ -1,4 +1,4 @@
-"""What keypoints that disagree with an estimate say: support by chance, usual mistakes named."""
+"""Keypoints that disagree with an estimate: support by chance, and the usual mistakes by name."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ class KeypointDetector:
 def _joined(inner: Any) -> Any:
     """A module that puts what ``inner`` makes of its input beside the input."""
 
-    class Joined(torch.nn.Module):
+    class SkipConnection(torch.nn.Module):
         """Channels of an input and of what a module makes of it."""
 
         def __init__(self) -> None:
@@ -120,7 +120,7 @@ def _joined(inner: Any) -> Any:
             """Both, side by side."""
             return torch.cat([given, self.inner(given)], dim=1)
 
-    return Joined()
+    return SkipConnection()
 
 
 def heatmap_loss(logits: Tensor, points_2d: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What sections of `bench.py` share: data that they are given, tables, cases, clocks."""
+"""Shared parts of the sections of `bench.py`: data that they are given, tables, cases, clocks."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def summary(cases: Sequence[Row]) -> Row:
 
 
 def attempt(call: Callable[..., T], *given: Any, **options: Any) -> T | None:
-    """What a call returns; None where it raises a CadalignError."""
+    """Call a function; None where it raises a CadalignError."""
     try:
         return call(*given, **options)
     except CadalignError:

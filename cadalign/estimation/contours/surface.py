@@ -151,14 +151,14 @@ def _hull_faces(vertices: FloatArray) -> IntArray:
     return cast(IntArray, ConvexHull(vertices, qhull_options=_QHULL).simplices.astype(np.int64))
 
 
-class Choice(NamedTuple):
+class SurfaceChoice(NamedTuple):
     """Surfaces, the likeliest first; ``hulls`` are their convex hulls, none of an exact one."""
 
     surfaces: list[Surface]
     hulls: list[Surface]
 
 
-def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> Choice:
+def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> SurfaceChoice:
     """Surfaces for a shape whose keypoints are about ``points_3d`` (m, 3), the nearest first.
 
     Raises InputError where there is no mesh, which the mask or photo ``where`` wants; DataError if
@@ -170,14 +170,14 @@ def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) ->
             fix = "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))"
             raise InputError(f"the model has no mesh, which {wanting} wants", where=where, fix=fix)
         if model.shape_sigma is None:
-            return Choice([RigidSurface(model.mesh)], [])
+            return SurfaceChoice([RigidSurface(model.mesh)], [])
         points = cast(FloatArray, model.points_3d)
         return _warped([(model.mesh, points, np.arange(len(points)))])
     return _warped(_nearest_with_mesh(model, points_3d, where, wanting))
 
 
-def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> Choice:
-    return Choice(
+def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> SurfaceChoice:
+    return SurfaceChoice(
         [WarpedSurface(*each) for each in given],
         [WarpedSurface(*each, is_hull=True) for each in given],
     )

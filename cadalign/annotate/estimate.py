@@ -227,7 +227,7 @@ class LiveProblem:
         Each comes with what it assumes, where ``{reason}`` stands for why the ones before fail.
         """
         problem = self
-        if not (self.is_by_mask and self.estimates_focal):  # which a mask alone does not tell
+        if not (self.is_by_mask and self.estimates_focal):  # which a mask alone leaves open
             yield problem, ""
         if self.estimates_focal:
             problem = problem.at_focal([view.camera for view in self.views])

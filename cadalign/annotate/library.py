@@ -109,7 +109,7 @@ class ModelChoice:
 def starting_model(options: FileOptions, image: Path) -> Path:
     """The model of a session for which only a library is given.
 
-    That of an earlier session, else the one with the most keypoints. Raises a CadalignError.
+    The model of an earlier session, else the one with the most keypoints. Raises a CadalignError.
     """
     choice = ModelChoice.open(options)
     if choice is None:

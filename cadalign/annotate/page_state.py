@@ -188,7 +188,7 @@ def _shape(state: PhotoState) -> dict[str, Any] | None:
 
 
 def _candidates(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
-    """Alignments that a mask alone allows, as lines x1, y1, x2, y2, ... [px], while no pair tells.
+    """Alignments that a mask alone allows, as lines x1, y1, x2, ... [px], while there is no pair.
 
     ``chosen`` says that the user has decided for one.
     """

@@ -199,7 +199,7 @@ class Session:
         return kept
 
     def _others_focal(self, state: PhotoState) -> dict[str, LiveAlignment]:
-        """Estimates of the photo's other objects that tell of its focal length, by their labels.
+        """Estimates of the photo's other objects that bear on its focal length, by their labels.
 
         Each is of the object alone, so that they depend neither on each other nor on the order.
         """

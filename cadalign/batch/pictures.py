@@ -47,7 +47,7 @@ def page_names(row: Row) -> Row:
 
 
 def _names_of(model: Path) -> tuple[str, str]:
-    """Category and name of a model's or a shape's file: in ShapeNet's layout the folders tell."""
+    """Category and name of a model's or a shape's file: in ShapeNet's layout the folders'."""
     for part, below in pairwise(model.parts):
         category = name_of_synset(part)
         if category != part:

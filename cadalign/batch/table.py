@@ -1,7 +1,7 @@
 """The table of a run over many observations: ``results.parquet``, and ``results.csv`` without the
 columns that are lists.
 
-Rows are in the order of the observations. Of several views pose and camera are the first's.
+Rows are in the order of the observations. Pose and camera of several views are the first's.
 
 row, source
     Number of the observation in the run, and its file, with the line or the object in it.

@@ -218,7 +218,7 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
 def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
     """Align the objects of one photo in a file together; returns the exit code.
 
-    Writes scene.json, which tells what the objects share, and for every object a folder with its
+    Writes scene.json with what the objects share, and for every object a folder with its
     observation, fit.json and overlay.png.
     """
     from cadalign.estimation.scene import align_scene

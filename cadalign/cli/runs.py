@@ -79,7 +79,7 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
-    """Show a progress bar with rate and time left; gives what a run is to tell its progress to."""
+    """Show a progress bar with rate and time left; yields what takes a run's progress."""
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),

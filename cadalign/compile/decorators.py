@@ -142,7 +142,7 @@ class KernelDispatcher(CPUDispatcher):
 class CompileProgress(event.Listener):
     """A line on a terminal's or a notebook's standard error, written anew for every kernel.
 
-    It tells how many of the kernels that the called one needs are compiled; those that are read
+    It shows how many of the kernels that the called one needs are compiled; those that are read
     from disk are not counted. Elsewhere, in a file for one, nothing is written.
     """
 

@@ -77,7 +77,7 @@ def _content(path: Path) -> tuple[bytes, tuple[Path, ...]]:
     """Hash of one file, and the files of the modules that it imports."""
     try:
         code = path.read_bytes()
-    except OSError:  # of code without a file, only its own name tells it apart
+    except OSError:  # of code without a file, only its own name distinguishes it
         return str(path).encode(), ()
     text = code.decode(errors="replace")
     return hashlib.sha256(code).digest(), tuple(dict.fromkeys(_imported(text)))
@@ -264,7 +264,7 @@ class _Implementation(CompileResultCacheImpl):
 class KernelCache(FunctionCache):
     """Compiled forms of one kernel, on disk.
 
-    `use` tells code that Python calls from code that kernels call.
+    `use` distinguishes code that Python calls from code that kernels call.
     """
 
     _impl_class = _Implementation

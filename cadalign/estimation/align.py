@@ -66,8 +66,8 @@ def align(
         One CAD model, exact, stretched, or only similar (``shape_sigma``); or the learned shape of
         a category.
     views : View or sequence of View
-        What the images tell. Views with ``cam_from_rig`` share one pose and determine the object's
-        size; views without it have a pose each and share the stretch and the shape.
+        Evidence of the images. Views with ``cam_from_rig`` share one pose and determine the
+        object's size; views without it have a pose each and share the stretch and the shape.
     size : Size, optional
         Known lengths of the object.
     init : Alignment or sequence of Alignment or None, optional

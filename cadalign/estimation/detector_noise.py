@@ -48,7 +48,7 @@ class DetectorNoise:
     ----------
     scores : (k,) float
         Rising scores at which ``sigmas`` are known; between them logarithms are interpolated,
-        beyond them the outermost holds. One, where scores tell nothing.
+        beyond them the outermost holds. One, where scores say nothing.
     sigmas : (k,) float
         Standard deviations there, falling: in ``unit``.
     unit : {"px", "size"}
@@ -235,7 +235,7 @@ def calibrate_detector(
 ) -> DetectorNoise:
     """Noise of a detector from its keypoints and the true ones.
 
-    Whether errors grow with the object in the image, and whether scores tell anything, is chosen by
+    Whether errors grow with the object in the image, and whether scores matter, is chosen by
     the likelihood.
 
     Parameters

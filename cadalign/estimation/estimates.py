@@ -90,7 +90,7 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
     Parameters
     ----------
     covariance : (3, 3) float
-        Of the rotation vector [rad squared].
+        Covariance of the rotation vector [rad squared].
 
     Examples
     --------
@@ -132,7 +132,7 @@ def placed_box(
 ) -> tuple[FloatArray, IntArray]:
     """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
 
-    Those of the keypoints that are seen, ``rows``, or the box's own corners.
+    Either keypoints that are seen, ``rows``, or the box's own corners.
     """
     bounds = margins.bounds(points[-2:], points[rows])
     outermost = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]

@@ -1,6 +1,6 @@
 """Kinds of evidence that are known directions and distances: gravity, camera height, size, others.
 
-A kind is a name, the fields that tell it, and a function that turns them into `KnownDirection` and
+A kind is a name, its fields, and a function that turns them into `KnownDirection` and
 `KnownDistance`: whoever writes it sees neither kernels nor derivatives. `register_evidence` adds
 one, and estimates, `result.evidence`, contributions, warnings, observation files and the command
 line follow.
@@ -88,8 +88,8 @@ class EvidenceKind:
     field : str
         The field of `View` without which a view has no such evidence.
     known : function of (mapping of str to values, ShapePrior)
-        What the fields of a view tell; raises InputError that names the field where the model does
-        not allow it.
+        Evidence in the fields of a view; raises InputError that names the field where the model
+        does not allow it.
     fields : tuple of EvidenceField
         Fields to declare, of a kind that is registered. `View` takes them as ``more``.
     """
@@ -197,7 +197,7 @@ def field_of(kind: str) -> str:
 
 
 def is_told(given: Mapping[str, Any]) -> bool:
-    """True where the fields of a view tell a direction or a distance."""
+    """True where the fields of a view hold a direction or a distance."""
     return any(kind.field in given for kind in _KINDS)
 
 

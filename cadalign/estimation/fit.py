@@ -83,7 +83,7 @@ def fit(
         It keeps keypoints in one plane, or seen end-on, solvable. By default the prior is flat from
         1/5 to 5 and falls off beyond: it bounds what keypoints leave open, and moves nothing else.
     known_axis : {"x", "y", "z"}
-        The model's axis whose length is right. One image alone does not tell size from distance.
+        The model's axis whose length is right. One image alone leaves size and distance open.
     focal : {"known", "estimate"}
         Take the camera's focal length as right, or estimate it too: a ninth unknown, for which
         5 points are needed. ``result.camera`` has the estimate. Principal point and shape of the
@@ -101,9 +101,9 @@ def fit(
     scores : (n,) float, optional
         Confidences of the keypoints, for ``ransac``: samples are drawn from the highest first.
     symmetry : Symmetry, optional
-        Motions that take the model to itself. Of the alignments that are equal under it, the result
-        is the one nearest to upright, y up, with the model's z axis towards the camera, and no
-        other is an alternative; ``points_3d`` are the keypoints as this one has them. A stretch
+        Motions that take the model to itself. The result is, among the alignments that are equal
+        under it, the one nearest to upright, y up, with the model's z axis towards the camera, and
+        no other is an alternative; ``points_3d`` are the keypoints as this one has them. A stretch
         that differs across an axis leaves half turns of its rotations; ``stretch="y"`` keeps round
         what is round about y. See `cadalign.geometry.symmetry_group`.
 

@@ -35,7 +35,7 @@ from cadalign.solvers.search import Effort, Minima, add_minimum, room_for_minima
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _MOST_STARTS = 8
-_COARSE_POINTS = 256  # that many tell the minima apart; all points then refine them
+_COARSE_POINTS = 256  # that many separate the minima; all points then refine them
 _MOST_LIKELY = 3  # coarse minima that all points refine
 _UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
 _SAME_BRANCH = 0.6  # chord between rotations of one minimum at neighbouring focal lengths

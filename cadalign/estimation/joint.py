@@ -203,7 +203,7 @@ def result_of_minima(
         raise DegenerateError(what, where="views", fix="give more keypoints, or a size")
     minimum = minima[0]
     inflation = prior.inflation
-    if all(view.mask is None for view in views):  # a contour tells as much as many keypoints
+    if all(view.mask is None for view in views):  # a contour is worth as much as many keypoints
         given = len(minimum.evidence.sightings.point)
         inflation = inflation_with(given, inflation, prior.few_keypoints)
     likely: Sequence[Estimate] = ()

@@ -50,14 +50,14 @@ def evidence_of(
     noise: float = 1.0,
     frames: Sequence[int] | None = None,
 ) -> Evidence:
-    """All that the views, the size and the first component of the prior tell.
+    """Evidence of the views, of the size and of the first component of the prior.
 
     By default the views' focal lengths are known. Keypoints without a sigma have the standard
     deviation ``noise`` [px]. ``frames`` number the poses of the views of a
     moving object.
 
-    Raises InputError if a view names a keypoint that the model lacks, tells nothing, or tells of an
-    up axis that the model lacks, or if only some views have a known pose.
+    Raises InputError if a view names a keypoint that the model lacks, lacks evidence, or has some
+    of an up axis that the model lacks, or if only some views have a known pose.
     """
     if lenses is None:
         lenses = Lenses.of(views, "known", None)

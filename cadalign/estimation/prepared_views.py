@@ -53,7 +53,7 @@ def views_without_pose(
     """Numbers of the views of unknown motion whose keypoints determine no pose.
 
     Those are fewer than three keypoints, or keypoints on one line. A single view, views of a rig,
-    views with a given start, and views that tell nothing at all are never among them.
+    views with a given start, and views without evidence are never among them.
     """
     if len(views) < 2 or any(view.cam_from_rig is not None for view in views):
         return []

@@ -184,7 +184,7 @@ class Result(ResultData):
         Parameters
         ----------
         path : path-like
-            Its ending tells the format: ``.glb``, ``.usdz``, ``.obj``, ``.ply``, BOP's ``.csv``.
+            Its ending chooses the format: ``.glb``, ``.usdz``, ``.obj``, ``.ply``, BOP's ``.csv``.
         format, options
             As for `cadalign.export.export_object`.
         **of_the_object

@@ -197,7 +197,7 @@ class ResultData:
         """Inverse of the Fisher information at the optimum, in the form of ``covariance``.
 
         The Cramer-Rao bound there: with few keypoints errors are larger. None for methods that are
-        not statistical, and where a file does not tell it.
+        not statistical, and where a file does not hold it.
         """
         return self.statistics.fisher_covariance
 
@@ -237,7 +237,7 @@ class ResultData:
         """Result of a chi-square test of residuals that the given sigma does not explain.
 
         None if they pass (of right data, 99.5 % or more do), for an estimated sigma, and for
-        methods that are not statistical. Of several pieces of evidence, ``warnings`` tell it.
+        methods that are not statistical. For several pieces of evidence, see ``warnings``.
         """
         return self.statistics.misfit
 

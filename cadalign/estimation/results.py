@@ -33,7 +33,7 @@ class Results(Sequence[Result | CadalignError]):
 
     As a sequence it has a `Result`, or the error in its place, for each of them; ``results[k]`` is
     what a single call returns. Its arrays have a row for each: those of a problem without solution
-    are NaN, ``errors`` has the reason. Of several views, poses and focal lengths are the first's.
+    are NaN, ``errors`` has the reason. Poses and focal lengths of several views are the first's.
 
     Parameters
     ----------

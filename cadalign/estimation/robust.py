@@ -141,7 +141,7 @@ def fit_similar_robustly(
 ) -> Result:
     """Fit the only problem, whose keypoints' standard deviation is to be estimated.
 
-    Of a model that is only similar the noise, and with it the threshold, is unknown. Two estimates
+    For a model that is only similar the noise, and with it the threshold, is unknown. Two estimates
     compete: the alignment under Cauchy's loss, which tolerates some outliers and any noise, and the
     consensus at thresholds from a few pixels up, which tolerates most keypoints being outliers, but
     not that all of them are off by more than the threshold. The one whose inliers chance explains

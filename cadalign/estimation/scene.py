@@ -128,8 +128,8 @@ def align_scene(
         What the objects have in common: the focal length, where it is unknown; the direction of
         gravity, as objects standing upright have it; and the ground that they stand on with their
         lowest faces, which includes gravity. The height of the camera above the ground is known by
-        `View.camera_height`, or by the objects whose ``size`` is known; it tells the size of the
-        others.
+        `View.camera_height`, or by the objects whose ``size`` is known; it determines the size of
+        the others.
     tilt_sigma_deg : float
         Standard deviation of an object's up axis about gravity [degrees].
     focal_prior, loss, loss_scale, ransac

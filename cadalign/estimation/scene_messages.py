@@ -156,13 +156,13 @@ def as_prior(
 
 @dataclass(frozen=True, eq=False)
 class SceneObject:
-    """An object of a photo: its model, what the photo tells, and what else is known.
+    """An object of a photo: its model, the photo's evidence, and what else is known.
 
     Parameters
     ----------
     model : Model or ShapeModel
     view : View
-        Of the scene's photo; all objects' views have the same camera.
+        View of the scene's photo; all objects' views have the same camera.
     size : Size, optional
         Known lengths of the object.
     init : Alignment, optional

@@ -56,7 +56,7 @@ def is_single(model: object, views: Sequence[View]) -> bool:
 
 
 def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignment | None]) -> bool:
-    """True where nothing but the mask of one view tells the pose of a model with a mesh."""
+    """True where the mask of one view is all evidence of the pose of a model with a mesh."""
     if isinstance(model, Model) and model.mesh is None:
         return False
     view = views[0]

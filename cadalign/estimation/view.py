@@ -1,4 +1,4 @@
-"""A view: what one image tells about an object, with checked depths, masks and directions."""
+"""A view: the evidence of one image about an object, with checked depths, masks and directions."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ class View(DeclaredEvidence):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the fields beside keypoints that tell something by themselves."""
+        """Names of the fields beside keypoints that are evidence by themselves."""
         return super().sources if self.image is None else (*super().sources, "image")
 
     @property

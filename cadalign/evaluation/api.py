@@ -49,7 +49,7 @@ def evaluate(
         A run's folder, to keep; a run that was killed there goes on.
     **options
         Options of the experiment, the same as on the command line: ``noise_px=2.0`` is
-        ``--noise-px 2``. Those of ``keypointnet`` are the fields of
+        ``--noise-px 2``. The options of ``keypointnet`` are the fields of
         `cadalign.evaluation.experiments.keypointnet.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
         ``shape``, ``visibility``, ``render``, ``metrics``, ``seed``. Among ``methods`` and

@@ -177,7 +177,7 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) -> list[Summary]:
     """Numbers of rows, of failures, and medians of the others, for every group and method.
 
-    Of the columns those are taken that the run's results have.
+    Columns that the run's results lack are left out.
     """
     statistics = {metric.key: median(metric.key) for metric in columns if metric.key in run.cells}
     summaries = []

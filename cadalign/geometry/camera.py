@@ -48,10 +48,10 @@ class Camera:
     cx, cy : float
         Principal point [px].
     distortion : tuple of float, optional
-        Of a perspective lens OpenCV's coefficients in OpenCV's order: (k1, k2, p1, p2), or with
-        k3, or with k3, k4, k5, k6; empty for none. Of a fisheye (k1, k2, k3, k4) as in
+        For a perspective lens OpenCV's coefficients in OpenCV's order: (k1, k2, p1, p2), or with
+        k3, or with k3, k4, k5, k6; empty for none. For a fisheye (k1, k2, k3, k4) as in
         ``cv2.fisheye``, 0 by default, or (k1, k2, p1, p2, k3, k4, sx1, sy1) as in COLMAP's
-        THIN_PRISM_FISHEYE. Of a fov lens (omega,) as in COLMAP's FOV.
+        THIN_PRISM_FISHEYE. For a fov lens (omega,) as in COLMAP's FOV.
     lens : {"perspective", "fisheye", "fov"}
         Kind of lens. A fisheye or fov lens may see points beside and behind the camera's plane;
         its focal length has to be known.
@@ -276,8 +276,8 @@ class Camera:
     def sees(self, points_cam: FloatArray) -> BoolArray:
         """Say which points (n, 3) of the camera frame have a projection, in the image or not.
 
-        Of a pinhole those in front of its plane; of a wide lens those up to the angle from the axis
-        at which the image of farther directions would turn back.
+        For a pinhole those in front of its plane; for a wide lens those up to the angle from the
+        axis at which the image of farther directions would turn back.
         """
         points = points_cam @ self.lens_from_camera.T if self.turn else points_cam
         if not self.is_wide:

@@ -1,7 +1,7 @@
 """Errors between an estimate and the truth.
 
 All metrics take ``est`` and ``gt`` by keyword, score a perfect estimate as perfect, and refuse NaN.
-Those of alignments take the model's ``symmetry``, too: the truth is then that of `nearest_truth`.
+Errors of alignments take the model's ``symmetry``, too: the truth is then that of `nearest_truth`.
 Names in the plural are their formulas for stacks, whose arrays have leading dimensions (...) more:
 nothing is checked, and errors of a stack are those of its members, bit for bit.
 """
@@ -102,7 +102,7 @@ def translation_error_up_to_scale(
 ) -> float:
     """Distance of the true translation from the ray through the estimated one [model units].
 
-    One image does not tell a large object far away from a small one nearby: the estimate may be
+    One image leaves open if a large object is far away or a small one nearby: the estimate may be
     scaled about the camera centre by any factor from 0 up. This is the error that remains for the
     best factor, the norm of the true translation times the sine of the angle between the two; all
     of the norm beyond 90 degrees.
@@ -174,9 +174,9 @@ def box_iou(*, est: Box, gt: Box) -> float:
 def box_iou_up_to_scale(*, est: Box, gt: Box) -> float:
     """Largest box IoU over all factors by which the estimate is scaled about the origin, 0 to 1.
 
-    The origin is the camera centre, of which one image does not tell an object's distance. Unlike
-    the IoU at equal distances of the two centres, this one does not change if estimate and truth
-    are exchanged, and a wrong length along the line of sight costs no more than it must.
+    The origin is the camera centre, from which one image does not determine an object's distance.
+    Unlike the IoU at equal distances of the two centres, this one does not change if estimate and
+    truth are exchanged, and a wrong length along the line of sight costs no more than it must.
 
     Global, to 1e-6. Where the boxes s E and G intersect, the cube root of the intersection's volume
     is a concave function of s (Brunn-Minkowski; the pairs of s and a point of s E form a convex

@@ -5,9 +5,9 @@ object. With A's rotation R and stretch S, A g has the linear part R S G. That i
 and a stretch along the model's axes where G' S^2 G is diagonal: then its rotation is R' = R G and
 its stretch S' = G' S G. Two cases:
 
-- G S = S G: the stretch keeps the symmetry, S' = S. Of a quarter turn about y this needs equal
-  stretches along x and z, of a half turn about y nothing. Of the rotations by any angle about an
-  axis only half turns are left where the stretches across it differ.
+- G S = S G: the stretch keeps the symmetry, S' = S. For a quarter turn about y this needs equal
+  stretches along x and z, for a half turn about y nothing. Among the rotations by any angle about
+  an axis only half turns are left where the stretches across it differ.
 - G exchanges two of the model's axes that are stretched differently, as a quarter turn does: S' has
   their stretches exchanged. The same object, with its sides named the other way round. Where one of
   these stretches is held, as that along x is by one image, A g is no answer and is left out.

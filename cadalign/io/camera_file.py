@@ -33,7 +33,7 @@ def read_camera(
         ``matrix`` (also ``K``, ``camera_matrix``, ``cam_K``), by rows; or a camera in the form of
         `Camera.from_dict` as JSON.
     size : tuple of 2 int, optional
-        Width and height of the photo [px], for a matrix whose file does not tell.
+        Width and height of the photo [px], for a matrix whose file lacks them.
     pixel_origin : {"center", "corner"}, optional
         Where (0, 0) lies for the principal point; by default what the file states, or else the
         centre for a matrix and the corner for COLMAP's form.

@@ -199,7 +199,7 @@ class DeclaredEvidence:
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the fields that are known and tell something by themselves."""
+        """Names of the fields that are known and are evidence by themselves."""
         values = vars(self) | dict(self.more)
         return tuple(
             each.name

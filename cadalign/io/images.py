@@ -191,8 +191,8 @@ class Video:
     def pictures(self, *, first: int = 0) -> Iterator[tuple[int, ByteImage]]:
         """Read the pictures (h, w, 3) in their order, each with its frame's number.
 
-        Those of a file are counted from ``first``; those of a folder have the number in their name,
-        see `frame_numbers`.
+        Pictures of a file are counted from ``first``; photos of a folder have the number in their
+        name, see `frame_numbers`.
 
         Raises
         ------

@@ -20,7 +20,7 @@ library's models to their nearest ones of another shape, in the category of k, t
     none_prior / (1 - none_prior) * sum over k of score_k E[B_k(tau)]
 
 The sum is over the most likely models, which hold nearly all of it. Four keypoints, through which
-any model passes, tell nothing: the probability is then near ``none_prior``.
+any model passes, decide nothing: the probability is then near ``none_prior``.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ object's shape, also of the parts that the image does not show. A model of the l
 probable as its keypoints and box are under that posterior, widened by what tells a model from the
 object that it stands for:
 
-- its size and place, which one image does not tell;
+- its size and place, which one image does not determine;
 - a deviation of each coordinate: ``shape_sigma`` times the extent of the mean shape or, where that
   is 0, the distance of the library's models from their nearest ones;
 - each keypoint of the image that the model lacks, by the probability ``spurious``, and each of the
@@ -16,7 +16,7 @@ several categories, each has the probability that its shape model gives to the i
 All models are ranked, but those that would reach behind the camera; none is searched for a pose.
 Matches have the pose of the estimated shape and the stretch that brings the model's keypoints and
 box closest to the estimated ones. An unknown focal length is estimated with the shape of the most
-probable category. Of the options, ``stretch_sigma`` and ``exhaustive`` have no
+probable category. The options ``stretch_sigma`` and ``exhaustive`` have no
 effect.
 """
 
@@ -50,7 +50,7 @@ from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS
 
 _LEAST_KEYPOINTS = 3
-_FREE_SIZE = 1.0  # deviations of what the image does not tell: of the log size,
+_FREE_SIZE = 1.0  # standard deviations of what the image leaves open: of the log size,
 _FREE_PLACE = 0.5  # and of the place, in extents of the shape
 _NEGLIGIBLE = 1e-9  # probability of a Gaussian that is left out
 _FLOOR = 1e-4  # least deviation of a coordinate, in extents of the shape
@@ -266,7 +266,7 @@ def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
     held = [axis for axis, name in enumerate("xyz") if name not in free]
     for axes in (held, *([axis] for axis in range(3) if axis not in held)):
         square, product = squares[:, axes].sum(axis=1), products[:, axes].sum(axis=1)
-        # A flat or mirrored model tells nothing of the scale along this axis.
+        # A flat or mirrored model leaves open the scale along this axis.
         known = (square > _FLAT * total) & (product > 0)
         found = np.where(known, product / np.where(known, square, 1.0), common)
         scales[:, axes] = found[:, None]

@@ -32,7 +32,7 @@ def write_retrieval(
 ) -> Path:
     """Write ``matches.json``, ``overlay_01.png`` and so on, and ``index.html``; returns the page.
 
-    The library is described by text. Without a photo the overlays are drawn on grey. Of a query,
+    The library is described by text. Without a photo the overlays are drawn on grey. For a query,
     ``match_01.json`` and so on are the observation of each match's model, and
     ``match_01_fit/fit.json`` its result, which `cadalign export` takes.
     """

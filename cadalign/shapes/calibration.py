@@ -2,7 +2,7 @@
 
 An image determines some directions of shape and pose and leaves others to the prior. Where few
 models were learned from, or shapes have heavier tails than Gaussians, errors in the latter are
-larger than the prior's covariance says, and no residual shows it. Held-out models tell how much:
+larger than the prior's covariance says, and no residual shows it. Held-out models show how much:
 each is seen from random directions in weak perspective, once with all of its keypoints and once
 with a few, and pose and shape follow in closed form, as the equations are linear about the truth.
 Found are a factor of the deviations for either number of keypoints, and the degrees of freedom of

@@ -1,7 +1,7 @@
 """Learning of a shape model's components; what is not given is chosen by held-out likelihood.
 
 Likelihoods are those of the keypoints as an image shows them, at an accuracy of `_RESOLUTION`:
-finer detail would decide otherwise, though no photo tells it.
+finer detail would decide otherwise, though no photo shows it.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from cadalign.geometry.mesh import Mesh
 _ROUNDING = 0.02  # of the kernel's tip, at most
 _MARGIN = 0.25  # from the mesh to the corners around it, which follow the stretch alone
 _COINCIDENT = 1e-6
-_PRIOR_SPREAD = 0.1  # keypoints that spread less along an axis barely tell its stretch
+_PRIOR_SPREAD = 0.1  # keypoints that spread less along an axis barely determine its stretch
 _LEAST_STRETCH = 0.1  # relative to that of all axes together
 
 

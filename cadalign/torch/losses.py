@@ -85,7 +85,7 @@ def reprojection_loss(
     Parameters
     ----------
     found, truth : PoseBatch
-        Of a learned shape, the points of each are its own, where it has ``points_3d``.
+        For a learned shape, the points of each are its own, where it has ``points_3d``.
     points_3d : (n, 3) or (B, n, 3) tensor
     camera : Camera or sequence of B Camera
         Without distortion.
@@ -128,7 +128,7 @@ def box_loss(
 ) -> Tensor:
     """Mean distance of the box's corners over the true box's diagonal, (B,) tensor.
 
-    Of a learned shape, the estimated box is that of its keypoints.
+    For a learned shape, the estimated box is that of its keypoints.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The rotations that map a model onto itself, as KeypointNet's annotation tells, by this rule:
+"""The rotations that map a model onto itself, by KeypointNet's annotation and this rule:
 
 - A circle (`RotationalSymmetry.circle`) makes its axis an axis of revolution if every keypoint lies
   on that axis or is on an annotated circle about it. A handle or a spout therefore rules it out.

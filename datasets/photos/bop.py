@@ -150,7 +150,7 @@ class Bop(PhotoDataset):
         <root>/<split>/<scene>/scene_gt.json, scene_camera.json, scene_gt_info.json,
                                rgb/000000.png (or gray), depth/, mask/, mask_visib/
 
-    ``root`` may be the data set, a split, or one scene. Of a scene, ``scene_gt.json`` alone is
+    ``root`` may be the data set, a split, or one scene. From a scene, ``scene_gt.json`` alone is
     necessary with a camera: ``scene_camera.json``, or ``camera.json`` in the scene or above it.
     Models are looked for in the scene's folder and the three above it.
 
@@ -284,7 +284,7 @@ class _Poses(PoseFile):
             what = f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number"
             fix = "give the data set's folder, or a file of that scene alone"
             raise DataError(what, where=str(estimates.path), fix=fix)
-        # A file or a folder that tells no number is of the one scene there is.
+        # A file or a folder without a number is of the one scene there is.
         self._any_scene = not is_numbered or scenes == {""}
         self._poses: dict[tuple[str, str], list[PoseEstimate]] = defaultdict(list)
         for each in estimates.poses:

@@ -198,8 +198,8 @@ class Photo:
     depth: DepthImage | None = None
     """The photo's depth image."""
     up: FloatArray | None = None
-    """(3,), the direction against gravity in the camera's frame, as a sensor or the rig tells
-    it."""
+    """(3,), the direction against gravity in the camera's frame, as a sensor or the rig
+    has it."""
     problems: tuple[DataError, ...] = ()
     """Why further objects of this photo could not be read."""
 

@@ -64,7 +64,7 @@ class BlindPnP(CorrespondenceSet):
     - ``p2d`` (n, 2) and ``p3d`` (m, 3) are shuffled, and padded with repetitions from
       ``num_points_2d`` and ``num_points_3d`` on. Scene point j belongs to image point ``W_gt[j]``,
       or to none where there is no such row. One of the sets is said to store it the other way
-      round; the true pose tells. Without ``W_gt`` the rows belong together as they are.
+      round; the true pose decides. Without ``W_gt`` the rows belong together as they are.
 
     Image points are stored with the calibration taken out. They are given in the pixels of a
     virtual camera of the sample's focal length, whose image is just large enough for them.

@@ -49,7 +49,7 @@ print("predicted ", np.round(predicted, 5))
 print("fitted    ", np.round(again.alignment.translation - result.alignment.translation, 5))
 
 # %%
-# ``by_log_sigma`` tells what it does to trust a keypoint more or less, ``by_points_3d`` what an
+# ``by_log_sigma`` is the effect of trusting a keypoint more or less, ``by_points_3d`` what an
 # error of the model does: a millimetre at each keypoint of a model in metres.
 
 by_model = np.linalg.norm(sensitivity.by_points_3d[:3], axis=(0, 2)) * 0.001

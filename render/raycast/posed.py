@@ -348,8 +348,8 @@ def within_lens_field(camera: Camera, points_cam: FloatArray) -> npt.NDArray[np.
 
     A distortion polynomial turns back at some radius and from there on folds far-off directions
     into the image. Points beyond are not seen by the camera, wherever the model puts them.
-    For points (n, 3), tell if the camera sees them and if the distorted radius grows all the way
-    from the centre to the point, (n,) bool.
+    Returns (n,) bool for points (n, 3): the camera sees them, and the distorted radius grows all
+    the way from the centre to the point.
     """
     seen = camera.sees(points_cam)
     if camera.is_wide or not camera.distortion:

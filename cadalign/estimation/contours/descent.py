@@ -3,8 +3,8 @@
 Rounds of steps approach the contours and learn from the residuals how accurate these are; then the
 cost at that noise is lowered until no step does. A Gauss-Newton step holds every rim's point on the
 surface: that the rim moves along the surface as the pose changes does not count to first order. It
-counts where little else tells poses apart, so that a step is taken only as far as the distances at
-its end, measured anew, with all other evidence, cost less.
+counts where little else distinguishes poses, so that a step is taken only as far as the distances
+at its end, measured anew, with all other evidence, cost less.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ def _explored(
     """Every start with the surface that fits best, the best fit first.
 
     Surfaces of a learned shape follow its modes alone: with the keypoints' own displacements a step
-    takes several times as long, and modes tell the surfaces apart.
+    takes several times as long, and modes distinguish the surfaces.
     """
     found = []
     for start in starts:

@@ -166,7 +166,7 @@ def _rows(
     pose: Alignment,
     camera: Camera,
 ) -> Measured:
-    """The lines that tell a place, in the form of the evidence."""
+    """The lines that have a place, in the form of the evidence."""
     told, silhouette, given = outline.is_told, outline.silhouette, photo.camera
     rays, _ = given.normalize_where_valid(silhouette.contour.points[told])
     slopes = np.array([[given.fx], [given.fy]]) * given.distortion_jacobian(rays)

@@ -35,7 +35,7 @@ _BINS = 16  # of a channel
 _FLOOR = 1e-4  # share of the colours that were never seen
 _AMPLITUDE = 0.43  # of the step: the rest of 0.5 is noise that no histogram knows
 _SLOPE = 0.6  # half width of the step, in steps along the line
-_LEAST_PRECISION = 0.1  # of a line that tells a place, over that of the prior
+_LEAST_PRECISION = 0.1  # of a line that has a place, over that of the prior
 _OF_STEPS = 1 / 12  # variance of a place within a step
 _LEAST_SIDE = 2.0  # steps on either side of an edge
 _QUANTUM = 3.0  # variance of three channels by their quantisation and a little noise
@@ -91,7 +91,7 @@ def regions_of(inside: IntArray, outside: IntArray) -> Regions:
 class Crossings(NamedTuple):
     """Places at which S lines leave the object, in steps outwards from their middles.
 
-    ``places`` (S,) and ``variances`` (S,), infinite where a line tells nothing.
+    ``places`` (S,) and ``variances`` (S,), infinite where a line has no edge.
     """
 
     places: FloatArray
@@ -141,7 +141,7 @@ def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
     between = (first**2).sum(axis=2) / np.where(usable, before, 1.0)
     between += (second**2).sum(axis=2) / np.where(usable, after, 1.0)
     squares = (values * colors).sum(axis=(1, 2))
-    # A line of which one side is unknown tells no edge.
+    # A line of which one side is unknown has no edge.
     error = squares[:, None] - np.where(usable, between, np.inf).min(axis=1, keepdims=True)
     error = np.where(usable, squares[:, None] - between, error) + _QUANTUM * total
     found = -total * min(step, 1.0) / 2 * np.log(np.maximum(error, 1e-9))
@@ -273,7 +273,7 @@ class Outline(NamedTuple):
 
     @property
     def is_told(self) -> BoolArray:
-        """Lines (S,) that tell a place."""
+        """Lines (S,) that have a place."""
         return np.isfinite(self.sigmas)
 
 

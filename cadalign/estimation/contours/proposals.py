@@ -52,7 +52,7 @@ def minima_of_mask(
 
     The best is the first; then numbers of iterations and of starts, and a mistake to warn of.
 
-    Of a model that is only similar, and of a learned shape, they are proposals: another shape in
+    For a model that is only similar, and for a learned shape, they are proposals: another shape in
     another pose has an outline alike.
 
     Raises InputError if the mask has no contour, the model no mesh, or the focal length is unknown.

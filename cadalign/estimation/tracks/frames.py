@@ -78,7 +78,7 @@ class Frames(NamedTuple):
         return cls(times, of_view.astype(np.int64))
 
     def chosen(self, prior: ShapePrior, views: Sequence[View]) -> list[int]:
-        """Views of the frames that tell most of the shape, spread over the track."""
+        """Views of the frames that determine the shape best, spread over the track."""
         mean = prior.components[0].mean
         counts = np.zeros(len(self.times), dtype=int)
         for number, view in enumerate(views):

@@ -67,7 +67,7 @@ class TrackUpdate:
 class Tracker:
     """Track one object online: each frame updates a window of the last ones.
 
-    What earlier frames tell of shape, stretch and motion is kept as Gaussian information, so that
+    What earlier frames say of shape, stretch and motion is kept as Gaussian information, so that
     an update takes the same few milliseconds however long the video is.
 
     Parameters

@@ -1,6 +1,6 @@
-"""A window over the last frames of a track, and what the earlier ones tell of it.
+"""A window over the last frames of a track, and what the earlier ones say of it.
 
-A frame that leaves the window is marginalised: what it tells of the next frame and of the shape
+A frame that leaves the window is marginalised: what it says of the next frame and of the shape
 stays as a quadratic (fixed-lag smoothing; Sibley, Matthies, Sukhatme, "Sliding window filter with
 application to planetary landing", 2010).
 """

@@ -84,7 +84,7 @@ def rank_evidence(
     ----------
     model : Model or ShapeModel
     views : View or sequence of View
-        All that is there; of a depth image, what it tells at keypoints counts.
+        All that is there; a depth image counts by its depths at keypoints.
     estimate : Alignment or Result
         The estimate from them. An alignment, in the first camera, suffices for an exact model and
         one view, or views with ``cam_from_rig``.
@@ -121,7 +121,7 @@ def rank_evidence(
     given = (views,) if isinstance(views, View) else tuple(views)
     scene = _scene_of(model, given, estimate, size)
     found = [each for name in candidates for each in _keypoints(scene, name)]
-    # Beside several views, a further one stands on the side that tells more.
+    # Beside several views, a further one stands on the more informative side.
     turns = (TURN_DEG,) if len(given) == 1 else (TURN_DEG, -TURN_DEG)
     found.append(min((_advice("view", "", _with_view(scene, t)) for t in turns), key=_worst))
     found.extend(_lengths(scene))
@@ -297,7 +297,7 @@ def _scene_of(
 ) -> _KnownScene:
     """The scene of views, a size, and the estimate from them.
 
-    Raises InputError if the estimate is neither an Alignment nor a Result, or does not tell shape
+    Raises InputError if the estimate is neither an Alignment nor a Result, or lacks shape
     and all poses, or a view has a mask that is not of an exact model.
     """
     if not views:

@@ -102,7 +102,7 @@ class SightedKeypoints:
 class DataSlopes(NamedTuple):
     """Derivatives of u unknowns by the data of k keypoints.
 
-    Of a point of the model that several views see, by all at once.
+    Differences of a point of the model that several views see, by all at once.
     """
 
     by_pixels: FloatArray  # (u, k, 2)

@@ -1,4 +1,4 @@
-"""Pieces of evidence: what each tells, how well it agrees with an estimate, what it contributes.
+"""Pieces of evidence: the rows of each, how well it agrees with an estimate, what it contributes.
 
 What a piece contributes is told by the standard deviations without it.
 """
@@ -51,7 +51,7 @@ class Piece(NamedTuple):
 
 
 def told_by(sightings: Sightings) -> dict[str, BoolArray]:
-    """Sightings (N,) that tell a keypoint's ray, a ray along a contour's normal alone, a depth."""
+    """Sightings (N,) of a keypoint's ray, of a ray along a contour's normal alone, of a depth."""
     is_keypoint = sightings.whitening[:, 2] > 0
     is_contour = (sightings.whitening[:, 2] == 0) & sightings.whitening.any(axis=1)
     return {"keypoints": is_keypoint, "mask": is_contour, "depth": sightings.depths[:, 1] > 0}

@@ -332,7 +332,7 @@ def _outliers(tested: _Tested) -> dict[int, float]:
 def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> str | None:
     """Name the mistake in the keypoints of a fit without which they would fit.
 
-    ``misfit`` may tell a camera that they fit as they are. Returns a warning; None where keypoints
+    ``misfit`` may have a camera that they fit as they are. Returns a warning; None where keypoints
     fit, and where no mistake explains the misfit better than that camera. Another image size, which
     leaves nearly as much open as a stretch, counts only where neither a stretch nor a few wrong
     keypoints explain it.

@@ -92,7 +92,7 @@ class Sensitivity:
     def strongest(self) -> Hashable:
         """Id of the keypoint that moves the result most: that of the largest ``influence``.
 
-        In several views, ``views`` at the same row tells which one it is in.
+        In several views, ``views`` at the same row is the number of its view.
         """
         return self.ids[int(np.argmax(self.influence))]
 

@@ -7,8 +7,8 @@ form, and its weight grows with the probability that it gave to b.
 
 Each keypoint is tested against what the others predict. The errors of held-out objects are
 distributed as a multivariate t: one unknown scale widens all of an object's shape. The other
-keypoints tell the scale, so that a keypoint is tested by an F distribution (Kotz and Nadarajah,
-"Multivariate t distributions and their applications", 2004).
+keypoints determine the scale, so that a keypoint is tested by an F distribution (Kotz and
+Nadarajah, "Multivariate t distributions and their applications", 2004).
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def misfits(cost: float, redundancy: int, tails: ShapeTails) -> tuple[str, ...]:
     """Report residuals that are too large for their standard deviations.
 
     At the optimum the cost, priors included, is distributed as chi-square: every unknown with a
-    prior adds one equation, every other takes one away. Of a learned shape it is distributed as
+    prior adds one equation, every other takes one away. For a learned shape it is distributed as
     errors of held-out objects are, see `ShapeTails`.
     """
     if redundancy <= 0 or cost < redundancy:

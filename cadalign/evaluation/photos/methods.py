@@ -134,7 +134,7 @@ def _simulated(
 ) -> tuple[NamedPoints, tuple[str, ...], FloatArray]:
     """Points of the model, those that the photo shows, and their pixels with noise.
 
-    Of a model without a mesh they are its keypoints, whatever hides them.
+    For a model without a mesh they are its keypoints, whatever hides them.
     """
     gt = target.found.truth.cam_from_model
     if gt is None:

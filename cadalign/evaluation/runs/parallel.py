@@ -119,7 +119,7 @@ class LocalProcesses:
 
 
 def _end_with(parent: int) -> None:
-    """End this worker once its parent is gone: a killed one has no chance to tell."""
+    """End this worker once its parent is gone: a killed one has no chance to say so."""
 
     def watch() -> None:
         while os.getppid() == parent:

@@ -3,7 +3,7 @@
 A finished chunk is a file in ``parts`` of the run's folder (`cadalign.evaluation.runs.folder`),
 which appears whole or not at all. Started again, a run does the chunks that have none, or whose
 tables are damaged. Chunks are the same whatever the number of workers, and their rows follow from
-the run's seed and the tasks' names, so nothing in ``results.parquet`` tells how often the run was
+the run's seed and the tasks' names, so nothing in ``results.parquet`` shows how often the run was
 interrupted or who did the work.
 
 An experiment of one's own is a `Spec` (`cadalign.evaluation.registry`).

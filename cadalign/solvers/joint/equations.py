@@ -1,6 +1,6 @@
 """Normal equations of the joint system, with room for them; what is integrated out of them.
 
-Of the displacement d of a point that one pose sees, with the prior N(0, spread^2 I), the equations
+For the displacement d of a point that one pose sees, with the prior N(0, spread^2 I), the equations
 ``r + J dx + D (e - d)``, with e the displacement to find, have the covariance I + spread^2 D D'
 about ``r - D d + J dx``. Whitening them by its Cholesky factor L leaves least squares in x alone,
 and ``e = -spread^2 D' L^-T (whitened residual)`` follows.
@@ -36,7 +36,7 @@ class JointEquations(NamedTuple):
 
     ``gradient`` is that of the ``arrow``; ``factor`` is for the damped one. The sightings of pose p
     are ``order[first[p]:first[p + 1]]``, point after point. ``rows`` and ``seen`` are those of
-    `write_rows`. Of one pose, the equations of point i are the ``columns[i]`` (2,) of the rows,
+    `write_rows`. For one pose, the equations of point i are the ``columns[i]`` (2,) of the rows,
     first and behind the last, none of several poses. ``log_determinant`` (1,) is that of the
     covariances by which eliminated displacements widened the equations; ``slopes`` (m, 3) are half
     the derivatives of the whole log determinant by the points before the stretch.

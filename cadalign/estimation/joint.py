@@ -369,7 +369,7 @@ def _one_of_equals(
 
 
 def _canonical(estimate: Estimate, symmetry: Symmetry, held: _Held) -> Estimate:
-    """The canonical one of all equal estimates, without deviations that mean nothing."""
+    """The canonical one of all equal estimates, without standard deviations that mean nothing."""
     best = group_of(symmetry).canonical(estimate.poses[0], held=held)
     turn, shift, scale = best.motion[:3, :3], best.motion[:3, 3], best.alignment.scale
     poses: list[Alignment] = []

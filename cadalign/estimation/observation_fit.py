@@ -103,7 +103,7 @@ class ObservationFit:
         return self.image or (self.stored and bool(observation.fit_options.get("image", False)))
 
     def stated_sigma(self, observation: Observation) -> dict[str, Sigma | None]:
-        """The deviation that takes the place of the keypoints' own, empty if there is none.
+        """Standard deviation in the place of the keypoints' own, empty if there is none.
 
         None is to be estimated.
         """

@@ -160,7 +160,7 @@ def has_scale_prior(scales: ScalePriors) -> bool:
 
 
 def widened(evidence: Evidence, state: State, factor: float) -> tuple[Evidence, State]:
-    """The same points under a prior of wider deviations."""
+    """The same points under a prior of wider standard deviations."""
     if factor == 1:
         return evidence, state
     shape = evidence.shape

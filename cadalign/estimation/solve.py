@@ -214,7 +214,7 @@ def _search(
     noises: FloatArray,
     is_bounded: bool = True,
 ) -> Solutions:
-    """Search at known focal lengths; ``noises`` (B,) multiply prior deviations and loss scales."""
+    """Search at known focal lengths; ``noises`` (B,) multiply priors' sigmas and loss scales."""
     given = points, rays, whitening, problems.offsets
     weight, width = options.scale_prior if is_bounded else (options.prior_weight, 0.0)
     scales = options.loss_scale * noises, weight * noises**2, width

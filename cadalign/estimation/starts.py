@@ -236,10 +236,10 @@ def _half_turned(evidence: Evidence, view: int, poses: FloatArray) -> list[Float
 
 
 class _Rows(NamedTuple):
-    """Equations in points of the rig: ``normals`` (N, 3), ``right`` (N,), inverse deviations.
+    """Equations in points of the rig: ``normals`` (N, 3), ``right`` (N,), inverse sigmas.
 
     They are of the model's ``points`` (N, 3), seen from a camera with ``turns`` and ``shifts``;
-    ``is_ray`` (N,) is 1 where the deviation is that of a ray: it grows with the depth.
+    ``is_ray`` (N,) is 1 where the standard deviation is that of a ray: it grows with the depth.
     """
 
     points: FloatArray

@@ -5,7 +5,7 @@ has the canonical one (`SymmetryGroup.canonical`), together with the keypoints a
 g^-1 x: the result is that of keypoints labelled so. To first order, a step (w, dt, ds) of A's
 rotation vector in the camera frame, translation and log scales is one of A g by a linear map, which
 carries the covariance. How far the object is turned about an axis of the symmetry means nothing:
-deviations are stated without that step, such that points on the axis keep theirs.
+standard deviations are stated without that step, such that points on the axis keep theirs.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def equal_slopes(
 def is_same(
     group: SymmetryGroup, best: Alignment, other: Alignment, covariance: FloatArray | None
 ) -> bool:
-    """True for an estimate that is equal to the best one, by its rotation's deviations."""
+    """True for an estimate that is equal to the best one, by its rotation's standard deviations."""
     near = group.nearest(other, best.rotation, tolerance=_SAME_SCALE).alignment
     if angle_between(near.rotation, best.rotation) < _SAME_DEG:
         return True

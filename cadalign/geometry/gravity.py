@@ -163,7 +163,7 @@ def up_from_vertical_edges(
         raise InputError("none is given", where="edges")
     found = [_plane(camera, ends, sigma, number) for number, ends in enumerate(clicks)]
     normals, deviations = zip(*found, strict=True)
-    # The forward direction is level to the deviation of the pitch: a plane like those of edges.
+    # The forward direction is level to within the pitch's sigma: a plane like those of edges.
     rows = np.array([*normals, [0.0, 0.0, 1.0]])
     planes = np.array([*deviations, np.eye(3) * np.radians(pitch_sigma_deg) ** 2])
     up = np.array([0.0, -1.0, 0.0])

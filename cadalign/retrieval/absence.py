@@ -45,7 +45,7 @@ LEAST_SPREAD = 0.7
 """Least standard deviation of log tau: objects of other categories are farther away."""
 _MOST_LIKELY = 40  # models that the sum is over
 _STEPS = np.linspace(-2.5, 2.5, 11)  # of log tau, in its standard deviations
-_USUAL = (np.log(0.03), 1.0)  # mean and deviation of log tau where there is nothing to compare
+_USUAL = (np.log(0.03), 1.0)  # mean and sigma of log tau where there is nothing to compare
 _FARTHEST = 1.0  # tau of two models that have nothing in common
 _ASKED = 64  # models of a category whose nearest ones are looked for
 _LEAST_SHARED = 4

@@ -5,9 +5,9 @@ models were learned from, or shapes have heavier tails than Gaussians, errors in
 larger than the prior's covariance says, and no residual shows it. Held-out models show how much:
 each is seen from random directions in weak perspective, once with all of its keypoints and once
 with a few, and pose and shape follow in closed form, as the equations are linear about the truth.
-Found are a factor of the deviations for either number of keypoints, and the degrees of freedom of
-the t distribution that the errors follow, as most objects of a category are nearer to the others
-than a Gaussian of that covariance says, and few far away.
+Found are a factor of the standard deviations for either number of keypoints, and the degrees of
+freedom of the t distribution that the errors follow, as most objects of a category are nearer to
+the others than a Gaussian of that covariance says, and few far away.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from cadalign.shapes.parts import (
     probability_within,
 )
 
-_FACTORS = np.geomspace(1.0, 3.0, 12)  # deviations are never narrowed; the first is no factor
+_FACTORS = np.geomspace(1.0, 3.0, 12)  # sigmas are never narrowed; the first is no factor
 _DEGREES_OF_FREEDOM = (None, 20.0, 10.0, 7.0, 5.0, 4.0, 3.0)
 _LEAST_KEYPOINTS = 4
 _NOMINAL = np.array([0.68, 0.95])
@@ -113,7 +113,7 @@ def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
 def _departure(squares: FloatArray, degrees_of_freedom: float | None) -> FloatArray:
     """Squared departures of coverage from its nominal values, in tolerances, by factor (F,).
 
-    ``squares`` (N, F) are those of errors along three coordinates, in stated deviations.
+    ``squares`` (N, F) are those of errors along three coordinates, in stated standard deviations.
     """
     levels = probability_within(squares, 3, degrees_of_freedom)
     shares = np.array([(levels <= nominal).mean(axis=0) for nominal in _NOMINAL])
@@ -144,7 +144,7 @@ class _Posterior(NamedTuple):
     """Pose (6,) and keypoints (n, 3) given an image and one Gaussian.
 
     Covariances of the rotation (F, 3, 3) and of each keypoint (F, n, 3, 3) are those with the
-    deviations widened by every factor.
+    standard deviations widened by every factor.
     """
 
     pose: FloatArray
@@ -189,7 +189,7 @@ def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: flo
 
 
 def _squares(view: _View, mixture: Gaussians, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Squared errors in deviations of the rotation (F,) and each keypoint (F, n).
+    """Squared errors in standard deviations of the rotation (F,) and each keypoint (F, n).
 
     Covariances are the second moments of the mixture about the likeliest component's estimate, as
     `cadalign.align` states them.

@@ -143,7 +143,7 @@ class ShapeModel:
 
         Models may lack keypoints; these are completed by expectation maximisation. What is not
         given is chosen by the likelihood of models that were held out. Ids that few models have
-        keep wide deviations.
+        keep wide standard deviations.
 
         Parameters
         ----------
@@ -292,7 +292,7 @@ class ShapeModel:
         Raises
         ------
         InputError
-            If a shape is wrong, a value is NaN or infinite, a deviation is negative, an id occurs
+            If a shape is wrong, a value is NaN or infinite, a sigma is negative, an id occurs
             twice, or the reflection names an unknown one.
 
         Examples

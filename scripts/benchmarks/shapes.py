@@ -148,7 +148,7 @@ class FocalShapes:
         yield RatioTable(f"unseen objects in near views, {self.noise_px:g} px", rows)
 
     def _unseen(self, dataset: KeypointNet, category: str, seed: int) -> tuple[Row, list[float]]:
-        """Errors with the focal length known and unknown; errors of the latter in deviations."""
+        """Errors with the focal length known and unknown; the latter's in sigmas."""
         shape = section.learned_shape(dataset, category)
         objects = dataset.subset(categories=[category], split="val")
         rows, deviations = [], []

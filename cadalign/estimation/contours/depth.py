@@ -41,7 +41,7 @@ _UNLIKELY = 60.0  # excess score of a minimum that is still tried
 
 
 class _Samples(NamedTuple):
-    """Depths (n,) of a view, their rays (n, 3), and their relative deviation."""
+    """Depths (n,) of a view, their rays (n, 3), and their relative standard deviation."""
 
     image: int
     rays: FloatArray

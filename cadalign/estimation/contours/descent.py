@@ -41,10 +41,10 @@ _FIRST_REACH = 24.0  # [px], and the same relative to the contour's size
 _RELATIVE_REACH = 0.04
 _WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
 _LEAST_REACH = 4.0
-_REACH = 6.0  # in deviations of the residuals
+_REACH = 6.0  # in standard deviations of the residuals
 _MOST_ROUNDS = 16
 _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
-_SETTLED = 0.02  # [px], median change of the offsets from round to round, or in deviations
+_SETTLED = 0.02  # [px], median change of the offsets from round to round, or in standard deviations
 _MOST_NOISES = 3  # that are learned, each where the cost at the last is least
 
 Masked = Sought[ViewContour]

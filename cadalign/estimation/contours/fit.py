@@ -38,7 +38,7 @@ _WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
 _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
 _LARGEST = 24.0  # [px]
 _HULL_GAIN = 0.5  # misfit of hulls, relative, below which these take the place of the outlines
-_INLIER = 3.5  # in deviations
+_INLIER = 3.5  # in standard deviations
 _OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
 

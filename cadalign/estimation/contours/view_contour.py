@@ -54,12 +54,12 @@ _FIRST_CORRELATION = 10.0  # samples, of a surface that is only similar
 _LEAST_OWN = 0.3  # [px], standard deviation of the part that is the model's
 _FIRST_SHARE, _LARGEST_SHARE = 0.8, 0.99  # of a contour, that is the model's
 _ROUNDS = 30
-_TO_SIGMA = 1.4826  # from the median of absolute values to the deviation of a Gaussian
-_OUTLYING = 3.5  # in deviations
+_TO_SIGMA = 1.4826  # from the median of absolute values to the standard deviation of a Gaussian
+_OUTLYING = 3.5  # in standard deviations
 _MOST_LAGS = 100
 _LEAST_PAIRS = 20
 _ALIKE = 0.2  # change of a variance's logarithm
-_INLIER = 3.5  # in deviations
+_INLIER = 3.5  # in standard deviations
 _BOUND_REACH = 8.0  # [px]
 _LEAST_COMMON_OFFSET = 0.1  # [px], that the whole contour may have in common
 
@@ -357,7 +357,7 @@ def with_contours(
 ) -> tuple[Evidence, State]:
     """The evidence of an exact model's views with the contours of their masks.
 
-    Their deviation and correlation are those that their residuals show at the state.
+    Their standard deviation and correlation are those that their residuals show at the state.
 
     Raises InputError if a mask has no contour, or the model has no mesh.
     """

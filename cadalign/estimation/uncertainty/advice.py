@@ -75,10 +75,11 @@ def rank_evidence(
 ) -> tuple[Advice, ...]:
     """Rank what could be added to the evidence of an object's views, the most useful first.
 
-    Compared is the largest deviation that is left, linearised at the estimate; what is known of a
-    learned or similar shape counts. A further view is one of the first view's keypoints from 25 deg
-    aside, its motion known where that of the others is. Lengths are the object's width and the less
-    certain of its height and length, measured to 1 %, or the one of them that is still unknown.
+    Compared is the largest standard deviation that is left, linearised at the estimate; what is
+    known of a learned or similar shape counts. A further view is one of the first view's keypoints
+    from 25 deg aside, its motion known where that of the others is. Lengths are the object's width
+    and the less certain of its height and length, measured to 1 %, or the one of them that is still
+    unknown.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def rank_evidence(
         in, as precisely as the others on average.
     mask : (h, w) bool, optional
         The mask that is predicted for the estimate in the first view, where one could be drawn; the
-        model then needs its mesh. Its contour counts with a deviation of 1.5 px.
+        model then needs its mesh. Its contour counts with a standard deviation of 1.5 px.
     size : Size, optional
         The lengths that are known.
 

@@ -56,7 +56,10 @@ def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
         if isinstance(cause, InputError) and str(cause) == str(error):  # of the model as a whole
             with in_file(file):
                 raise cause from None
-        raise SEAL.error(f"is invalid: {str(error)[:200]}", str(file)) from None
+        what, _, place = str(error).partition(" - at `$.")
+        join = "." if isinstance(cause, InputError) and cause.where else ": "
+        what = f"{place.rstrip('`')}{join}{what}" if place else what
+        raise SEAL.error(f"is invalid: {what[:200]}", str(file)) from None
     return model
 
 
@@ -68,10 +71,13 @@ def _written(value: Any) -> Any:
 
 
 def _read(kind: Any, value: Any) -> Any:
-    if kind is Path:
-        return Path(msgspec.convert(value, PathText))
+    try:
+        if kind is Path:
+            return Path(msgspec.convert(value, PathText))
+        array = msgspec.convert(value, _Array)
+    except msgspec.ValidationError as error:
+        raise ValueError(str(error)) from None  # to which the library adds the place
     dtype = np.dtype(get_args(get_args(kind)[1])[0]).newbyteorder("<")
-    array = msgspec.convert(value, _Array)
     numbers = np.frombuffer(array.data, dtype=dtype) if array.data else np.empty(0, dtype=dtype)
     if math.prod(array.shape) != len(numbers):
         raise InputError(f"{len(numbers)} numbers are not of the shape {array.shape}")

@@ -488,3 +488,22 @@ def test_real_models_that_were_held_out_are_likely(real_data: Path, category: st
     assert np.median(np.abs(errors)) < 0.6 * np.median(np.abs(spreads))
     assert 0.6 < (np.abs(whitened) < 1).mean() < 0.95
     assert (np.abs(whitened) < 2).mean() > 0.88
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "what"),
+    [
+        ("weight", -1.0, "components[0].weight: -1.0 is not in (0, 1]"),
+        ("mean", 3, "components[0].mean: Expected `object`, got `int`"),
+    ],
+)
+def test_damaged_parts_of_a_file_are_named(tmp_path, place, value, what):
+    path = tmp_path / "table.shape"
+    examples = [Example(f"t{k}", "abcdefg", TABLE * (1 + 0.01 * k)) for k in range(6)]
+    ShapeModel.learn(examples, category="table").save(path)
+    document = msgspec.msgpack.decode(SEAL.unwrap(path.read_bytes(), "table"))
+    document["components"][0][place] = value
+    SEAL.write(path, msgspec.msgpack.encode(document))
+    with pytest.raises(DataError) as caught:
+        ShapeModel.open(path)
+    assert str(caught.value).startswith(f"{path}: the shape file is invalid: {what};")

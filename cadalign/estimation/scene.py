@@ -153,6 +153,7 @@ def align_scene(
     --------
     Two boxes in a photo of unknown focal length:
 
+    >>> from cadalign import Alignment, Camera, Model, SceneObject, View
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     >>> camera = Camera(640, 480, 600, 600, 319.5, 239.5)
     >>> places = [[0.6, 0.3, 4.0], [-0.8, 0.4, 5.0]]
@@ -245,6 +246,7 @@ def focal_prior_by_others(
 
     Examples
     --------
+    >>> from cadalign import Alignment, Camera, Model, SceneObject, View
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     >>> turn = np.array([[-0.8, 0.0, 0.6], [0.0, -1.0, 0.0], [0.6, 0.0, 0.8]])
     >>> box = Alignment(turn, [0.6, 0.3, 4.0], [1.0, 1.2, 0.9]).apply(corners)

@@ -10,6 +10,7 @@ from support.photo_data import assert_damage_is_told, write_photo, write_text
 
 import cadalign.datasets
 from cadalign.datasets import Pascal3D, Pascal3DDetections
+from cadalign.datasets.photos.pascal3d import cad_model
 from cadalign.errors import DataError
 
 POINTS = np.array([[0.2, 0.1, 0.3], [-0.2, 0.1, 0.3], [0.2, -0.4, -0.3], [-0.2, -0.4, -0.3]])
@@ -152,22 +153,19 @@ def test_bad_objects_and_files_do_not_stop_the_others(root):
 
 
 def test_cad_files_are_checked_when_they_are_read(root):
-    chair = Pascal3D(root)[0].objects[0]
-    savemat(root / "CAD" / "x.mat", {"chair": np.array([{"vertices": POINTS}], dtype=object)})
-    model = type(chair.model.source)(root / "CAD" / "x.mat", "chair", 2)
+    savemat(root / "CAD" / "chair.mat", {"chair": np.array([{"vertices": POINTS}], dtype=object)})
     with pytest.raises(DataError, match="no model 2, only 1"):
-        model.load_mesh()
+        cad_model(root, "chair", 2).load_mesh()
     with pytest.raises(DataError, match="faces"):
-        type(model)(root / "CAD" / "x.mat", "chair", 1).load_mesh()
+        cad_model(root, "chair", 1).load_mesh()
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, 1e30])
 def test_faces_are_numbers_of_vertices(root, number):
-    model = Pascal3D(root)[0].objects[0].model.source
     cad = {"vertices": POINTS, "faces": np.array([[1.0, 2, number]])}
-    savemat(root / "CAD" / "x.mat", {"chair": np.array([cad], dtype=object)})
+    savemat(root / "CAD" / "chair.mat", {"chair": np.array([cad], dtype=object)})
     with pytest.raises(DataError, match="faces"):
-        type(model)(root / "CAD" / "x.mat", "chair", 1).load_mesh()
+        cad_model(root, "chair", 1).load_mesh()
 
 
 def test_damaged_files_are_told(root):

@@ -133,7 +133,7 @@ def test_the_samples_of_one_scan_and_frames_beside_each_other(root, tmp_path):
     dataset = cadalign.datasets.open(samples.parent)
     assert isinstance(dataset, Scan2CAD)
     assert dataset.names == ("scene0000_00/7",)
-    assert dataset[0].objects[0].model.source.mesh_path is None
+    assert dataset[0].objects[0].model.find_mesh() is None
 
 
 def test_folders_of_frames_and_models_may_be_elsewhere(root, tmp_path):

@@ -157,29 +157,31 @@ def factorize_arrow(arrow: Arrow) -> bool:
     poses, size, width = arrow.coupling.shape
     border, ahead = arrow.border.shape[0], ahead_of(arrow)
     for p in range(poses):
-        block, coupling = arrow.blocks[p], arrow.coupling[p]
+        block, coupling, linked = arrow.blocks[p], arrow.coupling[p], _next_of(arrow, p)
         if not factorize(block):
             return False
-        linked = ahead if p < poses - 1 else 0
         for k in range(size):
+            row = coupling[k]
             for j in range(k):
-                share = block[k, j]
+                share, above = block[k, j], coupling[j]
                 for m in range(ahead - linked, width):
-                    coupling[k, m] -= share * coupling[j, m]
+                    row[m] -= share * above[m]
             inverse = 1.0 / block[k, k]
             for m in range(ahead - linked, width):
-                coupling[k, m] *= inverse
+                row[m] *= inverse
         for k in range(size):
+            own, shared = coupling[k, :ahead], coupling[k, ahead:]
             for m in range(border):
-                share = coupling[k, ahead + m]
+                target, share = arrow.border[m], shared[m]
                 for j in range(m + 1):
-                    arrow.border[m, j] -= share * coupling[k, ahead + j]
+                    target[j] -= share * shared[j]
             for m in range(linked):
-                share = coupling[k, m]
+                next_row, share = arrow.blocks[p + 1, m], own[m]
                 for j in range(m + 1):
-                    arrow.blocks[p + 1, m, j] -= share * coupling[k, j]
-                for j in range(ahead, width):
-                    arrow.coupling[p + 1, m, j] -= share * coupling[k, j]
+                    next_row[j] -= share * own[j]
+                next_row = arrow.coupling[p + 1, m, ahead:]
+                for j in range(border):
+                    next_row[j] -= share * shared[j]
     return factorize(arrow.border)
 
 
@@ -192,34 +194,41 @@ def solve_arrow(factor: Arrow, gradient: FloatArray, step: FloatArray) -> None:
         step[k] = -gradient[k]
     shared = step[size * poses :]
     for p in range(poses):
-        block, coupling = factor.blocks[p], factor.coupling[p]
-        own = step[size * p : size * (p + 1)]
+        block, own, linked = factor.blocks[p], step[size * p : size * (p + 1)], _next_of(factor, p)
+        following = step[size * (p + 1) : size * (p + 1) + linked]
         for k in range(size):
+            row = block[k]
             for j in range(k):
-                own[k] -= block[k, j] * own[j]
-            own[k] /= block[k, k]
+                own[k] -= row[j] * own[j]
+            own[k] /= row[k]
         for k in range(size):
+            row, value = factor.coupling[p, k], own[k]
+            for m in range(linked):
+                following[m] -= row[m] * value
             for m in range(border):
-                shared[m] -= coupling[k, ahead + m] * own[k]
-            if p < poses - 1:
-                for m in range(ahead):
-                    step[size * (p + 1) + m] -= coupling[k, m] * own[k]
+                shared[m] -= row[ahead + m] * value
     solve_factor(factor.border, shared)
     for p in range(poses - 1, -1, -1):
-        block, coupling = factor.blocks[p], factor.coupling[p]
-        own = step[size * p : size * (p + 1)]
+        block, own, linked = factor.blocks[p], step[size * p : size * (p + 1)], _next_of(factor, p)
+        following = step[size * (p + 1) : size * (p + 1) + linked]
         for k in range(size):
-            total = 0.0
+            row, total = factor.coupling[p, k], 0.0
+            for m in range(linked):
+                total += row[m] * following[m]
             for m in range(border):
-                total += coupling[k, ahead + m] * shared[m]
-            if p < poses - 1:
-                for m in range(ahead):
-                    total += coupling[k, m] * step[size * (p + 1) + m]
+                total += row[ahead + m] * shared[m]
             own[k] -= total
         for k in range(size - 1, -1, -1):
-            for j in range(k + 1, size):
-                own[k] -= block[j, k] * own[j]
             own[k] /= block[k, k]
+            row, value = block[k], own[k]
+            for j in range(k):
+                own[j] -= row[j] * value
+
+
+@inlined
+def _next_of(arrow: Arrow, pose: int) -> int:
+    """Number of the next pose's unknowns that a pose has products with."""
+    return ahead_of(arrow) if pose < arrow.blocks.shape[0] - 1 else 0
 
 
 @kernel

@@ -175,7 +175,7 @@ def _observed_cars(folder: Path) -> Iterator[_Car]:
     for seen, camera, box, model in _real_cars(folder):
         kept = np.flatnonzero(seen.visible)
         if len(kept) >= _LEAST_KEYPOINTS and model is not None:
-            known = model.source.keypoints
+            known = model.load_keypoints()
             names = tuple(seen.names[k] for k in kept)
             points = known.xyz[[known.names.index(name) for name in names]]
             observed = cadalign.Observation(points, seen.points_2d[kept], camera, names=names)

@@ -131,7 +131,8 @@ class PhotoClicks:
 
     def first(self, count: int) -> PhotoClicks:
         """The first clicks."""
-        model = replace(self.model, points_3d=np.asarray(self.model.points_3d)[:count])
+        points = np.asarray(self.model.points_3d)[:count]
+        model = replace(self.model, points_3d=points, ids=None)
         return replace(self, model=model, pixels=self.pixels[:count])
 
     def true_for(self, est: Alignment) -> Alignment:

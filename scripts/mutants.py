@@ -6,11 +6,12 @@
     python scripts/mutants.py --coverage .coverage     # by the tests that run the changed line
 
 Each mutant swaps an operator, a comparison, a condition or a number at one place of a copy of the
-checkout. Survivors are printed as differences: each wants a test, or changes nothing that matters.
+checkout. Survivors are printed as differences: each needs a test, or changes nothing that matters.
 
 `pytest --cov --cov-context=test` writes the data for ``--coverage``. A test that does not run a
-line cannot notice its change, so this asks the whole suite at a hundredth of its time. Lines of
-compiled kernels are not in the data: their mutants are tested by the room, long tests included.
+line cannot notice its change, so this asks the whole suite at a hundredth of its time: first the
+tests of the mutant's room, then the others. Lines of compiled kernels are not in the data: their
+mutants are tested by the quick tests of the room and of `estimation`.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
 
+import pytest
 import tyro
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -59,8 +62,10 @@ class Arguments:
     """Run the whole suite on each mutant rather than the tests of its room."""
     coverage: Path | None = None
     """Data of pytest-cov with a context per test: run the tests that run the changed line."""
-    most: int = 150
-    """With coverage data, the number of tests per mutant: at first those of the room."""
+    most: int = 100
+    """With coverage data, the number of tests per mutant of its room, and of the others."""
+    first: int = 1
+    """Number of the mutant to begin with, to continue a run that was stopped."""
     timeout: float = 900.0
     """Seconds after which a mutant counts as caught: it hangs."""
 
@@ -78,21 +83,24 @@ def main(arguments: Arguments) -> int:
     """Test the mutants; returns 1 if one survived."""
     places = [place for path in sources(arguments.rooms) for place in places_of(path)]
     chosen = random.Random(arguments.seed).sample(places, min(arguments.count, len(places)))
-    survivors = []
+    catchers, survivors = Counter[str](), []
     with tempfile.TemporaryDirectory() as folder:
         checkout = Path(folder) / "checkout"
         copy_to(checkout)
-        for number, (path, place) in enumerate(chosen, start=1):
+        for number, (path, place) in enumerate(chosen[arguments.first - 1 :], arguments.first):
             mutant = mutated(path, place)
-            is_caught = caught(checkout, mutant, arguments)
-            print(f"{number:4} {'caught  ' if is_caught else 'SURVIVED'} {path}:{mutant.line}")
-            sys.stdout.flush()
-            if not is_caught:
+            catcher = caught_by(checkout, mutant, arguments)
+            print(f"{number:4} {catcher or 'SURVIVED':9} {path}:{mutant.line}", flush=True)
+            if catcher:
+                catchers[catcher] += 1
+            else:
                 survivors.append(mutant)
     for mutant in survivors:
         print(difference(mutant))
-    share = 100 * (1 - len(survivors) / max(len(chosen), 1))
-    print(f"caught {len(chosen) - len(survivors)} of {len(chosen)} mutants ({share:.0f} %)")
+    tested = catchers.total() + len(survivors)
+    by = ", ".join(f"{count} by {name}" for name, count in catchers.items())
+    share = 100 * catchers.total() / max(tested, 1)
+    print(f"caught {catchers.total()} of {tested} mutants ({share:.0f} %): {by}")
     return int(bool(survivors))
 
 
@@ -195,45 +203,57 @@ def copy_to(checkout: Path) -> None:
             shutil.copy2(source, checkout / name)
 
 
-def caught(checkout: Path, mutant: Mutant, arguments: Arguments) -> bool:
-    """True if a test fails on the mutant; the copy is as before afterwards."""
+def caught_by(checkout: Path, mutant: Mutant, arguments: Arguments) -> str:
+    """Name of the tests of which one fails on the mutant, empty if none does.
+
+    The copy is as before afterwards.
+    """
     target = checkout / mutant.path
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
     environment = {**os.environ, "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1"}
     target.write_text(mutant.text, encoding="utf-8")
     try:
-        done = subprocess.run(
-            [*command, *tests_of(mutant, arguments)],
-            cwd=checkout,
-            env=environment,
-            capture_output=True,
-            timeout=arguments.timeout,
-            check=False,
-        )
+        for name, tests in tests_of(mutant, arguments).items():
+            done = subprocess.run(
+                [*command, *tests],
+                cwd=checkout,
+                env=environment,
+                capture_output=True,
+                timeout=arguments.timeout,
+                check=False,
+            )
+            if done.returncode not in (0, pytest.ExitCode.NO_TESTS_COLLECTED):
+                return name
     except subprocess.TimeoutExpired:
-        return True
+        return "time"
     finally:
         shutil.copy2(ROOT / mutant.path, target)
-    return done.returncode != 0
+    return ""
 
 
-def tests_of(mutant: Mutant, arguments: Arguments) -> list[str]:
-    """Arguments of pytest that choose the tests of a mutant."""
-    room = f"tests/{room_of(mutant.path)}"
-    if arguments.coverage is not None:
-        covering = covering_tests(arguments.coverage).get((str(mutant.path), mutant.line), [])
-        if covering:
-            return ["-m", "not timing", *in_turns(covering, f"{room}/")[: arguments.most]]
-    is_known = (ROOT / room).is_dir() and room != "tests/"
-    chosen = "tests" if arguments.whole or not is_known else room
-    is_long = arguments.whole or arguments.coverage is not None
-    return ["-m", "not timing" if is_long else "not long and not timing", chosen]
+def tests_of(mutant: Mutant, arguments: Arguments) -> dict[str, list[str]]:
+    """Arguments of pytest that choose the tests of a mutant, by the name of the choice."""
+    folder = f"tests/{room_of(mutant.path)}"
+    room = folder if folder != "tests/" and (ROOT / folder).is_dir() else "tests"
+    quick = ["-m", "not long and not timing"]
+    if arguments.whole:
+        return {"all": ["-m", "not timing", "tests"]}
+    if arguments.coverage is None:
+        return {"room": [*quick, room]}
+    covering = covering_tests(arguments.coverage).get((str(mutant.path), mutant.line), [])
+    if not covering:
+        others = {"others": [*quick, "tests/estimation"]} if room == "tests/solvers" else {}
+        return {"room": [*quick, room], **others}
+    inside = in_turns([name for name in covering if name.startswith(f"{room}/")])
+    outside = in_turns([name for name in covering if not name.startswith(f"{room}/")])
+    groups = {"room": inside, "others": outside}
+    return {name: [*quick, *tests[: arguments.most]] for name, tests in groups.items() if tests}
 
 
-def in_turns(names: list[str], room: str) -> list[str]:
-    """Tests taken from one file after the other, those of the room first."""
+def in_turns(names: list[str]) -> list[str]:
+    """Tests taken from one file after the other."""
     files: dict[str, list[str]] = {}
-    for name in sorted(set(names), key=lambda name: (not name.startswith(room), name)):
+    for name in sorted(set(names)):
         files.setdefault(name.split("::")[0], []).append(name)
     rounds = zip_longest(*files.values())
     return [name for each in rounds for name in each if name is not None]

@@ -87,8 +87,8 @@ def test_tests_of_a_mutant_are_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.syspath_prepend(ROOT / "scripts")
     mutants = importlib.import_module("mutants")
     names = ["tests/io/b.py::q", "tests/io/b.py::p", "tests/cli/a.py::r", "tests/io/c.py::s"]
-    chosen = mutants.in_turns(names, "tests/io/")
-    assert [name[-1] for name in chosen] == ["p", "s", "r", "q"]
+    chosen = mutants.in_turns(names)
+    assert [name[-1] for name in chosen] == ["r", "p", "s", "q"]
 
 
 class TestComparingRatios:

@@ -5,8 +5,10 @@
     python scripts/mutants.py --whole                  # by the whole suite
     python scripts/mutants.py --coverage .coverage     # by the tests that run the changed line
 
-Each mutant swaps an operator, a comparison, a condition or a number at one place of a copy of the
-checkout. Survivors are printed as differences: each needs a test, or changes nothing that matters.
+Each mutant swaps an operator, a comparison or a condition at one place of a copy of the checkout,
+with ``--numbers`` also a number: many of these are dimensions of sample models, defaults and
+thresholds, which a test could only repeat. Survivors are printed as differences: each needs a test,
+or changes nothing that matters.
 
 `pytest --cov --cov-context=test` writes the data for ``--coverage``. A test that does not run a
 line cannot notice its change, so this asks the whole suite at a hundredth of its time: first the
@@ -58,6 +60,8 @@ class Arguments:
     """Seed of their places."""
     rooms: tuple[str, ...] = ()
     """Rooms to mutate, such as geometry; by default all."""
+    numbers: bool = False
+    """Mutate numbers, too."""
     whole: bool = False
     """Run the whole suite on each mutant rather than the tests of its room."""
     coverage: Path | None = None
@@ -81,7 +85,8 @@ class Mutant:
 
 def main(arguments: Arguments) -> int:
     """Test the mutants; returns 1 if one survived."""
-    places = [place for path in sources(arguments.rooms) for place in places_of(path)]
+    found = [place for path in sources(arguments.rooms) for place in places_of(path)]
+    places = [(path, place) for path, place, is_number in found if arguments.numbers >= is_number]
     chosen = random.Random(arguments.seed).sample(places, min(arguments.count, len(places)))
     catchers, survivors = Counter[str](), []
     with tempfile.TemporaryDirectory() as folder:
@@ -119,13 +124,14 @@ def room_of(path: Path) -> str:
     return parts[0] if len(parts) > 1 else ""
 
 
-def places_of(path: Path) -> Iterator[tuple[Path, int]]:
-    """Numbers of a module's nodes, in the order of `ast.walk`, that can be mutated."""
+def places_of(path: Path) -> Iterator[tuple[Path, int, bool]]:
+    """A module's nodes that can be mutated: their place in `ast.walk`, and if they are numbers."""
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
     hidden = set(unmutated(tree))
     for number, node in enumerate(ast.walk(tree)):
         if node not in hidden and swapped(node) is not None:
-            yield path, number
+            is_number = isinstance(node, ast.Constant) and not isinstance(node.value, bool)
+            yield path, number, is_number
 
 
 def unmutated(tree: ast.AST) -> Iterator[ast.AST]:

@@ -37,6 +37,7 @@ from benchmarks.tracks import Tracks
 from rich.console import Console
 from rich.table import Table
 
+from cadalign.cli import plain_help
 from cadalign.io.files import write_json
 
 SECTIONS: dict[str, type[Section]] = {
@@ -93,7 +94,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the sections; return 1 if a ratio got worse."""
     own = [(name, kind, field(default_factory=kind)) for name, kind in SECTIONS.items()]
     options_type: Any = make_dataclass("Options", own, bases=(Common,))
-    options = tyro.cli(options_type, description=__doc__, args=arguments)
+    options = tyro.cli(options_type, description=__doc__, args=arguments, registry=plain_help())
     named = [name.replace("-", "_") for name in options.sections]
     unknown = ", ".join(name for name in named if name not in SECTIONS)
     if unknown:

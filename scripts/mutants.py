@@ -13,7 +13,7 @@ or changes nothing that matters.
 `pytest --cov --cov-context=test` writes the data for ``--coverage``. A test that does not run a
 line cannot notice its change, so this asks the whole suite at a hundredth of its time: first the
 tests of the mutant's room, then the others. Lines of compiled kernels are not in the data: their
-mutants are tested by the quick tests of the room and of `estimation`.
+mutants are tested by the room and by `estimation`.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Arguments:
     """Run the whole suite on each mutant rather than the tests of its room."""
     coverage: Path | None = None
     """Data of pytest-cov with a context per test: run the tests that run the changed line."""
-    most: int = 100
+    most: int = 60
     """With coverage data, the number of tests per mutant of its room, and of the others."""
     first: int = 1
     """Number of the mutant to begin with, to continue a run that was stopped."""
@@ -246,10 +246,11 @@ def tests_of(mutant: Mutant, arguments: Arguments) -> dict[str, list[str]]:
         return {"all": ["-m", "not timing", "tests"]}
     if arguments.coverage is None:
         return {"room": [*quick, room]}
-    covering = covering_tests(arguments.coverage).get((str(mutant.path), mutant.line), [])
+    lines = covering_tests(arguments.coverage)
+    covering = lines.get((str(mutant.path), mutant.line), [])
     if not covering:
-        others = {"others": [*quick, "tests/estimation"]} if room == "tests/solvers" else {}
-        return {"room": [*quick, room], **others}
+        rooms = (f"{room}/", "tests/estimation/") if room == "tests/solvers" else (f"{room}/",)
+        covering = [name for names in lines.values() for name in names if name.startswith(rooms)]
     inside = in_turns([name for name in covering if name.startswith(f"{room}/")])
     outside = in_turns([name for name in covering if not name.startswith(f"{room}/")])
     groups = {"room": inside, "others": outside}

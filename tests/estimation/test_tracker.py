@@ -105,6 +105,26 @@ def test_an_object_that_jumps_is_reported_and_found_again() -> None:
     assert angle_between(last.alignment.rotation, other.poses[-1].rotation) < 5.0
 
 
+def test_keypoints_that_fit_no_pose_lose_the_object_until_others_do() -> None:
+    rng, track = np.random.default_rng(1), video(4, 60)
+    views = [
+        replace(view, points_2d=rng.uniform(0, 400, (POINTS, 2)), ids=range(POINTS))
+        if 30 <= k < 46
+        else view
+        for k, view in enumerate(track.views)
+    ]
+    tracker = Tracker(CATEGORY)
+    updates = [tracker.update(view) for view in views]
+    lost = [k for k, update in enumerate(updates) if update.is_lost and k > 10]
+    assert lost[0] == 33, "four frames in a row that contradict the track"
+    assert lost == list(range(33, lost[-1] + 1)), "no track of such keypoints begins"
+    assert lost[-1] < 59
+    assert not updates[-1].is_lost
+    last = updates[-1].pose
+    assert last is not None
+    assert angle_between(last.alignment.rotation, track.poses[-1].rotation) < 8.0
+
+
 def test_too_few_frames_have_no_pose() -> None:
     tracker = Tracker(CATEGORY)
     update = tracker.update(video(0, 2).views[0])

@@ -212,6 +212,8 @@ class Tracker:
         times = np.array([each.time for each in self._recent], dtype=float)
         window = Window(evidence, times, path, found.motion)
         _, window = window.refined(_ITERATIONS)
+        if self._fits(window).mean() < _LEAST_SHARE:
+            return nothing
         while len(window.times) > self._lag:
             window = window.without_first()
             self._recent.pop(0)
@@ -271,15 +273,18 @@ class Tracker:
     def _agreement(self, window: Window) -> BoolArray:
         """Marks the last frame's keypoints, in the view's order, that agree with the window."""
         view = self._recent[-1]
-        options = self._ransac or RansacOptions()
-        problem = self._problem(self._recent, range(len(self._recent)))
-        limits = thresholds(window.evidence, problem.lenses, problem.threshold(options))
-        fits = whitened_lengths(window.evidence, window.path.state) < limits
         last = window.evidence.sightings.image == len(self._recent) - 1
         order = np.argsort(self._prior.rows_of(view.keypoint_ids, "view.ids"), kind="stable")
         inliers = np.empty(len(order), dtype=bool)
-        inliers[order] = fits[last]
+        inliers[order] = self._fits(window)[last]
         return inliers
+
+    def _fits(self, window: Window) -> BoolArray:
+        """Marks the sightings of the recent views that agree with the window."""
+        options = self._ransac or RansacOptions()
+        problem = self._problem(self._recent, range(len(self._recent)))
+        limits = thresholds(window.evidence, problem.lenses, problem.threshold(options))
+        return whitened_lengths(window.evidence, window.path.state) < limits
 
     def _again(self, view: View, window: Window) -> Window | None:
         """A window that begins anew where the view's keypoints fit the known shape."""

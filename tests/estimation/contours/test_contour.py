@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import minimize
 
 from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import (
@@ -14,7 +15,12 @@ from cadalign.estimation.contours.contour import (
     contour_of,
     mask_contour,
 )
-from cadalign.estimation.contours.view_contour import correlation_length
+from cadalign.estimation.contours.view_contour import (
+    Noise,
+    correlation_length,
+    cost_of_contour,
+    with_learned_offsets,
+)
 
 WIDTH, HEIGHT = 160, 120
 
@@ -92,3 +98,32 @@ def test_correlated_residuals_count_less() -> None:
     alike = np.convolve(independent, np.ones(10) / np.sqrt(10), mode="same")
     assert correlation_length(contour, independent, every) < 1.3
     assert 8 < correlation_length(contour, alike, every) < 12
+
+
+def test_the_cost_of_a_contour_is_the_least_over_share_and_deviation() -> None:
+    rng, reach = np.random.default_rng(1), 20.0
+    residuals = np.concatenate([rng.normal(0, 1.5, 700), rng.uniform(-reach, reach, 300)])
+
+    def cost(unknowns: np.ndarray) -> float:
+        share, sigma = unknowns
+        own = share * np.exp(-((residuals / sigma) ** 2) / 2) / (np.sqrt(2 * np.pi) * sigma)
+        return float(-np.log(own + (1 - share) / (2 * reach)).mean())
+
+    best = minimize(cost, (0.5, 1.0), bounds=[(0.01, 0.99), (0.3, 10)])
+    assert best.x == pytest.approx((0.7, 1.5), abs=0.1)
+    assert cost_of_contour(residuals, reach) == pytest.approx(best.fun, abs=1e-6)
+
+
+@pytest.mark.parametrize("place", [2.0, 0.7, 0.5, 0.0])
+def test_an_offset_has_the_deviation_that_its_own_place_shows(
+    monkeypatch: pytest.MonkeyPatch, place: float
+) -> None:
+    """A contour lies ``place`` before a prior of 1 px, with a variance of .36 px^2."""
+    information = np.diag([1 / 0.36 + 1, 1.0, 1.0])
+    module = "cadalign.estimation.contours.view_contour.information_of"
+    monkeypatch.setattr(module, lambda *_: (None, information))
+    own = np.array([[place / (1 + 0.36), 0.2, 0.3]])
+    (learned,), moved = with_learned_offsets(None, None, [Noise(1.0, 1.0, 1.0)], own)  # type: ignore[arg-type]
+    assert learned.offset == pytest.approx(max(np.sqrt(max(place**2 - 0.36, 0.0)), 0.1))
+    assert moved[0, 0] * learned.offset == pytest.approx(own[0, 0])
+    assert moved[0, 1:] == pytest.approx(own[0, 1:])

@@ -22,6 +22,7 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage, read_image
 from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
@@ -116,7 +117,7 @@ def _thumb(photo: ByteImage, camera: Camera, result: Result) -> ByteImage:
     """The part of a photo around the object, with its box and keypoints."""
     box = Box.from_model(result.bounds, result.alignment)
     scale = camera.width / result.camera.width
-    observed = (result.views[0].points_2d + 0.5) * scale - 0.5
+    observed = rescaled_pixels(result.views[0].points_2d, scale)
     drawn: Any = draw_overlay(
         photo, camera, est_box=box, observed=observed, axes=False, legend=False
     )

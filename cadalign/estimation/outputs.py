@@ -18,6 +18,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage, read_photo
 from cadalign.notebook import card, draw_picture, photo_axes
 
@@ -105,8 +106,8 @@ def _plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> 
     color[..., 3] = _MODEL_OPACITY * seen
     axes.imshow(color, extent=(-0.5, camera.width - 0.5, camera.height - 0.5, -0.5))
     height, width = shade.shape
-    columns = (np.arange(width) + 0.5) * camera.width / width - 0.5
-    rows = (np.arange(height) + 0.5) * camera.height / height - 0.5
+    columns = rescaled_pixels(np.arange(width, dtype=float), camera.width / width)
+    rows = rescaled_pixels(np.arange(height, dtype=float), camera.height / height)
     if not seen.all() and min(shade.shape) > 1:
         axes.contour(columns, rows, seen, levels=[0.5], colors=[_MODEL_COLOR], linewidths=1.2)
 
@@ -148,8 +149,8 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
     step = max(1.0, max(camera.width, camera.height) / _LONGEST_SIDE)
     width, height = round(camera.width / step), round(camera.height / step)
     width, height = max(width, 1), max(height, 1)
-    across = (np.arange(width) + 0.5) * camera.width / width - 0.5
-    down = (np.arange(height) + 0.5) * camera.height / height - 0.5
+    across = rescaled_pixels(np.arange(width, dtype=float), camera.width / width)
+    down = rescaled_pixels(np.arange(height, dtype=float), camera.height / height)
     pixels = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
     rays, valid = camera.rays_where_valid(pixels)
     # depth * ray = R (scale * x) + t, in the model's own coordinates

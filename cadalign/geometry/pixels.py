@@ -42,7 +42,9 @@ def shift_of(pixel_origin: object, *, where: str = "pixel_origin") -> float:
 
 
 def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArray:
-    """Pixels (n, 2) in an image ``factor`` times as large: borders, not centres, stay in place.
+    """Pixels (n, 2), or coordinates (n,), in an image ``factor`` times as large.
+
+    Borders stay in place, centres do not.
 
     Examples
     --------

@@ -13,6 +13,7 @@ from cadalign.geometry.rotations import (
     rotation_from_quat_wxyz,
     rotation_from_vector,
     rotations_from_vectors,
+    spread_rotations,
 )
 
 vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
@@ -45,3 +46,14 @@ def test_many_vectors_give_the_rotations_of_each() -> None:
     vectors[0] = 0.0
     expected = [rotation_from_vector(each) for each in vectors]
     np.testing.assert_allclose(rotations_from_vectors(vectors), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [60, 500])
+def test_spread_rotations_are_about_as_far_from_each_other(count: int) -> None:
+    rotations = spread_rotations(count)
+    traces = np.einsum("aij,bij->ab", rotations, rotations)
+    angles = np.arccos(np.clip((traces - 1) / 2, -1, 1))
+    nearest = np.sort(angles, axis=1)[:, 1]
+    assert nearest.max() < 1.6 * nearest.min()
+    # As many balls of that radius have about the volume of all rotations.
+    assert count * (nearest.min() - np.sin(nearest.min())) / np.pi > 0.8

@@ -52,6 +52,7 @@ from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
+from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage
 from cadalign.render.drawing.overlay import draw_overlay
 from cadalign.render.raycast.renderer import cast_geometry
@@ -224,7 +225,7 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
         predicted = camera.project_where_ahead(estimate.alignment.apply(sighting.points_3d))
         if cad is not None and cad.has_mesh:
             frame = cast_geometry(cad.scene, camera, estimate.alignment)
-    observed = (sighting.points_2d + 0.5) * scale - 0.5
+    observed = rescaled_pixels(sighting.points_2d, scale)
     marks: dict[str, Any] = {"observed": observed, "reprojected": predicted}
     image = draw_overlay(photo, camera, est_frame=frame, **boxes, **marks)
     crop, near = _around(photo, camera, sighting, observed)

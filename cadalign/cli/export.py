@@ -38,7 +38,7 @@ class Export:
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
     """Result of `cadalign fit` or `cadalign annotate`; or the folder of a run of many fits."""
     to: Path
-    """File to write, or folder of a format of several files. Of a run, a format's name is a folder
+    """File to write, or folder of a format of several files. For a run, a format's name is a folder
     of that name: json, overlay, glb, coco, bop-results, colmap, nerfstudio, bop, kitti, pix3d,
     scan2cad, objectron."""
     format: str | None = None
@@ -54,7 +54,7 @@ class Export:
     """Text file of the first camera's pose in the world, 4 x 4, as ScanNet's pose files; for
     --frame world."""
     rows: tuple[int, ...] = ()
-    """Of a run, the numbers of the observations to write, by default all."""
+    """For a run, the numbers of the observations to write, by default all."""
     options: Annotated[
         _Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_Options.__doc__)
     ] = _Options()

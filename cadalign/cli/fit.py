@@ -109,11 +109,11 @@ class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
     """Folder to write to; by default <observation>_fit beside the file or folder."""
     overlay: Path | None = None
     """Draw the aligned model over the photo, too, and write it to this picture; further views to
-    FILE_1 and so on. The observation names the model. Of many observations, a folder."""
+    FILE_1 and so on. The observation names the model. For many observations, a folder."""
     overlay_mode: Literal["shaded", "translucent", "lines", "box"] = "shaded"
     """Style of drawing: in its own colours, as a red veil, its outline and creases, or its box."""
     overlay_opacity: float = 0.6
-    """Of the shaded or translucent model, 0 to 1."""
+    """Opacity of the shaded or translucent model, 0 to 1."""
 
     def run(self) -> int:
         """Run the fit, or the fits; returns the exit code."""

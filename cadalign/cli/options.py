@@ -101,7 +101,7 @@ class ManyCommand(ObservationCommand, DetectorOptions):
     dask: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
     pictures: int = 100
-    """Of many observations, the number of those whose photos the page shows, the first ones."""
+    """Number of observations, the first ones of many, whose photos the page shows."""
 
     def first(self) -> Path:
         """The first observation; raises UsageError if none is given."""

@@ -46,14 +46,14 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
 
     out: Path | None = None
     """Folder for matches.json, the matches' overlays and index.html; by default none is
-    written. Of many observations the run's, by default beside them."""
+    written. For many observations the run's, by default beside them."""
     mask: Path | None = None
     """Image of the object's pixels in white: ranks the matches again by their silhouettes."""
     workers: int | None = None
     """Threads for one observation, -1 (the default) for one per core. Processes for many, 0 for
     none; by default -1, for few observations 0."""
     picture: bool = True
-    """Of many observations, write a page."""
+    """Write a page of many observations."""
     ranking: Annotated[
         _RetrievalOptions, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_RetrievalOptions.__doc__)
     ] = _RetrievalOptions()

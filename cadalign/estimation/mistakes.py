@@ -106,7 +106,7 @@ def other_sizes(points_2d: FloatArray, camera: Camera) -> list[Mistake]:
 
 
 def larger_sizes(points_2d: FloatArray, camera: Camera) -> list[Mistake]:
-    """Those of `other_sizes`, where the camera's image does not hold most keypoints (n, 2)."""
+    """The `other_sizes`, where the camera's image does not hold most keypoints (n, 2)."""
     holds_most = camera.contains(points_2d).sum() > _MOST_INSIDE * len(points_2d)
     return [] if holds_most else other_sizes(points_2d, camera)
 

@@ -1,8 +1,8 @@
 """Results in terms of a model's symmetry: one of all equal alignments, and its uncertainty.
 
-A model that a symmetry g takes to itself is placed by A g as by A. Of all such alignments a result
-has the canonical one (`SymmetryGroup.canonical`), together with the keypoints as that one has them,
-g^-1 x: the result is that of keypoints labelled so. To first order, a step (w, dt, ds) of A's
+A model that a symmetry g takes to itself is placed by A g as by A. A result has the canonical one
+of all such alignments (`SymmetryGroup.canonical`), together with the keypoints as that one has
+them, g^-1 x: the result is that of keypoints labelled so. To first order, a step (w, dt, ds) of A's
 rotation vector in the camera frame, translation and log scales is one of A g by a linear map, which
 carries the covariance. How far the object is turned about an axis of the symmetry means nothing:
 standard deviations are stated without that step, such that points on the axis keep theirs.

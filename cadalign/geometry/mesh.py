@@ -314,7 +314,7 @@ def cluster(mesh: Mesh, *, cells: float) -> Simplified:
     """Merge the vertices in each cell of a grid into their mean; drop what has lost its area.
 
     As in Rossignac, Borrel, "Multi-resolution 3D approximations for rendering complex scenes"
-    (1993). Of triangles in one place the first remains. A triangle that becomes a line remains as a
+    (1993). The first of triangles in one place remains. A triangle that becomes a line remains as a
     wire, so that masts and railings don't vanish. ``cells``, at most `FINEST`, are those along the
     longest side of the mesh.
 

@@ -33,7 +33,7 @@ def warp_mesh(
 ) -> Mesh:
     """Warp a mesh such that its keypoints come to given places.
 
-    Keypoints may be coplanar, or few. Of coincident ones the mean of the targets counts; otherwise
+    Keypoints may be coplanar, or few. For coincident ones the mean of the targets counts; otherwise
     the warp is exact at the keypoints. Far from all keypoints it is a stretch along the axes.
 
     Parameters

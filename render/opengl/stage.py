@@ -28,7 +28,7 @@ def gl_meshes(scene: Scene) -> tuple[Any, Any]:
 
     Its shader lights one side of a triangle only. So every triangle is given twice, in one mesh as
     it is and in the other turned round with its normals, and OpenGL culls what is turned away: the
-    two sides look alike, as with ray casting. Of triangles that coincide, the one wound towards
+    two sides look alike, as with ray casting. Where triangles coincide, the one wound towards
     the viewer is kept.
     """
     alike, opposite = scene.coincident_faces

@@ -50,7 +50,7 @@ class Refined(NamedTuple):
     summaries: list[EvidenceSummary]
     warnings: list[str]
     residuals: tuple[MaskResiduals | None, ...] = ()
-    """Those of every view's mask."""
+    """The contours of every view's mask."""
     photos: frozenset[int] = frozenset()
     """Views whose photos count."""
 

@@ -6,7 +6,7 @@ moments, by a turn or a reflection. So silhouettes along directions all around a
 a model, compared with the mask's at all turns, and each that resembles it gives an affine camera.
 What an occluder or the image's border leaves of a silhouette has moments of its own: so each one is
 kept whole and cut by straight lines.
-Of ``M = R[:2] S / Z``, for the rows of ``M S^-1`` are orthogonal and of one length, the stretch
+From ``M = R[:2] S / Z``, for the rows of ``M S^-1`` are orthogonal and of one length, the stretch
 follows by two linear equations in the inverse squares of its scales.
 """
 

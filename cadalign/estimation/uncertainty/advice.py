@@ -50,11 +50,11 @@ class Advice:
     detail: Hashable
     """Id of the keypoint; names of the two lengths; empty otherwise."""
     rotation_deg: float
-    """Of the rotation [degrees]."""
+    """Standard deviation of the rotation [degrees]."""
     position: float
-    """Of the translation, over the distance."""
+    """Standard deviation of the translation, over the distance."""
     stretch: tuple[float, float, float]
-    """Of the lengths along x, y, z, relative."""
+    """Relative standard deviations of the lengths along x, y, z."""
     view: int = 0
     """Number of the view that a keypoint or a mask is added to."""
 

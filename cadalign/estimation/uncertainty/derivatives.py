@@ -208,7 +208,7 @@ class Optima:
     def pull_back(self, slopes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Derivatives by the data of numbers whose derivatives by the unknowns are (B, 10).
 
-        By rays (B, n, 2), log sigmas (B, n) and points (B, n, 3). Of one problem, the numbers may
+        By rays (B, n, 2), log sigmas (B, n) and points (B, n, 3). For one problem, the numbers may
         be many.
         """
         adjoint = np.zeros((len(slopes), UNKNOWNS))

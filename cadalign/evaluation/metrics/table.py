@@ -98,7 +98,7 @@ TRANSLATION = Metric(
 )
 """In diagonals of the model's bounding box."""
 TRANSLATION_IN_UNITS = replace(TRANSLATION, unit="model units")
-"""Of models that have no bounding box: the simulation's random points."""
+"""Metrics of models that have no bounding box: the simulation's random points."""
 TRANSLATION_OF_DISTANCE = replace(
     TRANSLATION, unit="% of distance", digits=2, factor=100.0, symbol="t %"
 )
@@ -155,7 +155,7 @@ SHAPE_DISTANCE = Metric(
     "shape_distance", "shape distance", "%", factor=100.0, symbol="shape%", log=False
 )
 MATCH_ROTATION = replace(ROTATION, digits=2)
-"""Of the best match, which is another object as a rule."""
+"""Metrics of the best match, which is another object as a rule."""
 
 MILLISECONDS = Metric("milliseconds", "time of one call", "ms", symbol="ms")
 QUERY_MILLISECONDS = replace(

@@ -161,7 +161,7 @@ class Reduction(NamedTuple):
     Modes move the s points that the evidence names in at most 3 s directions. In an orthonormal
     ``basis`` (K + 3 u, r) of these, coefficients ``c = basis @ reduced`` plus a rest that moves no
     such point: the rest keeps its standard normal prior, and the reduced coefficients have one,
-    too. Estimates, costs and determinants are those of all modes. Of several poses, the
+    too. Estimates, costs and determinants are those of all modes. With several poses, the
     displacements of sighted points are modes as well, before the basis is chosen: rows K + 3 j + a
     belong to that along axis a of point ``displaced[j]`` (u,).
     """

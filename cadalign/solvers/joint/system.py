@@ -1,6 +1,6 @@
 """The system of all unknowns: poses, focal lengths, scales and shape from all evidence.
 
-Of one pose, displacements of points are eliminated (see `cadalign.solvers.joint.equations`); of
+With one pose, displacements of points are eliminated (see `cadalign.solvers.joint.equations`); with
 several, they are modes (see `cadalign.solvers.joint.search`), so that poses have no products
 with each other. What is integrated out, coefficients and displacements, leaves its log determinant
 in the objective (see `cadalign.solvers.joint.equations`).

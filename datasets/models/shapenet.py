@@ -37,7 +37,7 @@ class ShapeNetModel:
     """Its OBJ file."""
 
     def load_mesh(self) -> Mesh:
-        """Read its mesh; see `cadalign.datasets.load_mesh`."""
+        """Read its mesh; see `cadalign.load_mesh`."""
         return load_mesh(self.mesh_path)
 
 

@@ -138,7 +138,7 @@ def test_bad_arguments_are_refused() -> None:
         Tracker(CATEGORY, lag=1)
     camera = Camera(640, 480, 600, 600, 319.5, 239.5)
     tracker = Tracker(CATEGORY)
-    with pytest.raises(InputError, match=r"view.time: a tracked view wants one; give seconds"):
+    with pytest.raises(InputError, match=r"view.time: a tracked view needs one; give seconds"):
         tracker.update(View(camera))
     tracker.update(View(camera, time=1.0))
     with pytest.raises(InputError, match=r"view.time: 0.5 is not later than 1.0"):

@@ -381,14 +381,14 @@ def requests() -> list[Request]:
         Request(
             "a mask, `Model` without a mesh",
             "keypoints have no outline",
-            "views[0].mask: the model has no mesh, which a mask wants; "
-            "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))",
+            "views[0].mask: the model has no mesh, which a mask needs; "
+            "give it: Model(..., mesh=cadalign.load_mesh(path))",
             lambda: align(Model(points_3d=POINTS), _seen(mask=mask)),
         ),
         Request(
             "a mask, `ShapeModel` without the mesh of any training model",
             "keypoints have no outline",
-            "views[0].mask: no training model has a mesh, which a mask wants; "
+            "views[0].mask: no training model has a mesh, which a mask needs; "
             "learn it from a data set with meshes, such as KeypointNet beside ShapeNet's models",
             lambda: align(learned, _seen(mask=mask)),
         ),

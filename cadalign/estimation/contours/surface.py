@@ -161,14 +161,14 @@ class SurfaceChoice(NamedTuple):
 def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> SurfaceChoice:
     """Surfaces for a shape whose keypoints are about ``points_3d`` (m, 3), the nearest first.
 
-    Raises InputError where there is no mesh, which the mask or photo ``where`` wants; DataError if
+    Raises InputError where there is no mesh, which the mask or photo ``where`` needs; DataError if
     one cannot be read.
     """
     wanting = "a photo" if where.endswith("image") else "a mask"
     if isinstance(model, Model):
         if model.mesh is None:
-            fix = "give it: Model(..., mesh=cadalign.datasets.load_mesh(path))"
-            raise InputError(f"the model has no mesh, which {wanting} wants", where=where, fix=fix)
+            fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
+            raise InputError(f"the model has no mesh, which {wanting} needs", where=where, fix=fix)
         if model.shape_sigma is None:
             return SurfaceChoice([RigidSurface(model.mesh)], [])
         points = cast(FloatArray, model.points_3d)
@@ -193,7 +193,7 @@ def _nearest_with_mesh(
         rows = [row for row, path in enumerate(training.mesh_paths) if path is not None]
     if training is None or not rows:
         fix = "learn it from a data set with meshes, such as KeypointNet beside ShapeNet's models"
-        what = f"no training model has a mesh, which {wanting} wants"
+        what = f"no training model has a mesh, which {wanting} needs"
         raise InputError(what, where=where, fix=fix)
     gaps = training.points_3d[rows].astype(np.float64) - points_3d
     squares = (gaps**2).sum(axis=2)

@@ -150,7 +150,7 @@ class Tracker:
             If the view has no time, or one that is not later than the last.
         """
         if view.time is None:
-            raise InputError("a tracked view wants one", where="view.time", fix="give seconds")
+            raise InputError("a tracked view needs one", where="view.time", fix="give seconds")
         if self._views and float(view.time) <= float(self._views[-1].time or 0.0):
             what = f"{view.time} is not later than {self._views[-1].time}, that of the last view"
             raise InputError(what, where="view.time")

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from cadalign.render.scene import Scene
 
 MAX_STEP = 0.01
-"""Share of a diameter: how far rotations about an axis of symmetry move the model's points at most."""
+"""How far turns about an axis of symmetry move the model's points at most, over its diameter."""
 VSD_DELTA = 15.0
 """Tolerance of the visibility test [mm]."""
 TAUS = tuple(np.arange(0.05, 0.51, 0.05).round(2).tolist())

@@ -47,7 +47,7 @@ from cadalign.shapes.model import ShapeModel
 
 ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
-_OUTLINED = frozenset({MASK, IMAGE})  # evidence about the model's outline, which wants a mesh
+_OUTLINED = frozenset({MASK, IMAGE})  # evidence about the model's outline, which needs a mesh
 _RIM = 2  # width of a mask's rim [px]
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 

@@ -43,7 +43,7 @@ class _Look:
 def read_gltf(path: Path) -> Mesh:
     """Read a glTF or GLB file as one mesh, each node placed by its transform.
 
-    `cadalign.datasets.load_mesh` is the public way to it.
+    `cadalign.load_mesh` is the public way to it.
 
     Raises
     ------

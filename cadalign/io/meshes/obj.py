@@ -45,7 +45,7 @@ class _Statements:
 
 
 def read_obj(path: Path) -> Mesh:
-    """Read an OBJ file; `cadalign.datasets.load_mesh` is the public way to it.
+    """Read an OBJ file; `cadalign.load_mesh` is the public way to it.
 
     Polygons are cut into fans of triangles, and `Mesh.polygon` holds the number of the ``f`` line
     that a triangle comes from. Lines and points (``l``, ``p``) have no number. Normals, groups,

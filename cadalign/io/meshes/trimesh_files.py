@@ -28,7 +28,7 @@ _MAX_HEADER_LINES = 1000
 
 
 def read_ply(path: Path) -> Mesh:
-    """Read a PLY file, ASCII or binary; `cadalign.datasets.load_mesh` is the public way to it."""
+    """Read a PLY file, ASCII or binary; `cadalign.load_mesh` is the public way to it."""
     data = read_bytes(path)
     with _parsing(path):
         header = _header(data, path)

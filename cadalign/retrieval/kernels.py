@@ -39,8 +39,8 @@ _HOPELESS_EXCESS = 20.0
 _SAME_CHORD = 1e-3
 # A start is also given up if its linearised cost, from which the quadratic model's decrease is
 # subtracted so many times, exceeds the ceiling by this factor. Among 39,000 candidates of four
-# queries 5 that were below the ceiling lost likelihood by that, 2e-7 of the best one's at most; with
-# the factor 1 it was 26, and 2e-3.
+# queries 5 below the ceiling lost likelihood by that, 2e-7 of the best one's at most; with the
+# factor 1 it was 26, and 2e-3.
 _OPTIMISM = 2.0
 _OUT_OF_REACH = 5.0
 

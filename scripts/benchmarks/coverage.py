@@ -26,6 +26,9 @@ _KINDS = ("fit", "sigma=None", "20 % outliers", "focal", "shape_sigma=.05", "two
 _REGION_SIZES = (5, 6, 8, 12, 30, 100, 200)
 _REGION_CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
 _SHAPE_SIGMA = 0.05
+_STRETCH_SIGMA = 0.2
+_SHAPE_SIGMAS = (0.01, 0.05, 0.1)
+_SIMILAR_SIZES = (6, 12, 30, 60, 200)
 _REGIONS = ("R", "t", "lengths")
 
 Draw = Callable[[np.random.Generator], Problem]
@@ -48,6 +51,7 @@ class Coverage:
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         yield RatioTable("Truths within nominal 68, 95 %", list(self._regions(given.seed)))
+        yield RatioTable("Similar models, more and more keypoints", list(self._similar(given.seed)))
         yield RatioTable("Errors within the 95 % ellipsoid", list(self._coverage(given.seed)))
         title = "Large errors without a warning, and misfits found"
         yield RatioTable(title, list(self._warnings(given.seed)))
@@ -68,6 +72,29 @@ class Coverage:
                         shares = (percent(levels <= share) for share in (0.68, 0.95))
                         row[name] = ", ".join(f"{share:.0f}" for share in shares)
                 yield row
+
+    def _similar(self, seed: int) -> Iterator[Row]:
+        """Bias of the distance, in stated standard deviations, rotations and translations."""
+        for stretch in ("free", "none"):
+            for shape_sigma in _SHAPE_SIGMAS:
+                for points in _SIMILAR_SIZES:
+                    found = []
+                    for number in range(self.region_problems):
+                        rng = np.random.default_rng([seed, points, number])
+                        similar = attempt(_similar_estimate, rng, shape_sigma, stretch, points)
+                        if similar is not None:
+                            found.append(similar)
+                    bias, stated, turn, level = np.array(found).T
+                    within = ", ".join(f"{percent(level <= p):.0f}" for p in (0.68, 0.95))
+                    yield {
+                        "stretch": stretch,
+                        "shape_sigma": shape_sigma,
+                        "keypoints": points,
+                        "log distance": float(bias.mean()),
+                        "stated": float(np.sqrt((stated**2).mean())),
+                        "R deg": float(np.median(turn)),
+                        "t within 68, 95 %": within,
+                    }
 
     def _coverage(self, seed: int) -> Iterator[Row]:
         for sigma, loss in ((self.noise_px, "linear"), (None, "linear"), (None, "cauchy")):
@@ -141,6 +168,35 @@ def _estimated(
     elif kind == "focal":
         camera, options["focal"] = Camera.without_focal(640, 480), "estimate"
     return cadalign.fit(model, seen[0], camera, **options), truth
+
+
+def _similar_estimate(
+    rng: np.random.Generator, shape_sigma: float, stretch: str, points: int
+) -> tuple[float, float, float, float]:
+    """Error of the log distance and its standard deviation, rotation error, region of t.
+
+    The truth is drawn from the priors that are stated.
+    """
+    model = rng.uniform(-0.5, 0.5, (points, 3))
+    logs = rng.normal(0, _STRETCH_SIGMA, 2) if stretch == "free" else np.zeros(2)
+    scale = np.array([1.0, *np.exp(logs)])
+    turn = Rotation.random(random_state=rng).as_matrix()
+    truth = Alignment(turn, rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0)), scale)
+    moved = model + rng.normal(0, shape_sigma, model.shape)
+    seen = _REGION_CAMERA.project(truth.apply(moved)) + rng.normal(0, 1, (points, 2))
+    prior: dict[str, Any] = {"stretch_sigma": _STRETCH_SIGMA} if stretch == "free" else {}
+    own = Model(
+        points_3d=model, shape_sigma=shape_sigma, stretch=None if prior else "none", **prior
+    )
+    result = cadalign.align(own, View(_REGION_CAMERA, seen, sigma=1.0))
+    distance = np.linalg.norm(truth.translation)
+    along = truth.translation / distance
+    error = np.log(np.linalg.norm(result.alignment.translation) / distance)
+    stated = np.sqrt(along @ result.covariance[3:6, 3:6] @ along) / distance
+    square = _square(result, truth, result.covariance, [3, 4, 5])
+    level = float(probability_within(square, 3, result.degrees_of_freedom))
+    turned = alignment_errors(est=result.alignment, gt=truth)["rotation_error_deg"]
+    return float(error), float(stated), float(turned), level
 
 
 def _regions_reached(result: Result, truth: Alignment) -> list[float]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cadalign import Camera, RansacOptions, ShapeModel, Tracker, View, align
+from cadalign import Camera, Motion, RansacOptions, ShapeModel, Tracker, View, align
 from cadalign.errors import InputError
 from cadalign.estimation.tracks.tracker import TrackUpdate
 from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
@@ -62,6 +62,25 @@ def test_the_newest_frame_is_better_than_frame_by_frame_with_a_shared_shape(seed
     whole = tracker.smooth()
     assert len(whole.views) == 80
     assert tracker.points_3d == pytest.approx(whole.points_3d, abs=0.03)
+
+
+def test_the_strength_of_the_motion_becomes_that_of_the_whole_track() -> None:
+    track = video(1, 80)
+    tracker = Tracker(CATEGORY)
+    strengths = []
+    for view in track.views:
+        tracker.update(view)
+        if tracker._window is not None:
+            strengths.append(tracker._window.prior.strength)
+    motion = tracker.smooth().trajectory.motion
+    whole = motion.strength(np.full(2, np.nan))
+    assert (strengths[0] > 2 * whole).all(), "a few frames do not show it"
+    assert strengths[-1] == pytest.approx(whole, rel=0.3)
+    given = Tracker(CATEGORY, motion=Motion(angular_sigma=20.0))
+    for view in track.views[:20]:
+        given.update(view)
+    assert given._window is not None
+    assert np.degrees(given._window.prior.strength[0]) == pytest.approx(20.0)
 
 
 def test_flipped_frames_and_outliers_do_not_lose_the_object() -> None:

@@ -20,7 +20,7 @@ from cadalign.estimation.search import JointProblem, thresholds
 from cadalign.estimation.tracks.frames import Frames, SuccessiveErrors, candidates_of, weakened
 from cadalign.estimation.tracks.motion import Motion, PoseAt, moved_by
 from cadalign.estimation.tracks.smooth import EstimatedTrack, estimate_track
-from cadalign.estimation.tracks.window import Window, begun_again
+from cadalign.estimation.tracks.window import SeenMotion, Window, begun_again
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
@@ -75,7 +75,7 @@ class Tracker:
     model : Model or ShapeModel
         As for `cadalign.align`.
     motion : Motion or "smooth"
-        As for `cadalign.align`; a strength that is not given is that of the first frames.
+        As for `cadalign.align`; a strength that is not given is that of all frames so far.
     lag : int
         Number of frames in the window, 3 or more.
     ransac : RansacOptions, optional
@@ -114,6 +114,7 @@ class Tracker:
         self._views: list[View] = []
         self._recent: list[View] = []
         self._window: Window | None = None
+        self._seen_motion: SeenMotion
         self._shape: Shape | None = None
         self._contradicting = 0
         self._is_lost = False
@@ -181,10 +182,7 @@ class Tracker:
         elif self._contradicting >= _FORGOTTEN_AFTER:
             self._window = None
             return self._begun(view)
-        while len(window.times) > self._lag:
-            window = window.without_first()
-            self._recent.pop(0)
-        self._window = window
+        self._window = self._shortened(window)
         return self._told(view, inliers, again is not None)
 
     def _begun(self, view: View) -> TrackUpdate:
@@ -214,11 +212,18 @@ class Tracker:
         _, window = window.refined(_ITERATIONS)
         if self._fits(window).mean() < _LEAST_SHARE:
             return nothing
-        while len(window.times) > self._lag:
-            window = window.without_first()
-            self._recent.pop(0)
+        self._seen_motion = SeenMotion.of_first(found.motion)
+        window = self._shortened(window)
         self._window, self._is_lost, self._contradicting = window, False, 0
         return self._told(view, self._agreement(window), True)
+
+    def _shortened(self, window: Window) -> Window:
+        """The window without frames beyond its lag, with what these showed of the motion."""
+        while len(window.times) > self._lag:
+            self._seen_motion = self._seen_motion.after(window)
+            window = window.without_first()
+            self._recent.pop(0)
+        return replace(window, prior=self._seen_motion.prior(window.prior, self._motion))
 
     def _problem(self, views: Sequence[View], frames: Sequence[int]) -> JointProblem:
         lenses = Lenses.of(views, "known", None)

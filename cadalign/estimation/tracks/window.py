@@ -8,13 +8,16 @@ application to planetary landing", 2010).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.tracks.motion import Motion
 from cadalign.solvers.joint.arrow import Arrow, factorize_arrow, invert_arrow
 from cadalign.solvers.joint.evidence import Evidence, Focals, Rig, kept_rows
-from cadalign.solvers.joint.motion import STATE, MotionPrior
+from cadalign.solvers.joint.motion import STATE, MotionPrior, moments
 from cadalign.solvers.joint.tracks import (
     NOTHING_KNOWN,
     Anchor,
@@ -24,6 +27,7 @@ from cadalign.solvers.joint.tracks import (
     refine_path,
 )
 
+_CHANGES = 6.0  # residuals of rotation, and of translation, between two frames
 _LONG = 100.0  # seconds of the motion after which a velocity is unknown
 
 
@@ -52,14 +56,31 @@ class Window:
         cost, path, _ = refine_path(self.system, self.path, max_iterations)
         return cost, replace(self, path=path)
 
-    def newest(self) -> FloatArray:
-        """Covariance (12, 12) of pose and velocity of the last frame."""
+    @cached_property
+    def _covariance(self) -> Arrow | None:
+        """Covariances of frames, of successive ones, and of the border; None if undetermined."""
         _, arrow = equations_of(self.system, self.path)
         for diagonal in range(STATE):
             arrow.blocks[:, diagonal, diagonal] *= 1 + 1e-12
-        if not factorize_arrow(arrow):
+        return invert_arrow(arrow) if factorize_arrow(arrow) else None
+
+    def newest(self) -> FloatArray:
+        """Covariance (12, 12) of pose and velocity of the last frame."""
+        if self._covariance is None:
             return np.full((STATE, STATE), np.inf)
-        return np.asarray(invert_arrow(arrow).blocks[-1])
+        return np.asarray(self._covariance.blocks[-1])
+
+    def first_change(self) -> tuple[FloatArray, FloatArray]:
+        """Squares of the motion's residuals between the first frames, and what is known of them.
+
+        Both (2,) are those of rotation and translation, the first in squared strengths.
+        """
+        if self._covariance is None:
+            return np.zeros(2), np.zeros(2)
+        motion, path = self.system.motion, self.path
+        first = motion._replace(seconds=motion.seconds[:1])
+        squares, variances = moments(first, path.state.poses, path.velocities, self._covariance)
+        return squares * motion.strength**2, np.maximum(_CHANGES - variances, 0.0)
 
     def without_first(self) -> Window:
         """The window without its first frame, which is marginalised."""
@@ -77,6 +98,38 @@ class Window:
             focals=_of_views(self.evidence, kept),
         )
         return replace(self, evidence=evidence, times=self.times[1:], path=later, anchor=anchor)
+
+
+class SeenMotion(NamedTuple):
+    """What frames that have left a window showed of the strength of the motion.
+
+    ``squares`` (2,) are those of residuals of rotation and translation, in squared strengths, and
+    ``told`` (2,) how many numbers the evidence tells of them, in ``frames`` frames.
+    """
+
+    squares: FloatArray
+    told: FloatArray
+    frames: float
+
+    @classmethod
+    def of_first(cls, prior: MotionPrior) -> SeenMotion:
+        """A motion whose strength the first frames of a track suggest, as one residual would."""
+        frames = 1.0 / prior.told if prior.told > 0 else len(prior.seconds) + 1.0
+        return cls(prior.strength**2, np.ones(2), frames)
+
+    def after(self, window: Window) -> SeenMotion:
+        """The motion with what the first frame of a window adds, which leaves it."""
+        squares, told = window.first_change()
+        return SeenMotion(self.squares + squares, self.told + told, self.frames + 1.0)
+
+    def prior(self, before: MotionPrior, motion: Motion) -> MotionPrior:
+        """The prior of further frames, with the likeliest strengths where these are not given.
+
+        A strength that is too large for the track would let the volume of its paths
+        (`MotionPrior`) drive it away from the camera, and one that is too small towards it.
+        """
+        strength = motion.strength(np.sqrt(self.squares / self.told))
+        return before._replace(strength=strength, told=float(self.told[1] / self.frames))
 
 
 def begun_again(window: Window, pose: FloatArray, evidence: Evidence) -> Window:

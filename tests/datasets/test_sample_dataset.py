@@ -20,6 +20,7 @@ from cadalign.datasets.sample.writer import MAKERS
 from cadalign.errors import CadalignError, DataError, InputError
 
 CATEGORIES = {"bottle": "02876657", "car": "02958343", "chair": "03001627", "vessel": "04530566"}
+MOMENTS = Path(__file__).parents[1] / "fixtures" / "sample_models.json"
 FEWEST_KEYPOINTS = {"bottle": 8, "car": 12, "chair": 10, "vessel": 8}
 
 
@@ -457,3 +458,27 @@ def test_closest_point_of_a_triangle_beats_all_others() -> None:
         others = np.linalg.norm(samples @ triangle[0] - point, axis=1)
         assert found <= others.min() + 1e-12
         assert found >= others.min() - 0.2
+
+
+def moments(model: SampleModel) -> list[float]:
+    """Numbers of vertices and faces; weighted means of places, squares and colours."""
+    vertices = model.mesh.vertices
+    colors = np.asarray(model.mesh.vertex_colors, dtype=float)
+    weights = 1 + np.arange(len(vertices)) % 7  # exchanged vertices differ
+    parts = [vertices, vertices**2, colors[:, :3]]
+    means = [np.average(part, axis=0, weights=weights[: len(part)]) for part in parts]
+    return [len(vertices), len(model.mesh.faces), *np.concatenate(means)]
+
+
+def test_models_are_those_that_results_were_measured_on(models: tuple[SampleModel, ...]) -> None:
+    """`python tests/datasets/test_sample_dataset.py` stores them anew where they are to change."""
+    stored = json.loads(MOMENTS.read_text())
+    assert len(stored) == len(models)
+    for model in models:
+        assert moments(model) == pytest.approx(stored[model.model_id], rel=1e-6, abs=1e-9)
+
+
+if __name__ == "__main__":
+    MOMENTS.write_text(
+        json.dumps({model.model_id: moments(model) for model in sample_models()}) + "\n"
+    )

@@ -23,12 +23,12 @@ from benchmarks.accuracy import Solvers, UnknownFocal, WideLenses
 from benchmarks.annotator import Annotator
 from benchmarks.cameras import PhotoLenses, Scenes
 from benchmarks.cars import NoiseOfDetector, RealDetections
-from benchmarks.clicks import Clicks, OutlineMethods
+from benchmarks.clicks import Clicks, OutlineMethods, ProposalClicks
 from benchmarks.coverage import Coverage
 from benchmarks.gradients import GradientErrors, TorchLayer
 from benchmarks.masks import MaskAlone, Masks
-from benchmarks.photo import Photos
-from benchmarks.retrieval import Retrieval, UnseenRetrieval
+from benchmarks.photo import Photos, PhotoTimes
+from benchmarks.retrieval import MaskRetrieval, Retrieval, UnseenRetrieval
 from benchmarks.runs import Evaluation, Fits, Ransac
 from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Section
 from benchmarks.shapes import Align, FocalShapes, Similar
@@ -55,8 +55,10 @@ SECTIONS: dict[str, type[Section]] = {
     "masks": Masks,
     "mask_alone": MaskAlone,
     "photo": Photos,
+    "photo_times": PhotoTimes,
     "clicks": Clicks,
     "outlines": OutlineMethods,
+    "proposals": ProposalClicks,
     "align": Align,
     "retrieval": Retrieval,
     "evaluation": Evaluation,
@@ -64,6 +66,7 @@ SECTIONS: dict[str, type[Section]] = {
     "detections": RealDetections,
     "ransac": Ransac,
     "unseen_retrieval": UnseenRetrieval,
+    "mask_retrieval": MaskRetrieval,
     "similar": Similar,
     "torch": TorchLayer,
     "gradients": GradientErrors,
@@ -71,8 +74,8 @@ SECTIONS: dict[str, type[Section]] = {
     "tracks": Tracks,
 }
 ON_REQUEST = (
-    *("mask_alone", "photo", "clicks", "outlines"),
-    *("detections", "unseen_retrieval", "similar", "tracks"),
+    *("mask_alone", "photo", "photo_times", "clicks", "outlines", "proposals"),
+    *("detections", "unseen_retrieval", "mask_retrieval", "similar", "tracks"),
 )
 STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2

@@ -141,8 +141,17 @@ def mirrored(state: PhotoState, *, pair: Index) -> ActionOutcome:
     return place_keypoint(state, keypoint=_registered(state, point, MIRRORED))
 
 
-def suggested(state: PhotoState, *, pair: Index | None = None) -> ActionOutcome:
-    """Place the suggested keypoint, by preference of the given pair."""
+def suggested(
+    state: PhotoState,
+    *,
+    pair: Index | None = None,
+    uv: Point2 | None = None,
+    snap: NotNegative = 0.0,
+) -> ActionOutcome:
+    """Place the suggested keypoint, by preference of the given pair; at ``uv``, both its halves.
+
+    See `move` for ``snap``.
+    """
     _, suggestion = state.session.live(state)
     if suggestion is None:
         what = "there is no suggested keypoint yet"
@@ -150,7 +159,12 @@ def suggested(state: PhotoState, *, pair: Index | None = None) -> ActionOutcome:
     keypoint = suggestion.point.semantic_id
     if keypoint is None:
         keypoint = state.model.registry.add(suggestion.point)
-    return place_keypoint(state, keypoint=keypoint, pair=pair)
+    if uv is None:
+        return place_keypoint(state, keypoint=keypoint, pair=pair)
+    place, message = _snapped(uv, snap, state)
+    number = state.document.next_number
+    state.record(state.document.append(Pair(number, place, keypoint)))
+    return ActionOutcome(number, message)
 
 
 def move(

@@ -9,14 +9,15 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.annotate.estimate import LEAST_JOINT_PAIRS, LEAST_PAIRS, Known, LiveAlignment
+from cadalign.annotate.candidates import Candidate
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.lines import Wireframe, box_lines
 from cadalign.annotate.models import KeypointRegistry, ObjectShape
+from cadalign.annotate.problem import LEAST_JOINT_PAIRS, LEAST_PAIRS, Known
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
@@ -55,7 +56,7 @@ def live_alignment(
     assert problem is not None
     counts = known_points(shape, points)
     free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
-    lines, carried = _warped(wireframe, result, problem.model, known, free)
+    lines, carried = _warped(wireframe, result, result.ids, problem.model, known, free)
     camera = result.cameras[place]
     residuals = np.empty((len(points), 2))
     residuals[counts] = result.views[place].residuals
@@ -73,6 +74,7 @@ def live_alignment(
         residuals=residuals,
         outliers={int(rows[row]): off for row, off in judged.contradicting(place).items()},
         wireframe=lines,
+        frames=_frames(estimate, known, wireframe, problem.model),
         prior_lengths=(
             np.array([0.0, prior, prior]) if shape is None else shape.length_sigmas(problem.model)
         ),
@@ -80,10 +82,16 @@ def live_alignment(
     )
 
 
-def candidates_of(result: Result) -> list[tuple[Alignment, float]]:
-    """Alignments that the evidence cannot tell apart, and their likelihoods over the first's."""
-    others = ((each.alignment, each.relative_likelihood) for each in result.alternatives)
-    return [(result.alignment, 1.0), *others]
+def _frames(
+    live: LiveAlignment, known: Known, wireframe: Wireframe, model: Model | ShapeModel
+) -> tuple[Wireframe, ...]:
+    """The model's lines warped to each of the mask's candidates that are left, if several are."""
+    candidates, left = live.candidates, np.flatnonzero(live.chances)
+    if candidates is None or len(left) < 2:
+        return ()
+    ids, nothing = candidates.result.ids, np.empty((0, 3))
+    every = (candidates.every[number] for number in left)
+    return tuple(_warped(wireframe, each, ids, model, known, nothing)[0] for each in every)
 
 
 def known_points(shape: ObjectShape | None, points: Sequence[ModelKeypoint]) -> BoolArray:
@@ -119,7 +127,12 @@ def _assumed_text(photos: tuple[str, ...], camera: Camera) -> str:
 
 
 def _warped(
-    wireframe: Wireframe, result: Result, model: Model | ShapeModel, known: Known, free: FloatArray
+    wireframe: Wireframe,
+    result: Result | Candidate,
+    ids: Sequence[Any],
+    model: Model | ShapeModel,
+    known: Known,
+    free: FloatArray,
 ) -> tuple[Wireframe, FloatArray]:
     """The model warped such that its known keypoints come to the estimated ones, with points."""
     if known.shape is None:
@@ -127,8 +140,8 @@ def _warped(
     if isinstance(model, Model):
         source, target = np.asarray(model.points_3d), result.points_3d
     else:
-        rows = [row for row, label in enumerate(result.ids) if label in known.anchors]
-        source = np.array([known.anchors[result.ids[row]].xyz for row in rows])
+        rows = [row for row, label in enumerate(ids) if label in known.anchors]
+        source = np.array([known.anchors[ids[row]].xyz for row in rows])
         target = result.points_3d[rows]
     return wireframe.warped(source, target, result.bounds, carried=free)
 
@@ -139,7 +152,7 @@ def drawing_of(
     """Box and edges of the model and, for an own shape, its keypoints with regions that hold them.
 
     Regions of keypoints that the model lacks are the faint ones. There are none in another view
-    than the first.
+    than the first, nor while several of the mask's candidates are left.
     """
     result, lines = live.result, live.wireframe
     assert result is not None
@@ -151,7 +164,7 @@ def drawing_of(
         "regions": [],
         "faint_regions": [],
     }
-    if shape is None or live.place:
+    if shape is None or live.place or live.frames:
         return drawing
     in_camera = result.alignment.apply(result.points_3d)
     names = {shape.id_of(point): (point.name, number in used) for number, point in registry}

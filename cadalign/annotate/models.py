@@ -190,6 +190,14 @@ class ObjectShape:
         """The noun that the object is compared with in a sentence."""
         return "the model" if self.learned is None else f"the average {self.learned.category}"
 
+    @property
+    def has_mesh(self) -> bool:
+        """True if masks say something of the shape; a similar model has its mesh."""
+        if self.learned is None:
+            return True
+        training = self.learned.training
+        return training is not None and any(path is not None for path in training.mesh_paths)
+
     def id_of(self, point: ModelKeypoint) -> KeypointId | None:
         """The id of a model's point in the estimate; None for one that was not learned."""
         if self.learned is None:

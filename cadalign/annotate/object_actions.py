@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, FurtherView, History, Pair, Priors
-from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import (
     ChosenStart,
     FurtherEvidence,
@@ -22,11 +21,11 @@ from cadalign.annotate.evidence import (
     find_up,
 )
 from cadalign.annotate.files import AnnotationFiles
-from cadalign.annotate.live import candidates_of
 from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.names import object_file, object_number
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.photos import FocalChoice
+from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Count, Finite, Index, Point2, Positive, Text
 
@@ -341,11 +340,11 @@ def begin_at(state: PhotoState, *, candidate: Index | None = None) -> None:
         state.mark(start=None)
         return
     live, _ = state.session.live(state)
-    known = [] if live.result is None else candidates_of(live.result)
+    known = () if live.candidates is None else live.candidates.every
     if candidate >= len(known):
         what = f"there is no candidate {candidate}"
         raise InputError(what, where="candidate", fix="reload the page")
-    state.mark(start=ChosenStart.of(known[candidate][0]))
+    state.mark(start=ChosenStart.of(known[candidate].alignment))
 
 
 OBJECT_ACTIONS = (

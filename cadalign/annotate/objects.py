@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from cadalign.annotate.candidates import Candidates
 from cadalign.annotate.document import AnnotationDocument, History, Pair, Pixel
-from cadalign.annotate.estimate import LEAST_JOINT_PAIRS, LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.evidence import FurtherEvidence, MaskDrawing, draw_mask
 from cadalign.annotate.files import AnnotationFiles, written_half
 from cadalign.annotate.models import OpenedModel, Proposal
 from cadalign.annotate.names import file_name, mask_file, object_number
 from cadalign.annotate.photos import Intrinsics, PhotoFile
+from cadalign.annotate.problem import LEAST_JOINT_PAIRS
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, InputError
@@ -59,6 +61,8 @@ class PhotoState:
         default=None, repr=False
     )
     """The last estimate of the object alone, from all photos, with the document it belongs to."""
+    by_mask: tuple[object, dict[Camera, Candidates]] | None = field(default=None, repr=False)
+    """What the mask alone allows, with what it depends on."""
 
     @property
     def document(self) -> AnnotationDocument:
@@ -137,6 +141,15 @@ class PhotoState:
             for pair in self.document.complete_pairs
             if shape is None or shape.knows(registry[pair.keypoint or 0])
         )
+
+    @property
+    def allowed_by_mask(self) -> dict[Camera, Candidates]:
+        """What the mask alone allows, which is kept until more than pairs changes."""
+        document = self.document
+        key = replace(document.evidence, start=None), document.priors, self.model
+        if self.by_mask is None or self.by_mask[0] != key:
+            self.by_mask = key, {}
+        return self.by_mask[1]
 
     @property
     def begins(self) -> bool:

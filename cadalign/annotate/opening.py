@@ -17,7 +17,6 @@ from cadalign.annotate.document import (
     history_path,
     read_history,
 )
-from cadalign.annotate.estimate import LIKELY_STRETCH
 from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
 from cadalign.annotate.files import AnnotationFiles, StoredView
 from cadalign.annotate.library import ModelChoice
@@ -41,6 +40,7 @@ from cadalign.annotate.photos import (
     intrinsics_of,
     read_camera,
 )
+from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.annotate.proposals import read_proposals, times_of
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, DataError, InputError

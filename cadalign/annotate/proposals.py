@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.annotate.estimate import LEAST_PAIRS
 from cadalign.annotate.models import KeypointRegistry, Proposal
 from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.photos import PhotoFile
+from cadalign.annotate.problem import LEAST_PAIRS
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import CadalignError, DataError, InputError

@@ -13,13 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.annotate.document import AnnotationDocument, history_path, write_history
-from cadalign.annotate.estimate import Known, LiveAlignment, warm_up
+from cadalign.annotate.estimate import LiveAlignment, warm_up
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import known_points, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry, Models, ObjectShape
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.photos import State, WorkList
+from cadalign.annotate.problem import Known
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.result import Result
@@ -175,7 +176,8 @@ class Session:
         is_single = len(observation.views) == 1
         by_photo = observation.init is not None and "image" in observation.fit_options
         is_enough = observation.evidence.mask is not None or by_photo
-        if self.shape is None and is_single and is_enough:
+        has_mesh = self.shape is None or self.shape.has_mesh
+        if has_mesh and is_single and is_enough:
             return ""
         return missing_text(
             known_points(self.shape, [state.model.registry[pair.keypoint or 0] for pair in pairs]),
@@ -231,6 +233,7 @@ class Session:
             estimates_focal=is_estimated,
             focal_prior=owner.document.priors.focal,
             uses_photos=owner.document.evidence.photo,
+            by_mask=owner.allowed_by_mask,
         )
 
     def save(self, state: PhotoState) -> None:

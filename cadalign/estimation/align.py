@@ -23,10 +23,16 @@ from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import JointProblem, find_minima, widened_by_noise
+from cadalign.estimation.search import (
+    JointProblem,
+    find_minima,
+    minima_at_start,
+    widened_by_noise,
+)
 from cadalign.estimation.single import (
     align_plain,
     align_single,
+    begins_at_outline,
     is_mask_alone,
     is_plain,
     is_single,
@@ -204,6 +210,9 @@ def _align_all(
         from cadalign.estimation.contours.proposals import minima_of_mask  # with OpenCV and embree
 
         minima, iterations, hypotheses, mistake = minima_of_mask(problem, model)
+    elif begins_at_outline(model, views, inits):
+        minima, iterations, hypotheses = minima_at_start(problem, inits)
+        mistake = None
     else:
         problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
         mistake = joint_mistake(problem, minima[0], ransac) if minima else None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, cast
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 
@@ -102,7 +103,8 @@ class Track(NamedTuple):
 class Minimum(NamedTuple):
     """An estimate under one component of the prior; ``score`` is -2 log of its probability.
 
-    The state's focal lengths are relative to those of ``lenses``.
+    The state's focal lengths are relative to those of ``lenses``. The score of a mask alone and a
+    model that is only similar is the ``outline_score``.
     """
 
     component: int
@@ -113,6 +115,7 @@ class Minimum(NamedTuple):
     score: float
     lenses: Lenses
     track: Track | None = None
+    outline_score: float | None = None
 
     @property
     def prior_score(self) -> float:
@@ -167,6 +170,29 @@ def minima_at_noise(
         minima = [_relinearised(problem, each) for each in minima]
     minima.sort(key=lambda minimum: minimum.score)
     return minima, iterations, hypotheses
+
+
+def minima_at_start(problem: JointProblem, init: Inits) -> tuple[list[Minimum], int, int]:
+    """As `minima_at_noise`, but at a given start, which too few keypoints would lead astray.
+
+    They are in the minima's evidence, for the outline to be found together with them.
+    """
+    nothing: dict[str, Any] = {
+        "points_2d": (),
+        "ids": None,
+        "sigma": 1.0,
+        "scores": None,
+        "depth": None,
+    }
+    bare = problem._replace(views=[replace(view, **nothing) for view in problem.views])
+    minima, *effort = minima_at_noise(bare, init, None)
+    found = []
+    for each in minima:
+        evidence = problem.evidence(each.evidence.shape, each.lenses)
+        every = np.ones(len(evidence.sightings.point), dtype=bool)
+        score = score_state(evidence, each.state) + each.prior_score
+        found.append(each._replace(inliers=every, evidence=evidence, score=score))
+    return found, effort[0], effort[1]
 
 
 def _starts(

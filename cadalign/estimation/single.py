@@ -45,7 +45,7 @@ _DECISIVE = 10.0  # of -2 log likelihood, times the variance of shapes that were
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
     """True where nothing but the keypoints of one view and an exact model is given."""
-    return isinstance(model, Model) and model.shape_sigma is None and _has_keypoints_alone(views)
+    return _is_own(model) and _has_keypoints_alone(views)
 
 
 def is_single(model: object, views: Sequence[View]) -> bool:
@@ -62,6 +62,23 @@ def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignmen
     view = views[0]
     is_alone = len(views) == 1 and inits[0] is None and not len(view.keypoint_ids)
     return is_alone and view.mask is not None
+
+
+def begins_at_outline(
+    model: object, views: Sequence[View], inits: Sequence[Alignment | None]
+) -> bool:
+    """True where a start is given for a mask or photo, and too few keypoints to refine it by.
+
+    The own model is refined by them, as its pose stays near where they leave it open.
+    """
+    if len(views) > 1 or inits[0] is None or _is_own(model):
+        return False
+    few = 0 < len(views[0].keypoint_ids) < _LEAST_POINTS
+    return few and (views[0].mask is not None or views[0].image is not None)
+
+
+def _is_own(model: object) -> bool:
+    return isinstance(model, Model) and model.shape_sigma is None
 
 
 def _has_keypoints_alone(views: Sequence[View]) -> bool:

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from benchmarks.photo import PhotoClicks, bop_cases
-from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, clocked, summary
-from cadalign import Model, View, align
+from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, clocked, spread, summary
+from cadalign import Camera, Model, View, align
+from cadalign.annotate.candidates import Candidates, best_click
+from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.metrics import nearest_truth
 from cadalign.metrics import rotation_error
-from cadalign.render import Scene, cast_geometry
+from cadalign.render import Scene, cast_geometry, sample_view
 
 _FEWEST = 3
+_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+_CLICK_PX = 2.0
+_SIMILAR_DEG = 30.0
 _MARGIN = 0.05  # of a box that is dragged around an object, relative to its larger side
 _BAND = 0.1  # about an estimated outline, relative to the larger side of its box
 _GRAB_ROUNDS = 5
@@ -115,6 +123,104 @@ class OutlineMethods:
                     found[f"{case.group}, {name}"].append(row)
         rows = [{"photos": name, **summary(each)} for name, each in found.items()]
         yield RatioTable("rough clicks refined, rigid models: medians", rows)
+
+
+@dataclass
+class ProposalClicks:
+    """Clicks that tell apart what a mask allows of a model that is only similar.
+
+    Photos of sample models, stretched by 0.74 to 1.35, exact masks, and the next model of the
+    category with the keypoints that both have. The clicks, off by 2 px, are those that the
+    annotator asks for, on visible keypoints, until one alignment is left. Right is a rotation
+    within 30 degrees, up to the object's symmetry.
+    """
+
+    models: int = 4
+    """Models of each category."""
+    views: int = 2
+    """Views of every model."""
+    shape_sigma: float = 0.06
+    """Standard deviation of a keypoint on the object about the model's [model units]."""
+    categories: tuple[str, ...] = ("bottle", "car", "chair", "vessel")
+    """Categories of the sample."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        found: dict[str, list[Row]] = defaultdict(list)
+        with tempfile.TemporaryDirectory() as folder:
+            sample = write_sample_dataset(Path(folder) / "sample", per_category=self.models)
+            for category in self.categories:
+                models = [each for each in KeypointNet(sample) if each.category == category]
+                for number, own in enumerate(models):
+                    other = models[(number + 1) % len(models)]
+                    for view in range(self.views):
+                        rng = np.random.default_rng([given.seed, 5, number, view])
+                        found[category].append(self._clicked(own, other, rng))
+        every = [row for rows in found.values() for row in rows]
+        table = [_told(name, rows) for name, rows in {**found, "all": every}.items()]
+        yield RatioTable("clicks among what a mask allows of a similar model", table)
+
+    def _clicked(self, own: AnnotatedModel, other: AnnotatedModel, rng: np.random.Generator) -> Row:
+        """Click until one alignment is left."""
+        scene, scale = Scene(own.load_mesh()), np.exp([0.0, *rng.uniform(-0.3, 0.3, 2)])
+        how = {"rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
+        view = sample_view(scene, own.keypoints.xyz, _CAMERA, min_visible=4, **how)
+        gt = view.cam_from_model
+        pixels = _CAMERA.project(gt.apply(own.keypoints.xyz))
+        places = dict(zip(own.keypoints.ids.tolist(), pixels, strict=True))
+        visible = set(own.keypoints.ids[view.visible].tolist())
+        ids, points = other.keypoints.ids.tolist(), other.keypoints.xyz
+        model = Model(
+            points_3d=points, ids=ids, mesh=other.load_mesh(), shape_sigma=self.shape_sigma
+        )
+        mask = cast_geometry(scene, _CAMERA, gt).mask
+        wall, _, result = clocked(lambda: align(model, View(_CAMERA, mask=mask)))
+        candidates = Candidates.of(model, _CAMERA, result)
+        predicted = candidates.predicted(ids, points)
+        chances = candidates.probabilities((), np.empty((0, 3)), np.empty((0, 2)))
+        first, clicked = int(np.count_nonzero(chances)), list[int]()
+        while np.count_nonzero(chances) > 1:
+            free = np.array([label in visible and label not in clicked for label in ids])
+            row = best_click(chances, *predicted, np.tile(free, (len(chances), 1)))
+            if row is None:
+                break
+            clicked.append(ids[row])
+            seen = np.array([places[label] for label in clicked])
+            seen += rng.normal(0, _CLICK_PX, seen.shape)
+            chances = candidates.probabilities(clicked, np.empty((len(clicked), 3)), seen)
+        right = np.array([_is_right(each.alignment, gt, own) for each in candidates.every])
+        return {
+            "first": bool(right[0]),
+            "among": bool(right.any()),
+            "candidates": first,
+            "clicks": len(clicked),
+            "settled": bool(np.count_nonzero(chances) == 1),
+            "refused": bool(not chances.any()),
+            "right": bool(right[chances > 0].any() and np.count_nonzero(chances) == 1),
+            "seconds": wall,
+        }
+
+
+def _is_right(est: Alignment, gt: Alignment, model: AnnotatedModel) -> bool:
+    nearest = nearest_truth(est=est, gt=gt, symmetry=model.symmetry)
+    return bool(rotation_error(est=est, gt=nearest) < _SIMILAR_DEG)
+
+
+def _told(name: str, rows: list[Row]) -> Row:
+    """Shares and numbers of clicks where several were allowed; `None` without any."""
+    several = [row for row in rows if row["candidates"] > 1]
+    clicks = [row["clicks"] for row in several if row["settled"]]
+    return {
+        "objects": name,
+        "count": len(rows),
+        "right first": np.mean([row["first"] for row in rows]),
+        "right among": np.mean([row["among"] for row in rows]),
+        "several": len(several),
+        "clicks": spread(clicks) if clicks else None,
+        "one left": len(clicks),
+        "none left": sum(row["refused"] for row in several),
+        "right left": sum(row["right"] for row in several),
+        "seconds": float(np.median([row["seconds"] for row in rows])),
+    }
 
 
 def _by_clicks(clicks: PhotoClicks) -> Alignment:

@@ -18,16 +18,19 @@ from scipy.stats import chi2
 from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, clocked, summary
 from cadalign import Camera, Mesh, Model, Result, View, align
 from cadalign.arrays import FloatArray
-from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
+from cadalign.datasets import AnnotatedModel, KeypointNet, load_mesh, write_sample_dataset
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
-from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.images import read_photo
 from cadalign.metrics import rotation_error
 from cadalign.render import RaycastRenderer, Scene, Studio, cast_geometry, sample_view
 
 _CAMERA = Camera(640, 480, 800.0, 800.0, 319.5, 239.5)
+_LARGE = Camera(1632, 1224, 2040.0, 2040.0, 815.5, 611.5)
+_TURN_DEG, _SHIFT = 2.0, 0.01  # from frame to frame of a clip, relative to the distance
+_LOST_DEG = 10.0
 _CLICKS = 6
 _CLICK_SHARE = 4.0 / 640.0  # standard deviation of a click, relative to the photo's width
 _STRETCH_SIGMA = 0.3
@@ -64,6 +67,39 @@ class Photos:
             title = "an unknown stretch" if stretched else "a rigid model"
             table = [{"photos": name, **summary(found)} for name, found in rows.items()]
             yield RatioTable(f"photos beside rough clicks, {title}: medians", table)
+
+
+@dataclass
+class PhotoTimes:
+    """Time that a photo takes beyond the keypoints, and of a track by photos alone.
+
+    Composites of 2 megapixels with six rough clicks; and a clip of 640 x 480 px in which an object
+    turns by 2 degrees and moves by 1 % of its distance from frame to frame, each frame aligned from
+    the pose of the last by its photo alone.
+    """
+
+    composites: int = 12
+    """Composites of 2 megapixels."""
+    frames: int = 40
+    """Frames of each clip; there is one of each category."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        rows: dict[str, list[Row]] = defaultdict(list)
+        for number, case in enumerate(_composites(given, self.composites, _LARGE)):
+            for stretched in (False, True):
+                rng = np.random.default_rng([given.seed, 7, number])
+                clicks = case.clicked(rng, stretched=stretched)
+                clicks.aligned()
+                row = _compared(clicks)
+                names = ("R clicks", "R photo", "seconds")
+                rows["stretched" if stretched else "rigid"].append({n: row[n] for n in names})
+        table = []
+        for name, found in rows.items():
+            late = float(np.percentile([row["seconds"] for row in found], 90))
+            table.append({"model": name, **summary(found), "seconds, 90 %": late})
+        yield RatioTable("photos of 2 megapixels beside six clicks: medians", table)
+        clips = list(_clip_rows(given, self.frames)) if self.frames else []
+        yield RatioTable("a track by photos of 640 x 480 px", clips)
 
 
 def _compared(clicks: PhotoClicks) -> Row:
@@ -217,8 +253,10 @@ def _rigid(rotation: FloatArray, translation: FloatArray) -> Alignment:
 # Composites ---------------------------------------------------------------------------------------
 
 
-def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
-    """Models of ShapeNet and of the sample, rendered before real photos; some partly hidden."""
+def _scenery(
+    given: BenchmarkData, camera: Camera
+) -> tuple[list[tuple[AnnotatedModel, Scene]], list[np.ndarray]]:
+    """Models of ShapeNet and of the sample, and real photos of a camera's size."""
     root = given.needed().parent
     with tempfile.TemporaryDirectory() as folder:
         sample = list(KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=2)))
@@ -226,12 +264,19 @@ def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
         models = [m for m in real if m.mesh_path.suffix == ".obj"] + sample
         scenes = [(m, Scene(m.load_mesh())) for m in models]
     photos = sorted((root / "sfm").rglob("*.jpg")) + sorted((root / "real").rglob("rgb/*.png"))
-    behind = [cv2.resize(read_photo(p), (640, 480), interpolation=cv2.INTER_AREA) for p in photos]
+    size = camera.width, camera.height
+    behind = [cv2.resize(read_photo(p), size, interpolation=cv2.INTER_AREA) for p in photos]
+    return scenes, behind
+
+
+def _composites(given: BenchmarkData, count: int, camera: Camera = _CAMERA) -> Iterator[PhotoCase]:
+    """Models of ShapeNet and of the sample, rendered before real photos; some partly hidden."""
+    scenes, behind = _scenery(given, camera)
     for number in range(count):
         rng = np.random.default_rng([given.seed, number])
         model, scene = scenes[number % len(scenes)]
         how: dict[str, Any] = {"min_visible": 0, "fill": (0.4, 0.8), "roll": 15.0}
-        view = attempt(sample_view, scene, model.keypoints.xyz, _CAMERA, rng=rng, **how)
+        view = attempt(sample_view, scene, model.keypoints.xyz, camera, rng=rng, **how)
         if view is None:
             continue
         pixels = behind[rng.integers(len(behind))]
@@ -240,16 +285,58 @@ def _composites(given: BenchmarkData, count: int) -> Iterator[PhotoCase]:
         light = rng.normal(size=3) * [1, 0.6, 0.3] + [0, -0.6, -0.7]
         studio = Studio(key=tuple(light / np.linalg.norm(light)), key_power=rng.uniform(0.3, 0.8))
         renderer, truth = RaycastRenderer(studio=studio), view.cam_from_model
-        frame = renderer.render(scene, _CAMERA, truth, samples=8)
+        frame = renderer.render(scene, camera, truth, samples=8)
         drawn = frame.composite(np.ascontiguousarray(pixels))
         is_hidden = number % 4 == 3
         if is_hidden:
             drawn = _hidden(drawn, frame.mask, behind[rng.integers(len(behind))], rng)
-        drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
-        noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
-        photo = np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        photo = _blurred(drawn, rng)
         kind = "hidden" if is_hidden else "clear"
-        yield PhotoCase("composite", _CAMERA, photo, scene.mesh, truth, kind, model.symmetry)
+        yield PhotoCase("composite", camera, photo, scene.mesh, truth, kind, model.symmetry)
+
+
+def _blurred(drawn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A photo with blur and noise of its own."""
+    drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
+    noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
+    return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+
+
+def _clip_rows(given: BenchmarkData, frames: int) -> Iterator[Row]:
+    """A clip of each category: the time of a frame by its photo alone, and its errors."""
+    scenes, behind = _scenery(given, _CAMERA)
+    by_category = {model.category: (model, scene) for model, scene in scenes}
+    for number, (model, scene) in enumerate(by_category.values()):
+        rng = np.random.default_rng([given.seed, 8, number])
+        how: dict[str, Any] = {"min_visible": 0, "fill": (0.4, 0.6), "roll": 15.0}
+        view = sample_view(scene, model.keypoints.xyz, _CAMERA, rng=rng, **how)
+        truth, pixels = view.cam_from_model, behind[rng.integers(len(behind))]
+        axis = rng.normal(size=3)
+        turn = rotation_from_vector(np.radians(_TURN_DEG) * axis / np.linalg.norm(axis))
+        own, last = Model(mesh=scene.mesh, stretch="none"), truth
+        times, errors = [], []
+        for frame in range(frames):
+            shift = rng.normal(0, _SHIFT, 3) * np.linalg.norm(view.cam_from_model.translation)
+            place = view.cam_from_model.translation + shift * [1, 1, 0]
+            truth = Alignment(turn @ truth.rotation, place, np.ones(3))
+            drawn = RaycastRenderer().render(scene, _CAMERA, truth, samples=4).composite(pixels)
+            photo = View(_CAMERA, image=_blurred(drawn, rng))
+            wall, _, result = clocked(partial(attempt, align, own, photo, init=last))
+            last = truth if result is None else result.alignment
+            error = rotation_error(est=last, gt=truth)
+            if frame:
+                times.append(1e3 * wall)
+                errors.append(error)
+            if error > _LOST_DEG:
+                last = truth
+        yield {
+            "model": model.category,
+            "frames": len(times),
+            "ms": float(np.median(times)),
+            "ms, 90 %": float(np.percentile(times, 90)),
+            "R": float(np.median(errors)),
+            "lost": int((np.array(errors) > _LOST_DEG).sum()),
+        }
 
 
 def _hidden(

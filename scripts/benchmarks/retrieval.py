@@ -16,19 +16,23 @@ import numpy as np
 
 from benchmarks import section
 from benchmarks.section import BenchmarkData, RatioTable, Row
-from cadalign import Box, Library, Observation, ShapeModel
-from cadalign.datasets import KeypointNet
+from cadalign import Box, Camera, Library, Observation, ShapeModel
+from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.geometry.metrics import box_iou_up_to_scale
+from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval import LibraryModel, Match
 from cadalign.retrieval.absence import SAME_SHAPE, shape_distance
+from cadalign.retrieval.by_mask import MOST_ALIGNED
 from cadalign.retrieval.models import ModelKey
 
 _KEYPOINTS = 8
 _CALLS = 3
 _LEAST_SHARED = 4
 _FLAT = 1e-9
+_MASK_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+_SAMPLE_CATEGORIES = 4
 
 
 @dataclass
@@ -143,6 +147,69 @@ def _observed(
 
 def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
     return library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
+
+
+@dataclass
+class MaskRetrieval:
+    """Retrieval by an exact mask alone: recall and time, among growing libraries.
+
+    The models are ShapeNet's and those of the sample generator. Queries are models of the library,
+    stretched along y and z by 0.5 to 2, in random views of 640 x 480 px. Outlines are compared with
+    the mask's, which is the cheap stage, and the best few models aligned. The first
+    query makes the outlines, which the library keeps, and does not count in the other columns.
+    """
+
+    sizes: tuple[int, ...] = (100, 1000)
+    """Models of the libraries."""
+    queries: int = 30
+    """Queries per library."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        with tempfile.TemporaryDirectory() as folder:
+            count = -(-max(self.sizes) // _SAMPLE_CATEGORIES)
+            sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=count))
+            models = [model for model in sample if model.mesh_path is not None]
+            if given.keypointnet is not None:
+                real = (m for m in KeypointNet(given.keypointnet) if m.mesh_path is not None)
+                models = [*(m for m in real if m.mesh_path.suffix == ".obj"), *models]
+            order = np.random.default_rng(given.seed).permutation(len(models)).tolist()
+            for size in self.sizes:
+                chosen = [models[k] for k in order[:size]]
+                yield RatioTable(
+                    f"by a mask alone, {size:,} models", [self._queried(chosen, given)]
+                )
+
+    def _queried(self, models: Sequence[AnnotatedModel], given: BenchmarkData) -> Row:
+        library = Library.from_models([LibraryModel.of_annotated(model) for model in models])
+        found: list[Row] = []
+        first = np.nan
+        for number in range(self.queries + 1):
+            rng = np.random.default_rng([given.seed, 6, number])
+            model = models[int(rng.integers(len(models)))]
+            mask = _stretched_mask(model, rng)
+            query = partial(library.retrieve, mask=mask, camera=_MASK_CAMERA, top=MOST_ALIGNED)
+            wall, _, matches = section.clocked(query)
+            if number == 0:
+                first = wall
+                continue
+            keys = [(match.category, match.model_id) for match in matches]
+            own = (model.category, model.model_id)
+            row: Row = {"first": keys[0] == own, "aligned": own in keys}
+            found.append(row | {"category": keys[0][0] == own[0], "seconds": wall})
+        names = ("first", "aligned", "category")
+        shares = {name: float(np.mean([row[name] for row in found])) for name in names}
+        seconds = section.spread([row["seconds"] for row in found])
+        times = {"first query s": first, "seconds": seconds}
+        return {"models": len(models), "queries": len(found), **shares, **times}
+
+
+def _stretched_mask(model: AnnotatedModel, rng: np.random.Generator) -> np.ndarray:
+    """The mask of a model that is stretched, in a random view."""
+    scene = Scene(model.load_mesh())
+    scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(2.0))])
+    how: dict[str, Any] = {"scale": scale, "fill": (0.6, 0.9), "roll": 10.0, "min_visible": 0}
+    view = sample_view(scene, model.keypoints.xyz, _MASK_CAMERA, rng=rng, **how)
+    return np.asarray(cast_geometry(scene, _MASK_CAMERA, view.cam_from_model).mask)
 
 
 @dataclass

@@ -14,9 +14,10 @@ from support.annotating import Case, place_all, served
 
 from cadalign import Camera, Model, View
 from cadalign.annotate.actions import perform
-from cadalign.annotate.estimate import LIKELY_STRETCH, LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.guard import TOKEN_HEADER
 from cadalign.annotate.page_state import page_state
+from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.annotate.ranking import advice_state
 from cadalign.annotate.session import Session
 from cadalign.annotate.suggestion import evidence_text, left_text, rank

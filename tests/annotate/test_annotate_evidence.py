@@ -12,9 +12,10 @@ from support.annotating import Case, flat, place_all
 
 from cadalign import Size, Symmetry, View, align
 from cadalign.annotate.actions import perform
-from cadalign.annotate.estimate import LIKELY_STRETCH, LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.evidence import FurtherEvidence
 from cadalign.annotate.page_state import page_state
+from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera

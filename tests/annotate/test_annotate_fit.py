@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from support.problems import problem_of
 
 from cadalign import Alignment, Camera, fit
-from cadalign.annotate.estimate import Known, LiveAlignment
+from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.live import facts_of, live_alignment, missing_text, notes_of
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.photos import FocalChoice, Intrinsics
+from cadalign.annotate.problem import Known
 from cadalign.annotate.suggestion import (
     UNKNOWNS,
     NextBest,

@@ -50,7 +50,7 @@ def test_a_mask_alone_is_aligned_and_a_candidate_chosen(
     assert len(shown) == (1 + len(live.result.alternatives) if live.result.alternatives else 0)
 
     perform(session, 0, {"do": "begin_at", "candidate": 0})
-    assert page_state(session, 0)["by_mask"] == {"chosen": True, "candidates": []}
+    assert page_state(session, 0)["by_mask"] == {"chosen": True, "candidates": [], "text": ""}
     again, _ = session.live(session.photos[0])
     assert rotation_error(est=again.alignment, gt=truth) < 0.5
     assert "init" in json.loads(case.observation.read_text())

@@ -234,8 +234,8 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
 def approached(masked: Masked, state: State) -> tuple[State, FloatArray, float] | None:
     """Take the first steps of `settle` from a start that may be far off.
 
-    Returns the state there, the contours' distances (S,) from the rims [px], without the offset
-    that all of a contour has in common, and the reach that these are at most.
+    Returns the state there, the signed distances (S,) of the contours from the rims [px], without
+    the offset that all of a contour has in common, and the reach that these are at most.
     """
     reach = _first_reach(masked, _WIDE_REACH)
     found = _approach(masked, Place.of(state, len(masked.views)), reach)
@@ -244,10 +244,10 @@ def approached(masked: Masked, state: State) -> tuple[State, FloatArray, float] 
     place, noises, _ = found
     look = rims_at(masked, place, reach, is_fine=False)
     residuals = [
-        np.where(rims.found, np.abs(rims.offset + own_offset * noise.offset), reach)
+        np.where(rims.found, rims.offset + own_offset * noise.offset, reach)
         for rims, own_offset, noise in zip(look.rims, place.own[:, 0], noises, strict=True)
     ]
-    return place.state, np.minimum(np.concatenate(residuals), reach), reach
+    return place.state, np.clip(np.concatenate(residuals), -reach, reach), reach
 
 
 def settle_with(

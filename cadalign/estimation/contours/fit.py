@@ -80,7 +80,8 @@ class _Candidate(NamedTuple):
     @property
     def score(self) -> float:
         """-2 log of its probability."""
-        return self.settled.score + self.start.prior_score
+        own, known = self.settled.score + self.start.prior_score, self.start.outline_score
+        return own if known is None or not np.isfinite(own) else known
 
     @property
     def minimum(self) -> Minimum:

@@ -12,10 +12,16 @@ from cadalign.errors import InputError
 from cadalign.estimation.contours.descent import Masked, approached
 from cadalign.estimation.contours.silhouettes import differ, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
-from cadalign.estimation.contours.view_contour import ViewContour, contour_view, cost_of_contour
+from cadalign.estimation.contours.view_contour import (
+    ViewContour,
+    contour_view,
+    correlation_length,
+    cost_of_contour,
+)
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
+from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import TrainingShapes
@@ -37,12 +43,18 @@ class _Proposal(NamedTuple):
     """A minimum near the mask.
 
     The ``misfit`` is the mean distance [px] of the mask's contour from the rim, the ``cost`` the
-    mean of the samples' -log probability density [1/px].
+    mean of the samples' -log probability density [1/px]; neighbouring samples are off alike, so
+    that as many as are ``independent`` count.
     """
 
     minimum: Minimum
     misfit: float
     cost: float
+    independent: float
+
+    def over(self, best: _Proposal) -> float:
+        """-2 log of the likelihood over the best one's, for the fewer independent samples."""
+        return 2 * (self.cost - best.cost) * min(self.independent, best.independent)
 
 
 def minima_of_mask(
@@ -53,7 +65,8 @@ def minima_of_mask(
     The best is the first; then numbers of iterations and of starts, and a mistake to warn of.
 
     For a model that is only similar, and for a learned shape, they are proposals: another shape in
-    another pose has an outline alike.
+    another pose has an outline alike. Their ``outline_score`` is what ranks them: warped to the
+    mask, a model follows it in a wrong pose, too.
 
     Raises InputError if the mask has no contour, the model no mesh, or the focal length is unknown.
     """
@@ -89,8 +102,16 @@ def minima_of_mask(
             f"{_WHERE}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
             "average: the object may be partly hidden, the model another, or the pose wrong"
         )
-    chosen = [each.minimum for each in _chosen(proposals)]
-    return chosen, steps, starts, mistake
+    chosen = _chosen(proposals)
+    if is_exact:
+        return [each.minimum for each in chosen], steps, starts, mistake
+    scores = [each.over(chosen[0]) for each in chosen]
+    likely = [
+        each.minimum._replace(outline_score=score)
+        for each, score in zip(chosen, scores, strict=True)
+        if np.exp(-score / 2) >= LEAST_LIKELIHOOD
+    ]
+    return likely, steps, starts, mistake
 
 
 def _is_met(proposals: Sequence[_Proposal], contour: ViewContour) -> bool:
@@ -131,8 +152,10 @@ def _approached(
     if found is None:
         return None, iterations
     state, residuals, reach = found
-    misfit, cost = float(residuals.mean()), cost_of_contour(residuals, reach)
-    return _Proposal(best._replace(state=state), misfit, cost), iterations
+    misfit, cost = float(np.abs(residuals).mean()), cost_of_contour(residuals, reach)
+    alike = correlation_length(contour.contour, residuals, np.ones(len(residuals), dtype=bool))
+    minimum = best._replace(state=state)
+    return _Proposal(minimum, misfit, cost, len(residuals) / alike), iterations
 
 
 def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:

@@ -10,7 +10,7 @@ export class Candidates {
     this.root = h("div", { class: "candidates" });
   }
 
-  show({ by_mask: { chosen, candidates }, image }) {
+  show({ by_mask: { chosen, candidates, text }, image }) {
     this.root.hidden = !chosen && !candidates.length;
     if (this.root.hidden) return;
     this.root.replaceChildren(
@@ -20,20 +20,20 @@ export class Candidates {
             button("Choose again", () => this.act({ do: "begin_at", candidate: null })),
           ]
         : [
-            h("p", {}, "The mask allows several alignments: choose one, or mark a pair, which tells them apart."),
+            h("p", {}, text),
             h("div", { class: "strip" }, candidates.map((each, place) => this.picture(each, place, image))),
           ]),
     );
   }
 
-  picture({ lines, likelihood }, place, image) {
+  picture({ number, lines, likelihood }, place, image) {
     const share = place ? `${Math.max(1, Math.round(100 * likelihood))} % as likely` : "likeliest";
     return h(
       "button",
       {
         type: "button",
         "aria-label": `Alignment ${place + 1}, ${share}`,
-        onclick: () => this.act({ do: "begin_at", candidate: place }),
+        onclick: () => this.act({ do: "begin_at", candidate: number }),
       },
       svg(
         "svg",

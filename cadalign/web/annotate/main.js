@@ -76,7 +76,7 @@ class App {
       this.objects,
     );
     this.photo = new PhotoView(this.layout.photo, {
-      onPlace: (uv) => this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach }),
+      onPlace: (uv) => this.place(uv),
       onAccept: (keypoint) => this.act({ do: "accept", keypoints: [keypoint] }),
       onMark: (action) => this.act(action),
       onSelect: (pair) => this.select(pair),
@@ -235,8 +235,17 @@ class App {
   placeMiddle() {
     const uv = this.photo.toPixel(this.photo.middle);
     if (this.photo.marking.active) this.photo.marking.confirm(this.photo.clamp(uv));
-    else if (this.photo.contains(uv)) this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach });
+    else if (this.photo.contains(uv)) this.place(uv);
     return true;
+  }
+
+  /** Place a point in the photo: of the pair that is begun, else of the keypoint that is asked for. */
+  place(uv) {
+    const { pairs, suggestion } = this.state;
+    const isBegun = pairs.some((pair) => !pair.uv || pair.keypoint === null);
+    const isAsked = !isBegun && suggestion?.others;
+    if (isAsked) this.act({ do: "suggested", uv, snap: this.photoReach });
+    else this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach });
   }
 
   /** Choose what clicks in the photo mark. */

@@ -171,9 +171,11 @@ export class Panel {
       h(
         "p",
         { class: "soft" },
-        "It is marked by a dashed yellow ring on the model, and in the photo where it should be.",
+        suggestion.others
+          ? "It is marked by a dashed yellow ring on the model, and in the photo where each alignment puts it. Any other point: click it on the model first."
+          : "It is marked by a dashed yellow ring on the model, and in the photo where it should be.",
       ),
-      button("Use this model point", this.handlers.suggested, { title: "N" }),
+      suggestion.others ? "" : button("Use this model point", this.handlers.suggested, { title: "N" }),
     );
   }
 

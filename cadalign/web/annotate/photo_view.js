@@ -268,9 +268,11 @@ export class PhotoView {
 
   drawSuggestion(suggestion) {
     if (!suggestion) return;
-    const { x, y } = this.toView(suggestion.uv);
     this.context.setLineDash([4, 3]);
-    drawBadge(this.context, "suggested", "", x, y);
+    for (const uv of [suggestion.uv, ...(suggestion.others ?? [])]) {
+      const { x, y } = this.toView(uv);
+      drawBadge(this.context, "suggested", "", x, y);
+    }
     this.context.setLineDash([]);
   }
 

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Mesh, Model, Symmetry, View, align
+from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.estimation.contours.silhouettes import atlas_of, resembling_poses
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
-from cadalign.render import Scene, cast_geometry
+from cadalign.render import Scene, cast_geometry, sample_view
 
 pytestmark = pytest.mark.long
 
@@ -109,6 +111,29 @@ class TestSimilarModel:
         start = Alignment(turn @ truth.rotation, truth.translation, np.ones(3))
         found = align(self.model, View(CAMERA, mask=mask_of(body(), truth)), init=start)
         assert rotation_error(est=found.alignment, gt=truth) < 6.0
+
+    def test_one_keypoint_counts_beside_a_start(self) -> None:
+        truth = posed(1)
+        turn = rotation_from_vector(np.array([0.1, 0.05, -0.1]))
+        start = Alignment(turn @ truth.rotation, truth.translation, np.ones(3))
+        pixel = CAMERA.project(truth.apply(body().vertices[7:8]))
+        view = View(CAMERA, pixel, ids=[7], sigma=1.0, mask=mask_of(body(), truth))
+        found = align(self.model, view, init=start)
+        assert rotation_error(est=found.alignment, gt=truth) < 6.0
+        assert np.abs(found.residuals).max() < 3.0
+
+    def test_another_car_is_ranked_by_its_own_outline(self, tmp_path: Path) -> None:
+        """Warped to the mask, it fits best in a pose that is 122 degrees away."""
+        root = write_sample_dataset(tmp_path / "sample", per_category=3, categories=["car"])
+        (_, own, other), rng = KeypointNet(root)["car"], np.random.default_rng([1, 1])
+        camera, scene = Camera(640, 480, 935, 935, 319.5, 239.5), Scene(own.load_mesh())
+        scale = np.exp(rng.uniform(-0.3, 0.3, 3) * [0, 1, 1])
+        how = {"min_visible": 4, "rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
+        truth = sample_view(scene, own.keypoints.xyz, camera, **how).cam_from_model
+        points, ids = other.keypoints.xyz, other.keypoints.ids
+        model = Model(points_3d=points, ids=ids, mesh=other.load_mesh(), shape_sigma=0.06)
+        found = align(model, View(camera, mask=cast_geometry(scene, camera, truth).mask))
+        assert rotation_error(est=found.alignment, gt=truth) < 15
 
 
 class TestSilhouettes:

@@ -7,9 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from scipy.stats import chi2
 
 from benchmarks.section import (
     LIMIT_DRAWS,
@@ -18,15 +20,17 @@ from benchmarks.section import (
     Row,
     attempt,
     clocked,
+    percent,
     summary,
 )
 from cadalign import Alignment, Camera, Model, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
+from cadalign.estimation.contours.measured import shift_to
 from cadalign.estimation.contours.view_contour import contour_bound
 from cadalign.evaluation.instances.evidence import DAMAGES, damaged_mask
 from cadalign.geometry.metrics import nearest_truth
-from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 
@@ -36,6 +40,8 @@ _STRETCH = 2.0
 _LEAST_KEYPOINTS = 4
 _RIGHT_DEG, _RIGHT_STRETCH = 10.0, 0.15
 _ERRORS = ("R", "stretch", "IoU")
+_FILLS = ((0.75, 0.95), (0.5, 0.75), (0.25, 0.5), (0.12, 0.25))  # of the image, by the object
+_FREE = [0, 1, 2, 3, 4, 5, 7, 8]  # of a covariance, where x is known
 
 
 @dataclass
@@ -53,6 +59,8 @@ class Masks:
     """Kinds of masks."""
     neighbours: int = 40
     """Masks of neighbouring objects."""
+    optima: int = 0
+    """Problems at every distance, whose ends of the refinement are compared with the truth."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         cases = _cases_of(given, self.views)
@@ -60,6 +68,10 @@ class Masks:
         yield RatioTable(f"masks, {len(cases)} views: medians", rows)
         if self.neighbours:
             yield RatioTable("masks of neighbouring objects", [self._neighbours(cases, given.seed)])
+        if self.optima:
+            models = _models_of(given)
+            ends = [_ends_of(models, fill, self.optima, given.seed) for fill in _FILLS]
+            yield RatioTable("exact masks, seen from anywhere", ends)
 
     def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
         """Medians over all views for one kind of mask."""
@@ -212,30 +224,77 @@ class _Case:
 
 
 def _cases_of(given: BenchmarkData, views: int) -> list[_Case]:
-    """Random views of the models of the sample dataset and, where it is given, of KeypointNet."""
+    """Random views of the models."""
+    how = {"fill": (0.6, 0.9), "roll": 10.0}
+    found = []
+    for number, model in enumerate(_models_of(given)):
+        rng = np.random.default_rng([given.seed, number])
+        found += [case for case in (_drawn(model, rng, **how) for _ in range(views)) if case]
+    return found
+
+
+_Meshed = tuple[AnnotatedModel, Scene]
+
+
+def _models_of(given: BenchmarkData) -> list[_Meshed]:
+    """The models of the sample dataset and, where it is given, of KeypointNet, with meshes."""
     with tempfile.TemporaryDirectory() as folder:
         sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
         models = [model for model in sample if model.mesh_path is not None]
         if given.keypointnet is not None:
             real = (m for m in KeypointNet(given.keypointnet) if m.mesh_path is not None)
             models += [model for model in real if model.mesh_path.suffix == ".obj"]
-        seeds = ([given.seed, number] for number in range(len(models)))
-        return [
-            c for m, seed in zip(models, seeds, strict=True) for c in _draw_cases(m, views, seed)
-        ]
+        return [(model, Scene(model.load_mesh())) for model in models]
 
 
-def _draw_cases(model: AnnotatedModel, views: int, seed: list[int]) -> Iterator[_Case]:
-    scene, rng = Scene(model.load_mesh()), np.random.default_rng(seed)
-    for _ in range(views):
-        scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
-        how = {"rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
-        seen = scene, model.keypoints.xyz, _CAMERA
-        view = attempt(sample_view, *seen, min_visible=7, **how)
-        view = view or attempt(sample_view, *seen, min_visible=_LEAST_KEYPOINTS, **how)
-        if view is not None:
-            ids = np.flatnonzero(view.visible).tolist()
-            yield _Case.drawn(model, scene, _CAMERA, view.cam_from_model, ids, rng)
+def _drawn(model: _Meshed, rng: np.random.Generator, **how: Any) -> _Case | None:
+    """A view of a stretched model that shows enough keypoints, if there is one."""
+    annotated, scene = model
+    scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
+    seen = scene, annotated.keypoints.xyz, _CAMERA
+    view = None
+    for least in (7, _LEAST_KEYPOINTS):
+        view = view or attempt(sample_view, *seen, min_visible=least, rng=rng, scale=scale, **how)
+    if view is None:
+        return None
+    ids = np.flatnonzero(view.visible).tolist()
+    return _Case.drawn(annotated, scene, _CAMERA, view.cam_from_model, ids, rng)
+
+
+def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed: int) -> Row:
+    """Where exact masks end, of objects of one distance: errors, and whether these are stated."""
+    found = []
+    for number in range(count):
+        rng = np.random.default_rng([seed, 3, round(100 * fill[0]), number])
+        how = {"fill": fill, "roll": 180.0, "elevation": (-89.0, 89.0)}
+        case = _drawn(models[number % len(models)], rng, **how)
+        if case is None:
+            continue
+        wall, _, result = clocked(partial(align, case.model, case.view(case.mask)))
+        est, truth = result.alignment, case.truth
+        # The logarithm of the distance: it rises with the stretches where the size is open.
+        error = np.concatenate(
+            [
+                vector_from_rotation(truth.rotation @ est.rotation.T),
+                shift_to(est.translation, truth.translation),
+                np.log(truth.scale / est.scale)[1:],
+            ]
+        )
+        square = error @ np.linalg.solve(result.covariance[np.ix_(_FREE, _FREE)], error)
+        lengths = np.linalg.norm([truth.translation, est.translation], axis=1)
+        errors = np.abs([*error[6:], np.log(lengths[1] / lengths[0])])
+        found.append((errors[:2].max(), errors[2], square, wall))
+    stretch, distance, squares, walls = np.transpose(found)
+    return {
+        "image filled": f"{fill[0]:g} to {fill[1]:g}",
+        "count": len(found),
+        "beyond 10 %": int((np.maximum(stretch, distance) > 0.1).sum()),
+        "beyond the 99.9 % region, %": percent(squares > chi2.ppf(0.999, len(_FREE))),
+        "95 % regions hold": float((squares < chi2.ppf(0.95, len(_FREE))).mean()),
+        "stretch, %": 100 * float(np.median(stretch)),
+        "distance, %": 100 * float(np.median(distance)),
+        "seconds": float(np.median(walls)),
+    }
 
 
 def _damaged(

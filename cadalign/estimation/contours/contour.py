@@ -36,8 +36,12 @@ Image = npt.NDArray[np.float32]
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _MOST_STEPS = 24  # to either side
 _PRECISION = 0.01  # [px], of a rim
+ROUGH = 0.05
+"""Precision [px] of a rim whose contour is extracted as well, which replaces its place."""
 _STEEPEST = 1.2  # tangent of the angle between rim and contour above which these don't match
-_BAND = 7  # [px], about the rims, that smoothing depends on
+# Widths [px] of the band about a rim where pixels may differ from the mask's, by the largest
+# distance [px] of the rim from the contour; smoothing does not reach beyond the last.
+_BANDS = ((0.25, 3), (1.0, 5), (np.inf, 7))
 _MARGIN = 8  # [px], about the rims: their reach, and that of smoothing
 _LEAST_COSINE = 0.3  # between rim and contour
 
@@ -277,11 +281,11 @@ class Sight(NamedTuple):
         return origin, rays @ model_from_ray[:, :2].T + model_from_ray[:, 2], valid
 
 
-def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
+def find_rims(sight: Sight, contour: Contour, reach: float, precision: float = _PRECISION) -> Rims:
     """Find the rims that are nearest to a contour, at most ``reach`` [px] away.
 
-    A rim is a change from the object to the background in the contour's outward direction. Where
-    the rim runs at a steep angle to the contour, the two don't match.
+    A rim is a change from the object to the background in the contour's outward direction, located
+    to the ``precision`` [px].
     """
     count = len(contour.points)
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
@@ -295,7 +299,7 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     rows = np.flatnonzero(found)
     some = contour.taken(rows)
     inner, outer = steps[nearest[rows]], steps[nearest[rows] + 1]
-    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / _PRECISION)))):
+    for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / precision)))):
         half = (inner + outer) / 2
         inside = sight.covers(some.at(half))
         inner, outer = np.where(inside, half, inner), np.where(inside, outer, half)
@@ -308,10 +312,20 @@ def find_rims(sight: Sight, contour: Contour, reach: float) -> Rims:
     offset[rows] = ((inner + outer) / 2)[hit]
     surface[rows] = points[hit]
     faces[rows] = face[hit]
-    jump = contour.neighbours(found) & (np.abs(np.diff(offset)) > _STEEPEST * SPACING)
-    found[1:] &= ~jump
-    found[:-1] &= ~jump
     return Rims(found, offset, surface, faces)
+
+
+def without_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:
+    """The rims without those that run at a steep angle to the contour: the two don't match.
+
+    The ``bias`` (S,) of the contour's extraction counts: it rounds corners of the rim off.
+    """
+    distances = rims.offset - bias
+    steep = contour.neighbours(rims.found) & (np.abs(np.diff(distances)) > _STEEPEST * SPACING)
+    found = rims.found.copy()
+    found[1:] &= ~steep
+    found[:-1] &= ~steep
+    return rims._replace(found=found)
 
 
 def across_rims(contour: Contour, rims: Rims) -> FloatArray:
@@ -360,23 +374,32 @@ def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims)
     if not len(rows):
         return bias
     some, offsets = contour.taken(rows), rims.offset[rows]
-    corner, rendered = _rendered(sight, mask, some.at(offsets))
+    corner, rendered = _rendered(sight, mask, some.at(offsets), np.abs(offsets))
     own = crossings(smoothed(rendered), some.points - corner, some.normals, offsets)
     bias[rows] = np.nan_to_num(offsets - (own - mask.crossings[rows]))
     return np.where(np.abs(bias) < REACH, bias, 0.0)
 
 
-def _rendered(sight: Sight, mask: MaskImage, rims: FloatArray) -> tuple[IntArray, Image]:
-    """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it."""
+def _rendered(
+    sight: Sight, mask: MaskImage, rims: FloatArray, distances: FloatArray
+) -> tuple[IntArray, Image]:
+    """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it.
+
+    Where rims are at small ``distances`` (S,) [px] from the contour, all but the nearest pixels are
+    those of the mask.
+    """
     height, width = mask.inside.shape
     places = np.clip(np.rint(rims).astype(int), 0, [width - 1, height - 1])
     corner = np.maximum(places.min(axis=0) - _MARGIN, 0)
     right, bottom = places.max(axis=0) + _MARGIN + 1
     rendered = mask.inside[corner[1] : bottom, corner[0] : right].copy()
-    columns, rows = (places - corner).T
-    near = np.zeros(rendered.shape, dtype=np.uint8)
-    near[rows, columns] = 1
-    near = np.asarray(cv2.dilate(near, np.ones((_BAND, _BAND), np.uint8)), dtype=np.uint8)
+    near, least = np.zeros(rendered.shape, dtype=np.uint8), 0.0
+    for most, band in _BANDS:
+        columns, rows = (places[(distances >= least) & (distances < most)] - corner).T
+        some = np.zeros_like(near)
+        some[rows, columns] = 1
+        near |= np.asarray(cv2.dilate(some, np.ones((band, band), np.uint8)), dtype=np.uint8)
+        least = most
     columns, rows = cv2.findNonZero(near).reshape(-1, 2).T  # five times as fast as NumPy
     rendered[rows, columns] = sight.covers(np.stack([columns, rows], axis=1) + corner)
     return corner, rendered

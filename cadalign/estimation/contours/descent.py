@@ -15,7 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.contours.contour import Rims, Sight, extraction_bias, find_rims
+from cadalign.estimation.contours.contour import (
+    ROUGH,
+    Rims,
+    Sight,
+    extraction_bias,
+    find_rims,
+    without_steep,
+)
 from cadalign.estimation.contours.measured import Joined, Place, Sought, cost_of, weakest_steps
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.estimation.contours.view_contour import (
@@ -85,12 +92,14 @@ def rims_at(masked: Masked, place: Place, reach: float, *, is_fine: bool) -> Pla
     for view, own in zip(masked.views, place.own, strict=True):
         camera = view.registered(masked.camera_at(view.image, view.camera, place.state), own)
         sight = Sight(posed.caster, camera, poses[view.image])
-        found = find_rims(sight, view.contour, reach)
-        bias = np.zeros(len(found.found))
         if is_fine:
+            found = find_rims(sight, view.contour, reach, ROUGH)
             bias = extraction_bias(sight, view.mask, view.contour, found)
+        else:
+            found = find_rims(sight, view.contour, reach)
+            bias = np.zeros(len(found.found))
         sights.append(sight)
-        rims.append(found)
+        rims.append(without_steep(view.contour, found, bias))
         biases.append(bias)
     return PlacedRims(posed, sights, rims, biases)
 

@@ -12,7 +12,13 @@ import numpy as np
 
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.descent import ContourFit, Masked, Settled, settle, settle_with
-from cadalign.estimation.contours.measured import cost_of, scaled, with_displacement_modes
+from cadalign.estimation.contours.measured import (
+    Place,
+    cost_of,
+    scaled,
+    weakest_steps,
+    with_displacement_modes,
+)
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import ViewContour, contour_view
 from cadalign.estimation.model import Model
@@ -31,6 +37,9 @@ _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 8  # where nothing but the masks determines the estimate
 _LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, relative
 _UNLIKELY = 60.0  # excess score of a minimum without masks that is still tried with them
+_AGREEING = 2.0  # [px], of the misfit of an exact model, above which other starts are tried
+_DISPLACED = (-2.0, -1.0, 1.0, 2.0)  # standard deviations
+_WELL_KNOWN = 0.05  # standard deviation of a logarithm of a scale
 _LEAST_SUPPORT = 0.5  # share of the contour that must agree
 _LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
 _RELATIVE_TOLERANCE = 0.02
@@ -117,10 +126,16 @@ def fit_masks(
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
-    explore = partial(_explored, likely[:most], keypoints, is_wide=is_open)
+    starts = [(each, each.state) for each in likely[:most]]
+    explore = partial(_explored, starts, keypoints, is_wide=is_open)
     best: list[_Candidate] = []
     while used:
         best = explore(used, choice.surfaces)
+        if not choice.hulls and not is_open and (not best or _misfit(best[0].settled) > _AGREEING):
+            displaced = _explored(
+                _displaced(first), keypoints, used, choice.surfaces, is_wide=False
+            )
+            best = sorted([*best, *displaced[:1]], key=lambda each: _misfit(each.settled))
         hulls = [_hull_contour(each, views[each.image]) for each in used] if choice.hulls else []
         known = [each for each in hulls if each is not None]
         if known and len(known) == len(used):
@@ -172,8 +187,21 @@ def _is_determined(minimum: Minimum) -> bool:
     return bool(np.linalg.eigvalsh(scaled(information)[0])[0] > _LEAST_INFORMATION)
 
 
+def _displaced(start: Minimum) -> list[tuple[Minimum, State]]:
+    """States of an estimate without masks along the direction of which it knows least.
+
+    None where all stretches are known well enough for rims to be found from there.
+    """
+    _, information = information_of(start.evidence, start.state)
+    (step,) = weakest_steps(information, 1)
+    place = Place.of(start.state)
+    if np.abs(place.moved(step).state.log_scales - start.state.log_scales).max() < _WELL_KNOWN:
+        return []
+    return [(start, place.moved(sigmas * step).state) for sigmas in _DISPLACED]
+
+
 def _explored(
-    starts: Sequence[Minimum],
+    starts: Sequence[tuple[Minimum, State]],
     keypoints: int,
     contours: list[ViewContour],
     surfaces: list[Surface],
@@ -186,8 +214,8 @@ def _explored(
     takes several times as long, and modes distinguish the surfaces.
     """
     found = []
-    for start in starts:
-        evidence, state = start.evidence, start.state
+    for start, state in starts:
+        evidence = start.evidence
         if not len(evidence.shape.modes):
             evidence, state = with_displacement_modes(evidence, state)
         tried = []

@@ -24,6 +24,7 @@ from cadalign.estimation.contours.contour import (
     contour_of,
     find_rims,
     interpolated,
+    without_steep,
 )
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.geometry.alignment import Alignment
@@ -227,7 +228,7 @@ def silhouette_of(surface: PosedSurface, camera: Camera, pose: Alignment) -> Sil
     if not len(rough.points):
         return None
     contour = rough._replace(points=corner + cell * rough.points)
-    rims = find_rims(sight, contour, _RIM_REACH * cell)
+    rims = without_steep(contour, find_rims(sight, contour, _RIM_REACH * cell))
     on_rim = contour._replace(points=contour.at(rims.offset))
     across = across_rims(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
     within = (on_rim.points > _BORDER) & (on_rim.points < [camera.width - 3, camera.height - 3])

@@ -25,6 +25,7 @@ from cadalign.estimation.contours.contour import (
     find_rims,
     mask_contour,
     mask_image,
+    without_steep,
 )
 from cadalign.estimation.contours.measured import OWN_MODES, Joined, Measured, Place, solved
 from cadalign.estimation.contours.surface import PosedSurface, surfaces_of
@@ -380,10 +381,11 @@ def with_contours(
 def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> Measured:
     sight = Sight(posed.caster, seen.camera, gt)
     rims = find_rims(sight, seen.contour, _BOUND_REACH)
+    bias = extraction_bias(sight, seen.mask, seen.contour, rims)
+    rims = without_steep(seen.contour, rims, bias)
     offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
     centred = np.where(rims.found, rims.offset - offset, np.nan)
     known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
-    bias = extraction_bias(sight, seen.mask, seen.contour, rims)
     noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
     agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
     rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)

@@ -13,7 +13,7 @@ from cadalign import Alignment, Camera, Mesh, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.estimation.contours.contour import Contour, Rims, across_rims
 from cadalign.estimation.contours.descent import Descent, Masked, settle
-from cadalign.estimation.contours.measured import Place
+from cadalign.estimation.contours.measured import Place, shift_to, shifted
 from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.contours.view_contour import contour_view
 from cadalign.estimation.pack import evidence_of
@@ -66,6 +66,19 @@ def test_exact_masks_end_within_the_stated_uncertainty(real_data: Path, seed: in
     models = [m for m in KeypointNet(real_data / "keypointnet")["bathtub"] if m.mesh_path]
     model, view, truth = seen_from_anywhere(models[0], seed)
     assert squared_distance(align(model, view), truth) < chi2.ppf(0.999, 8)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [12, 13, 15])
+def test_keypoints_that_leave_the_distance_open_are_no_bad_start(
+    sample_root: Path, seed: int
+) -> None:
+    model, view, truth = seen_from_anywhere(KeypointNet(sample_root)["chair"][0], seed)
+    found = align(model, view)
+    assert len(view.keypoint_ids) == 6
+    assert found.mask_residuals[0] is not None
+    assert found.mask_residuals[0].is_used
+    assert squared_distance(found, truth) < chi2.ppf(0.99, 8)
 
 
 @pytest.mark.long
@@ -128,6 +141,23 @@ def test_places_move_and_go_towards_others() -> None:
     assert np.allclose(half.state.poses, twice.state.poses)
     assert np.allclose(half.state.log_scales, twice.state.log_scales)
     assert np.allclose(half.own, twice.own)
+
+
+def test_places_of_one_picture_lie_on_a_line() -> None:
+    """Distance and stretch that rise by one factor change little in the picture."""
+    pose = np.append(np.eye(3).ravel(), [1.0, -2.0, 9.0])[None]
+    still = State(pose, np.zeros(0), np.zeros(3), np.zeros(0), np.zeros((5, 3)))
+    step = np.concatenate([np.zeros(3), 0.7 * pose[0, 9:], np.full(3, 0.7)])
+    place = Place(still, np.zeros((0, 3)))
+    moved = place.moved(step)
+    factor = np.exp(moved.state.log_scales[0])
+    np.testing.assert_allclose(moved.state.poses[0, 9:], factor * pose[0, 9:])
+    half = place.towards(moved, 0.5).state
+    np.testing.assert_allclose(half.poses[0, 9:], np.exp(half.log_scales[0]) * pose[0, 9:])
+    np.testing.assert_allclose(shift_to(pose[0, 9:], moved.state.poses[0, 9:]), step[3:6])
+    zero = np.zeros(3)
+    np.testing.assert_allclose(shifted(zero, step[:3] + 1), step[:3] + 1)
+    np.testing.assert_allclose(shift_to(zero, step[3:6]), step[3:6])
 
 
 def test_directions_across_rims_are_the_rims_own() -> None:

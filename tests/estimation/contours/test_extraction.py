@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from support.scenes import CAMERA, truth_of
 
 from cadalign import Alignment, Mesh
+from cadalign.estimation.contours import contour as contours
 from cadalign.estimation.contours.contour import (
+    ROUGH,
     Sight,
     contour_of,
     extraction_bias,
     find_rims,
     mask_image,
+    without_steep,
 )
 from cadalign.estimation.contours.surface import caster_of
 from cadalign.render import Scene, cast_geometry
@@ -46,3 +50,41 @@ def test_a_displacement_is_no_part_of_it() -> None:
     assert 0.2 < outwards < 2
     assert abs(np.median(bias)) < 0.15
     assert np.abs(bias).max() < 2
+
+
+def test_pixels_that_cannot_differ_from_the_mask_are_not_cast(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mask = cast_geometry(Scene(BOX), CAMERA, TRUTH).mask
+    turned = Alignment(TRUTH.rotation, TRUTH.translation + [0.0005, 0, 0.002], TRUTH.scale)
+    contour, cast = contour_of(mask), []
+    covers = Sight.covers
+
+    def counted(sight: Sight, pixels: np.ndarray) -> np.ndarray:
+        cast.append(pixels.size // 2)
+        return covers(sight, pixels)
+
+    monkeypatch.setattr(Sight, "covers", counted)
+
+    def distances(precision: float) -> np.ndarray:
+        cast.clear()
+        sight = Sight(caster_of(BOX), CAMERA, turned)
+        rims = find_rims(sight, contour, 4.0, precision)
+        bias = extraction_bias(sight, mask_image(mask, contour), contour, rims)
+        return np.where(rims.found, rims.offset - bias, np.nan)
+
+    found, rays = distances(ROUGH), sum(cast)
+    monkeypatch.setattr(contours, "_BANDS", ((np.inf, 9),))
+    every = distances(0.01)
+    assert rays < 0.6 * sum(cast)
+    assert (np.abs(found - every) < 1e-3).mean() > 0.99
+
+
+def test_corners_that_are_rounded_off_are_not_steep() -> None:
+    points = np.column_stack([2.0 * np.arange(9), np.zeros(9)])
+    contour = contours.Contour(points, np.tile([0.0, -1.0], (9, 1)), np.zeros(9, dtype=int))
+    offset = np.array([0, 0, 0, 0, 3.0, 0, 0, 0, 0])
+    nothing = np.zeros((9, 3)), np.zeros(9, dtype=int)
+    rims = contours.Rims(np.ones(9, dtype=bool), offset, *nothing)
+    assert without_steep(contour, rims).found.tolist() == [*[True] * 3, *[False] * 3, *[True] * 3]
+    assert without_steep(contour, rims, offset).found.all()

@@ -15,6 +15,7 @@ from cadalign.estimation.mistakes import (
     Explained,
     Mistake,
     find_in_all,
+    find_likelier,
     find_mistake,
     other_sizes,
 )
@@ -29,6 +30,7 @@ from cadalign.estimation.search import (
 from cadalign.estimation.uncertainty.evidence import redundancy_of
 
 _FEW_REJECTED = 0.9  # share of the keypoints that agree, above which no mistake is searched for
+_LEAST_UNCERTAIN_MISFIT = 1.0  # of an uncertain shape, below which none is searched for
 _LEAST_MISFIT = 2.0  # root of the reduced chi-square at which a mistake is looked for
 _MOST_CORRECTED = 1.6  # the same, without the mistake
 _LEAST_RATIO = 1.7  # of both
@@ -37,18 +39,24 @@ _LEAST_RATIO = 1.7  # of both
 def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions | None) -> str | None:
     """Name the mistake without which the keypoints agree better.
 
-    With ``ransac`` where many are rejected, otherwise where the evidence does not agree at all.
+    With ``ransac`` where many are rejected or an uncertain shape follows them poorly, otherwise
+    where the evidence does not agree at all.
     """
     if ransac is None:
         return _mistake_in_all(problem, best)
-    if best.inliers.mean() > _FEW_REJECTED:
+    is_exact = not best.evidence.shape.spread.any() and not len(best.evidence.shape.modes)
+    are_few = best.inliers.mean() > _FEW_REJECTED
+    if are_few and (is_exact or _misfit(best) < _LEAST_UNCERTAIN_MISFIT):
         return None
 
     def explain(mistake: Mistake) -> Explained | None:
         minimum = _without(problem, mistake, ransac)
         return None if minimum is None else _explained(problem, minimum, ransac)
 
-    return find_mistake(_explained(problem, best, ransac), len(best.inliers), explain)
+    found = _explained(problem, best, ransac)
+    if are_few:
+        return find_likelier(found.score, len(best.inliers), explain)
+    return find_mistake(found, len(best.inliers), explain)
 
 
 def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:

@@ -19,6 +19,7 @@ OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
 _LEAST_GAIN = 2.0  # of -2 log likelihood, by which corrected data must explain more
 _DECISIVE = 12.0  # the same where nothing is rejected
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
+_LARGEST_LOG = math.log(1e6)  # of the odds, in a message
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 _MOST_INSIDE = 0.8  # of the keypoints lie in their image
 SOLUTIONS_OF_FOUR = 2.3  # valid alignments to 4 points, in the mean
@@ -65,7 +66,6 @@ class Mistake(NamedTuple):
         return np.where(self.flipped, last - points_2d, points_2d)
 
 
-# About a centred principal point, flips are the same as a mirrored model.
 _MISTAKES = (
     Mistake("the model is mirrored", mirrored=True),
     Mistake("u and v are swapped", swapped=True),
@@ -172,6 +172,28 @@ def find_mistake(
         f"{name_likely(tried, best)}: corrected, {best.inliers} of {given} keypoints agree; as "
         f"given, {rejected} ({100 * rejected / given:.0f} %) are rejected"
     )
+
+
+def find_likelier(
+    score: float, count: int, explain: Callable[[Mistake], Explained | None]
+) -> str | None:
+    """Name the mistake without which the keypoints of an uncertain shape are likelier.
+
+    Such a shape follows the keypoints of most mistakes, so that none is rejected: the likelihoods
+    tell them apart. ``score`` is that of the ``count`` keypoints as given.
+    """
+
+    def likelier(tried: Tried) -> list[Explained]:
+        return [each for _, each in tried if each.score < score - _AS_LIKELY]
+
+    # About a centred principal point, flips are the same as a mirrored model.
+    tried = try_mistakes(explain, count, _MISTAKES[:2])
+    if not likelier(tried):
+        return None
+    tried += try_mistakes(explain, count, _MISTAKES[2:])
+    best = min(likelier(tried), key=lambda each: each.score)
+    odds = math.exp(min((score - best.score) / 2, _LARGEST_LOG))
+    return f"{name_likely(tried, best)}: corrected, the keypoints are {odds:.2g} times as likely"
 
 
 def _listed(clauses: Sequence[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -185,6 +185,26 @@ def test_views_of_a_learned_or_similar_shape_share_it() -> None:
         view = View(CENTRED, problem.points_2d)
         found = align(Model(points_3d=model, shape_sigma=0.005), view, ransac=options)
         assert (NAMES["swapped"] in " ".join(found.warnings)) == wanted
+
+
+@pytest.mark.parametrize("mistake", ["mirrored", "swapped"])
+def test_likelihoods_tell_mistakes_that_a_similar_model_follows(mistake: str) -> None:
+    named = alarms = followed = 0
+    for seed in range(16):
+        rng = np.random.default_rng([seed, 2])
+        right = seen(seed, count=8)
+        similar = replace(right, points_3d=right.points_3d + rng.normal(0, 0.02, (8, 3)))
+        for problem in (similar, similar.mistaken(mistake)):
+            model = Model(points_3d=problem.points_3d, shape_sigma=0.02)
+            found = align(model, View(CENTRED, problem.points_2d), ransac=RansacOptions())
+            texts = [text for text in found.warnings if NAMES[mistake] in text]
+            if problem is similar:
+                alarms += bool(texts)
+            elif found.inliers.mean() > 0.9:
+                followed += 1
+                named += any("times as likely" in text for text in texts)
+    assert alarms == 0
+    assert named >= 0.6 * followed > 0
 
 
 def test_what_explains_no_more_keypoints_is_no_mistake() -> None:

@@ -27,6 +27,7 @@ from benchmarks.clicks import Clicks, OutlineMethods, ProposalClicks
 from benchmarks.coverage import Coverage
 from benchmarks.gradients import GradientErrors, TorchLayer
 from benchmarks.masks import MaskAlone, Masks
+from benchmarks.mistakes import Mistakes
 from benchmarks.photo import Photos, PhotoTimes
 from benchmarks.retrieval import MaskRetrieval, Retrieval, UnseenRetrieval
 from benchmarks.runs import Evaluation, Fits, Ransac
@@ -54,6 +55,7 @@ SECTIONS: dict[str, type[Section]] = {
     "annotator": Annotator,
     "masks": Masks,
     "mask_alone": MaskAlone,
+    "mistakes": Mistakes,
     "photo": Photos,
     "photo_times": PhotoTimes,
     "clicks": Clicks,
@@ -74,7 +76,7 @@ SECTIONS: dict[str, type[Section]] = {
     "tracks": Tracks,
 }
 ON_REQUEST = (
-    *("mask_alone", "photo", "photo_times", "clicks", "outlines", "proposals"),
+    *("mask_alone", "mistakes", "photo", "photo_times", "clicks", "outlines", "proposals"),
     *("detections", "unseen_retrieval", "mask_retrieval", "similar", "tracks"),
 )
 STORED = Path(__file__).parent / "benchmark_ratios.json"

@@ -24,6 +24,7 @@ from cadalign.estimation.mistakes import (
     disagreeing,
     find_mistake,
     larger_sizes,
+    share_as_moderate,
 )
 from cadalign.estimation.options import (
     MINIMAL_SOLVERS,
@@ -112,8 +113,16 @@ class RobustSearch:
             where="points_2d",
             solutions=SOLUTIONS_OF_FOUR,
             chance=_CHANCE,
+            share=self._share_as_moderate(best.alignment),
             disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
         )
+
+    def _share_as_moderate(self, alignment: Alignment) -> float:
+        """The share of alignments by chance that are stretched as little; 1 if unknown."""
+        options = self.options
+        if options.prior_weight or options.focal == "estimate" or not options.stretched_axes:
+            return 1.0
+        return share_as_moderate(alignment.scale, len(options.stretched_axes))
 
     @np.errstate(all="ignore")  # residuals that overflow are outliers'
     def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:

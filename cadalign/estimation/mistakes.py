@@ -24,6 +24,8 @@ _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at 
 _MOST_INSIDE = 0.8  # of the keypoints lie in their image
 SOLUTIONS_OF_FOUR = 2.3  # valid alignments to 4 points, in the mean
 LEAST_ERROR = 0.1  # no keypoint is taken to be better than that [px]
+_CHANCE_STRETCH = 3.2  # standard deviation of log scales of alignments by chance
+_LEAST_SHARE = 0.01  # of alignments by chance that are as moderate, at a factor of 1.5
 _MOST_NAMED = 5  # keypoints, in a message
 _SAME_MIDDLE = 0.02  # of an image's size, from its middle to a principal point taken for it
 
@@ -276,15 +278,20 @@ def check_support(
     where: str,
     solutions: float = MAX_SOLUTIONS,
     chance: float = 0.1,
+    share: float = 1.0,
     disagreeing: str = "",
 ) -> None:
     """Refuse an estimate whose poses have no more support together than chance gives.
 
     ``size`` keypoints determine a pose, with so many ``solutions``; ``score`` is the truncated sum
     of squares [px^2], which the NoConsensusError carries. ``chance`` bounds the expected number of
-    models with as much support; ``disagreeing`` are words about keypoints that disagree.
+    models with as much support, of which a ``share`` is as moderate as this one; ``disagreeing``
+    are words about keypoints that disagree.
     """
     logarithm = sum(min(0.0, log_expected_by_chance(each, size, solutions)) for each in supports)
+    if logarithm < 0 and share < 1:  # the distribution of the product of both
+        logarithm += math.log(share)
+        logarithm += math.log1p(-logarithm)
     if np.isfinite(score) and logarithm <= math.log(chance):
         return
     inliers, count = sum(len(each.errors) for each in supports), sum(n for _, n, _ in supports)
@@ -298,6 +305,16 @@ def check_support(
         score=score,
         inliers=inliers,
     )
+
+
+def share_as_moderate(scale: FloatArray, free: int) -> float:
+    """The share of alignments by chance whose stretch is at most that of ``scale`` (3,).
+
+    Alignments that keypoints scattered at random support are stretched by factors of 25 and more,
+    in ``free`` axes.
+    """
+    largest = float(np.abs(np.log(scale)).max())
+    return max(math.erf(largest / (math.sqrt(2) * _CHANCE_STRETCH)) ** free, _LEAST_SHARE)
 
 
 def disagreeing(errors: FloatArray, kept: BoolArray) -> str:

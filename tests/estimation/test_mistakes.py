@@ -13,7 +13,15 @@ from support.problems import with_outliers
 
 from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
 from cadalign.errors import CadalignError, NoConsensusError
-from cadalign.estimation.mistakes import Explained, Mistake, find_mistake
+from cadalign.estimation.mistakes import (
+    Explained,
+    Mistake,
+    Support,
+    check_support,
+    find_mistake,
+    log_expected_by_chance,
+    share_as_moderate,
+)
 
 CENTRED = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 OFF_CENTRE = Camera(640, 480, 935.0, 935.0, 190.0, 330.0)
@@ -22,6 +30,13 @@ CHAIR = np.array(  # feet, corners of the seat, top of the back, arms
     + [(x, 0.0, z) for x in (-0.25, 0.25) for z in (-0.26, 0.24)]
     + [(x, 0.42, -0.31) for x in (-0.23, 0.23)]
     + [(x, 0.15, z) for x in (-0.27, 0.27) for z in (-0.2, 0.12)]
+)
+BOTTLE = np.array(  # rings of four
+    [
+        (radius * np.cos(angle), height, radius * np.sin(angle))
+        for radius, height in ((0.13, -0.45), (0.13, 0.1), (0.05, 0.25), (0.05, 0.45))
+        for angle in np.arange(4) * np.pi / 2 + 0.3
+    ]
 )
 NAMES = {
     "mirrored": "the model is mirrored",
@@ -136,6 +151,37 @@ def test_outliers_raise_no_alarm() -> None:
     for seed in range(100):
         problem = spoiled(seen(seed, count=8 + seed % 5), seed)
         assert not problem.complaint()
+
+
+def test_moderate_alignments_of_few_keypoints_are_no_chance() -> None:
+    """Chance stretches by more: 2 outliers of 7 keypoints are found, scattered ones refused."""
+    refused = accepted = 0
+    for seed in range(100):
+        problem = seen(seed, BOTTLE, count=7)
+        refused += "no alignment is supported" in spoiled(problem, seed).complaint()
+        pixels = np.random.default_rng([seed, 3]).uniform(
+            problem.points_2d.min(axis=0), problem.points_2d.max(axis=0), (7, 2)
+        )
+        scattered = replace(problem, points_2d=pixels).complaint()
+        accepted += "no alignment is supported" not in scattered
+    assert refused <= 20
+    assert accepted <= 2
+
+
+def test_the_share_of_chance_rises_with_the_stretch() -> None:
+    shares = [share_as_moderate(np.array([1.0, 1.0, factor]), 2) for factor in (1.1, 2, 10, 1e4)]
+    assert 0 < shares[0] < 0.05 > shares[1]
+    assert sorted(shares) == shares
+    assert shares[-1] > 0.9
+    errors, chance = np.full(5, 1.0), Support(np.full(5, 1.0), 7, 5000.0)
+    assert log_expected_by_chance(chance, 4, 2.3) > np.log(0.1)
+    options = {"max_reproj_error": 3.0, "score": 5.0, "where": "points_2d", "solutions": 2.3}
+    with pytest.raises(NoConsensusError):
+        check_support([chance], 4, **options)  # type: ignore[arg-type]
+    check_support([chance], 4, share=shares[0], **options)  # type: ignore[arg-type]
+    few = Support(errors[:4], 7, 5000.0)
+    with pytest.raises(NoConsensusError):
+        check_support([few], 4, share=shares[0], **options)  # type: ignore[arg-type]
 
 
 def test_outliers_beside_a_mistake_hide_it_not() -> None:

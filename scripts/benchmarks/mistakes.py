@@ -72,23 +72,25 @@ class Mistakes:
     """Displacement of the keypoints of similar models, in diagonals."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        folder = given.needed() / "annotations"
-        own: list[Row] = []
-        similar: list[Row] = []
-        for category in self.categories:
-            models = json.loads((folder / f"{category}.json").read_text(encoding="utf-8"))
-            points = [np.array([each["xyz"] for each in model["keypoints"]]) for model in models]
-            points = [each for each in points if len(each) >= _FEWEST]
-            row = _shares(points, given.seed, self.problems)
-            own.append({"category": category, **row})
-            row = _shares(points, given.seed, self.similar, self.shape_sigma)
-            similar.append({"category": category, **row})
+        own = [self._row(given, each, self.problems) for each in self.categories]
         yield RatioTable(f"mistakes, {self.problems} problems each: %", own)
-        title = f"of similar models, shape_sigma {self.shape_sigma:g}, {self.similar} each: %"
-        yield RatioTable(title, similar)
+        if self.similar:
+            sigma = self.shape_sigma
+            similar = [self._row(given, each, self.similar, sigma) for each in self.categories]
+            title = f"of similar models, shape_sigma {sigma:g}, {self.similar} each: %"
+            yield RatioTable(title, similar)
+
+    def _row(
+        self, given: BenchmarkData, category: str, problems: int, shape_sigma: float = 0.0
+    ) -> Row:
+        path = given.needed() / "annotations" / f"{category}.json"
+        models = json.loads(path.read_text(encoding="utf-8"))
+        points = [np.array([each["xyz"] for each in model["keypoints"]]) for model in models]
+        points = [each for each in points if len(each) >= _FEWEST]
+        return {"category": category, **_shares(points, given.seed, problems, shape_sigma)}
 
 
-def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: float = 0.0) -> Row:
+def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: float) -> Row:
     """Shares for the models of one category."""
     said: dict[str, list[tuple[bool, bool, bool]]] = {}
     for number in range(problems):

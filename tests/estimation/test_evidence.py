@@ -23,7 +23,11 @@ from support.scenes import (
 
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.errors import InputError
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
+from cadalign.estimation.search import JointProblem
+from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.geometry.gravity import up_from_vertical_edges
 
 
@@ -303,3 +307,13 @@ def test_bad_input_is_named(call: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
         call()
     assert str(caught.value).startswith(message)
+
+
+def test_equations_beyond_the_unknowns_are_counted() -> None:
+    points, truth = keypoints(12), truth_of()
+    views = [seen(points, truth, np.eye(4)), seen(points, truth, np.eye(4))]
+    prior = prior_of(Model(points_3d=points))
+    for few, poses in ((views[:1], 1), (views, 2)):
+        problem = JointProblem(prior, few, None, FitOptions(), Lenses.of(few, "known", None))
+        evidence = problem.evidence(prior.components[0], problem.lenses)
+        assert redundancy_of(evidence) == 24 * poses - 6 * poses - 2

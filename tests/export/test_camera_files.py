@@ -42,7 +42,7 @@ def _pixels(view):
 def test_what_is_written_is_read_again(tmp_path, kind, count):
     cameras = [PLAIN if kind == "open3d" else BENT, replace(PLAIN, width=800, fx=600), PLAIN]
     views = [_view(camera, f"{n}.jpg", 100 * n) for n, camera in enumerate(cameras[:count])]
-    path = tmp_path / ("model" if kind == "colmap" else "cameras.json")
+    path = tmp_path / ("a/new/model" if kind == "colmap" else "cameras.json")
     WRITERS[kind](path, views)
     again = read_camera_views(path)
     assert len(again) == count

@@ -15,7 +15,15 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, clocked, summary
+from benchmarks.section import (
+    BenchmarkData,
+    RatioTable,
+    Row,
+    attempt,
+    clocked,
+    processor_seconds,
+    summary,
+)
 from cadalign import Camera, Mesh, Model, Result, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, load_mesh, write_sample_dataset
@@ -71,7 +79,7 @@ class Photos:
 
 @dataclass
 class PhotoTimes:
-    """Time that a photo takes beyond the keypoints, and of a track by photos alone.
+    """Time [s of a processor] that a photo takes beyond the keypoints, and a track by photos alone.
 
     Composites of 2 megapixels with six rough clicks; and a clip of 640 x 480 px in which an object
     turns by 2 degrees and moves by 1 % of its distance from frame to frame, each frame aligned from
@@ -89,14 +97,15 @@ class PhotoTimes:
             for stretched in (False, True):
                 rng = np.random.default_rng([given.seed, 7, number])
                 clicks = case.clicked(rng, stretched=stretched)
-                clicks.aligned()
-                row = _compared(clicks)
-                names = ("R clicks", "R photo", "seconds")
-                rows["stretched" if stretched else "rigid"].append({n: row[n] for n in names})
+                first = processor_seconds(clicks.aligned)
+                row, second = _compared(clicks), -first
+                second += processor_seconds(partial(clicks.aligned, image=case.pixels))
+                kept = {name: row[name] for name in ("R clicks", "R photo", "seconds")}
+                rows["stretched" if stretched else "rigid"].append(kept | {"processor": second})
         table = []
         for name, found in rows.items():
-            late = float(np.percentile([row["seconds"] for row in found], 90))
-            table.append({"model": name, **summary(found), "seconds, 90 %": late})
+            late = float(np.percentile([row["processor"] for row in found], 90))
+            table.append({"model": name, **summary(found), "processor, 90 %": late})
         yield RatioTable("photos of 2 megapixels beside six clicks: medians", table)
         clips = list(_clip_rows(given, self.frames)) if self.frames else []
         yield RatioTable("a track by photos of 640 x 480 px", clips)
@@ -321,11 +330,12 @@ def _clip_rows(given: BenchmarkData, frames: int) -> Iterator[Row]:
             truth = Alignment(turn @ truth.rotation, place, np.ones(3))
             drawn = RaycastRenderer().render(scene, _CAMERA, truth, samples=4).composite(pixels)
             photo = View(_CAMERA, image=_blurred(drawn, rng))
-            wall, _, result = clocked(partial(attempt, align, own, photo, init=last))
+            _, busy, result = clocked(partial(attempt, align, own, photo, init=last))
             last = truth if result is None else result.alignment
-            error = rotation_error(est=last, gt=truth)
+            nearest = nearest_truth(est=last, gt=truth, symmetry=model.symmetry)
+            error = rotation_error(est=last, gt=nearest)
             if frame:
-                times.append(1e3 * wall)
+                times.append(1e3 * busy)
                 errors.append(error)
             if error > _LOST_DEG:
                 last = truth

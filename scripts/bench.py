@@ -35,6 +35,7 @@ from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Se
 from benchmarks.shapes import Align, FocalShapes, Similar
 from benchmarks.speed import Calls, Cold, Rendering
 from benchmarks.tracks import Tracks
+from benchmarks.warned import Warned
 from rich.console import Console
 from rich.table import Table
 
@@ -74,10 +75,11 @@ SECTIONS: dict[str, type[Section]] = {
     "gradients": GradientErrors,
     "noise": NoiseOfDetector,
     "tracks": Tracks,
+    "warned": Warned,
 }
 ON_REQUEST = (
     *("mask_alone", "mistakes", "photo", "photo_times", "clicks", "outlines", "proposals"),
-    *("detections", "unseen_retrieval", "mask_retrieval", "similar", "tracks"),
+    *("detections", "unseen_retrieval", "mask_retrieval", "similar", "tracks", "warned"),
 )
 STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2

@@ -48,7 +48,7 @@ def result_of_keypoints(
     """The result of keypoints in one view, from the fields of their `FittedKeypoints`."""
     points, options = fitted["points_3d"], fitted["options"]
     ids = _rows(len(points))
-    statistics = quickly(KeypointStatistics, fitted)
+    statistics = quickly(KeypointStatistics, {**fitted, "alternatives": alternatives})
     of_view = {
         "camera": fitted["camera"],
         "alignment": fitted["alignment"],
@@ -114,23 +114,25 @@ def canonical_result(result: Result, symmetry: Symmetry) -> Result:
     if covariance is not None:
         covariance = carried(covariance, result.alignment, best, held)
     canonical = [(group.canonical(each.alignment, held=held), each) for each in result.alternatives]
+    alternatives = tuple(
+        replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
+        for equal, each in canonical
+        if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
+    )
     statistics = replace(
         statistics,
         alignment=best.alignment,
         points_3d=best.relabelled(statistics.points_3d),
         fisher_covariance=covariance,
         symmetry=symmetry,
+        alternatives=alternatives,
     )
     return replace(
         result,
         views=(replace(result.views[0], alignment=best.alignment, statistics=statistics),),
         points_3d=best.relabelled(result.points_3d),
         statistics=statistics,
-        alternatives=tuple(
-            replace(each, alignment=equal.alignment, points_3d=equal.relabelled(each.points_3d))
-            for equal, each in canonical
-            if group.is_trivial or not is_same(group, best.alignment, equal.alignment, covariance)
-        ),
+        alternatives=alternatives,
         symmetry=symmetry,
     )
 

@@ -138,12 +138,18 @@ def result_of(
                     where=f"views[{number}]: " if len(views) > 1 else "",
                 )
             ),
-            *weaknesses(pose, uncertainty_of(covariances[0])),
+            *weaknesses(pose, uncertainty_of(covariances[0]), best.lengths),
             *warnings,
             *another_pose(
                 pose,
-                [each.poses[0] for each in others],
-                [each.likelihood for each in others],
+                [(each.poses[0], each.likelihood) for each in others],
+                covariances[0],
+                prior.degrees_of_freedom,
+                near=sum(
+                    each.likelihood
+                    for each, far in zip(estimates[1:], is_far[1:], strict=True)
+                    if not far
+                ),
             ),
         ),
         evidence=evidence,

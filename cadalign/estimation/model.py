@@ -34,9 +34,9 @@ class Model:
     mesh : Mesh, optional
         The model's surface, for `AlignResult.mesh`.
     shape_sigma : float, optional
-        Standard deviation of the keypoints' positions on the object about those on the stretched
-        model, along each axis [model units]: for an object that is only similar. None for the
-        exact, stretched model.
+        Standard deviation of the keypoints' positions about the model's, along each axis, before
+        the stretch [model units]: for an object that is only similar. None for the exact,
+        stretched model.
     stretch, known_axis
         As for `cadalign.fit`.
     stretch_sigma : float, optional

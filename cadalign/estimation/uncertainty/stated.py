@@ -19,7 +19,7 @@ from cadalign.estimation.uncertainty.posterior import FittedKeypoints, posterior
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
     Misfit,
-    uncertainty_of,
+    another_pose,
     weaknesses_of_keypoints,
 )
 from cadalign.geometry.alignment import Alignment
@@ -27,6 +27,7 @@ from cadalign.geometry.rotations import by_rotation
 
 if TYPE_CHECKING:
     from cadalign.estimation.consensus import RobustSearch
+    from cadalign.estimation.result_parts import Alternative
     from cadalign.estimation.uncertainty.evidence import AnyBasis
 
 
@@ -58,6 +59,7 @@ class KeypointStatistics(FittedKeypoints):
     """
 
     search: RobustSearch | None = None
+    alternatives: tuple[Alternative, ...] = ()
     points_covariance = points_cam_covariance = degrees_of_freedom = basis = None
 
     @cached_property
@@ -105,12 +107,17 @@ class KeypointStatistics(FittedKeypoints):
         weak = weaknesses_of_keypoints(
             kept,
             self.alignment,
-            uncertainty_of(self.covariance),
+            self.covariance,
             redundancy=2 * len(kept) - options.unknowns,
             stretch_sigma=options.stretch_sigma,
             doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
         )
-        return (*placed, *doubts, *weak)
+        others: tuple[str, ...] = ()
+        # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
+        if self.misfit is None and self.search is None:
+            poses = [(each.alignment, each.relative_likelihood) for each in self.alternatives]
+            others = another_pose(self.alignment, poses, self.covariance)
+        return (*placed, *doubts, *weak, *others)
 
     def _placed(self) -> tuple[str, ...]:
         """Warnings about keypoints and a principal point outside of the image."""

@@ -12,17 +12,20 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.shapes.parts import probability_within
 
 UNDETERMINED = 1.0
 """Relative standard deviation beyond which a length, distance or focal length is undetermined."""
 UNDETERMINED_ROTATION_DEG = 30.0
 _LEAST_GAIN = 0.9  # of a standard deviation, relative to that of the prior alone
+_ANY_ROTATION = math.sqrt(math.pi**2 / 3 + 2)  # standard deviation of uniform rotations [rad]
 _SHALLOW = 0.5  # differences of depth over the distance
 _THIN = 0.1  # spread along an axis over the largest that counts as nearly a plane
 _END_ON_DEG = 15.0
 _ANOTHER_DEG = 10.0
-_LIKELY = 0.1  # probability of an alternative that is worth a warning
+_LEAST_TURN = 1e-12  # [rad], and of a relative variance
+_REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
 _MOST_NAMED = 5  # outliers, in a sentence
 
 
@@ -56,7 +59,7 @@ def uncertainty_of(covariance: FloatArray) -> Uncertainty:
 def weaknesses_of_keypoints(
     points_3d: FloatArray,
     alignment: Alignment,
-    std: Uncertainty,
+    covariance: FloatArray,
     *,
     redundancy: int,
     stretch_sigma: float | None,
@@ -64,11 +67,13 @@ def weaknesses_of_keypoints(
 ) -> tuple[str, ...]:
     """Warn about stretch and motion that the keypoints do not determine, with the reason.
 
-    ``redundancy`` counts the equations minus the unknowns; beside a prior on the scales the
+    Not about two scales that are open together, whose ratio is not: one image leaves size and
+    distance open as far as the known axis does not tell them, and the standard deviations of both
+    say so. ``redundancy`` counts the equations minus the unknowns; beside a prior on the scales the
     keypoints must determine them better than the prior does; ``doubt`` is a warning about an
     estimated focal length that looks well determined.
     """
-    warnings = []
+    warnings, std = [], uncertainty_of(covariance)
     if redundancy <= 0:
         warnings.append(
             f"{len(points_3d)} keypoints fit exactly whatever they are: "
@@ -82,13 +87,15 @@ def weaknesses_of_keypoints(
     most = UNDETERMINED
     if stretch_sigma is not None:
         most = min(most, _LEAST_GAIN * stretch_sigma)
-    for axis, relative in enumerate(std.scale):
-        if relative > most:
+    is_open = [axis for axis, relative in enumerate(std.scale) if relative > most]
+    if len(is_open) == 1 or _ratio_deviation(covariance, is_open) > most:
+        for axis in is_open:
             why = _why_scale_is_weak(points_3d, alignment, axis)
-            warnings.append(_known_only(f"s_{'xyz'[axis]}", percent(relative), why))
-    warnings += _weak_rotation(std)
+            warnings.append(_known_only(f"s_{'xyz'[axis]}", percent(std.scale[axis]), why))
+    if std.rotation_deg > UNDETERMINED_ROTATION_DEG:
+        warnings.append(_known_only("the rotation", f"{std.rotation_deg:.2g} deg"))
     distance, spread = _distance(alignment, std)
-    if spread > UNDETERMINED * distance:
+    if spread > UNDETERMINED * distance and not is_open and std.focal <= UNDETERMINED:
         direction = "xyz"[int(np.argmax(std.translation))]
         share = f" ({percent(spread / distance)} of the distance)" if distance > 0 else ""
         size = f"{max(std.translation):.2g} model units{share}"
@@ -96,14 +103,27 @@ def weaknesses_of_keypoints(
     return tuple(warnings)
 
 
-def weaknesses(alignment: Alignment, std: Uncertainty) -> tuple[str, ...]:
-    """Warn about rotation, lengths, distance and focal length that are not determined."""
-    warnings = _weak_rotation(std)
-    for axis, relative in zip("xyz", std.scale, strict=True):
-        if relative > UNDETERMINED:
+def _ratio_deviation(covariance: FloatArray, axes: Sequence[int]) -> float:
+    """Standard deviation of the logarithm of the ratio of two scales; 0 without two."""
+    if len(axes) < 2:
+        return 0.0
+    logs = np.zeros(len(covariance))
+    logs[[6 + axes[0], 6 + axes[1]]] = 1.0, -1.0
+    return math.sqrt(max(float(logs @ covariance @ logs), 0.0))
+
+
+def weaknesses(alignment: Alignment, std: Uncertainty, lengths: FloatArray) -> tuple[str, ...]:
+    """Warn about lengths, distance and focal length that are not determined.
+
+    ``lengths`` (3,) are those of the object: what is open of one counts relative to all, for that
+    of a flat object's thickness changes little.
+    """
+    warnings, size = [], float(np.linalg.norm(lengths))
+    for axis, relative, length in zip("xyz", std.scale, lengths.tolist(), strict=True):
+        if relative * length > UNDETERMINED * size:
             warnings.append(_known_only(f"the length along {axis}", percent(relative)))
     distance, spread = _distance(alignment, std)
-    if spread > UNDETERMINED * distance > 0:
+    if spread > UNDETERMINED * distance > 0 and not warnings:
         warnings.append(_known_only("the distance", percent(spread / distance)))
     if std.focal > UNDETERMINED:
         warnings.append(_known_only("the focal length", percent(std.focal)))
@@ -112,12 +132,6 @@ def weaknesses(alignment: Alignment, std: Uncertainty) -> tuple[str, ...]:
 
 def _known_only(what: str, to: str, why: str = "") -> str:
     return f"{what} is known only to +-{to}" + (f": {why}" if why else "")
-
-
-def _weak_rotation(std: Uncertainty) -> list[str]:
-    if std.rotation_deg <= UNDETERMINED_ROTATION_DEG:
-        return []
-    return [_known_only("the rotation", f"{std.rotation_deg:.2g} deg")]
 
 
 def _distance(alignment: Alignment, std: Uncertainty) -> tuple[float, float]:
@@ -155,20 +169,37 @@ def percent(fraction: float) -> str:
 
 
 def another_pose(
-    best: Alignment, others: Sequence[Alignment], likelihoods: Sequence[float]
+    best: Alignment,
+    others: Sequence[tuple[Alignment, float]],
+    covariance: FloatArray,
+    degrees_of_freedom: float | None = None,
+    *,
+    near: float = 0.0,
 ) -> tuple[str, ...]:
-    """Warning about the likeliest of others, relative to the best, if it has a share of both."""
-    if not others:
+    """Warn about other poses, with likelihoods relative to the best, that the deviations conceal.
+
+    Those outside of the stated 95 % interval of the turn to them, where they have more than the 5 %
+    that it leaves them together; any, where the deviations leave every rotation open. ``near`` is
+    the likelihood of all further estimates whose pose is hardly another one.
+    """
+    total = 1 + near + sum(likelihood for _, likelihood in others)
+    is_open = covariance[:3, :3].trace() > (_LEAST_GAIN * _ANY_ROTATION) ** 2
+    concealed = []
+    for other, likelihood in others:
+        turn = vector_from_rotation(other.rotation @ best.rotation.T)
+        angle = float(np.linalg.norm(turn))
+        along = float(turn @ covariance[:3, :3] @ turn) / max(angle, _LEAST_TURN) ** 4
+        within = probability_within(1 / max(along, _LEAST_TURN), 1, degrees_of_freedom)
+        if math.degrees(angle) > _ANOTHER_DEG and (is_open or within > _REGION):
+            concealed.append((likelihood / total, math.degrees(angle)))
+    share = sum(probability for probability, _ in concealed)
+    if share <= 1 - _REGION:
         return ()
-    likeliest = int(np.argmax(likelihoods))
-    share = likelihoods[likeliest] / (1 + sum(likelihoods))
-    angle = angle_between(others[likeliest].rotation, best.rotation)
-    if share < _LIKELY or angle < _ANOTHER_DEG:
-        return ()
-    return (
-        f"another pose, {angle:.0f} deg away, has a probability of {100 * share:.0f} %: "
-        "see `alternatives`",
-    )
+    _, angle = max(concealed)
+    which = f"another pose, {angle:.0f} deg away, has"
+    if len(concealed) > 1:
+        which = f"other poses, the likeliest {angle:.0f} deg away, have"
+    return (f"{which} a probability of {percent(share)}: see `alternatives`",)
 
 
 @dataclass(frozen=True)

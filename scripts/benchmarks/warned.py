@@ -1,0 +1,267 @@
+"""Warnings on right data, which need none, and on wrong data, which they should name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import cadalign
+from benchmarks import section
+from benchmarks.section import BenchmarkData, RatioTable, Row, percent
+from cadalign import Alignment, Model, Result, ShapeModel, View
+from cadalign.arrays import FloatArray
+from cadalign.datasets import KeypointNet
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.unseen import UnseenObject
+from cadalign.evaluation.metrics.cramer_rao import probability_level
+from cadalign.geometry.metrics import rotation_error
+from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.seeding import instance_rng
+
+_PAIRS = 200  # of training models, which tell how models of a category differ
+_LEAST_KEYPOINTS = 4
+_STRETCH_SIGMA = 0.2
+_LARGE_DEG, _REGION = 10.0, 0.99
+_FARTHER = np.array([0.0, 0.0, 0.2])  # until a drawn object is in the image
+_MOVED_PX = 40.0
+_MIRRORED = 0.05  # distance of a keypoint from the other one's mirror image [diagonals]
+_KINDS = {
+    "another pose": ("another pose", "other poses"),
+    "not determined": ("known only to", "is held at 1"),
+    "nothing to test": ("fit exactly",),
+    "misfit": ("residuals are", "does not fit", "predict it", "contradict", "corrected,"),
+}
+
+
+class _Differ(NamedTuple):
+    """How models of a category differ: standard deviations of keypoints and of log stretches."""
+
+    shape: float
+    stretch: float
+
+
+class _Case(NamedTuple):
+    """A model, its noisy keypoints in a view by id, and the object's pose."""
+
+    model: Model | ShapeModel
+    ids: list[int]
+    points_3d: FloatArray  # (n, 3) of the object
+    points_2d: FloatArray  # (n, 2)
+    gt: Alignment
+
+
+@dataclass
+class Warned:
+    """Warnings on right data by kind, and how many of them are of large errors; on wrong data.
+
+    Objects of KeypointNet's split val with all keypoints, up to so many of each category. Right
+    models are: the object's own one, stretched; one from which its keypoints are displaced at
+    random, and a random other one, by as much as models of the category differ (`shape_sigma`,
+    `stretch_sigma`); the shape that was learned from the split train. Whether warnings tell good
+    estimates from bad ones is seen in rotations off by more than 10 deg or beyond the stated 99 %
+    region, among those warned of and among the others.
+    """
+
+    objects: int = 40
+    """Objects of each category."""
+    noise_px: float = 2.0
+    """Standard deviation of the keypoints [px]."""
+    categories: tuple[str, ...] = ()
+    """Categories; all by default."""
+
+    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
+        rows = list(self.cases(KeypointNet(given.needed())))
+        right = [row for row in rows if row["data"] == "right"]
+        wrong = [row for row in rows if row["data"] != "right"]
+        yield RatioTable("Warned of on right data [%]", _by(right, ("model", "category"), _shares))
+        yield RatioTable("Wrong data named [%]", _by(wrong, ("data", "model"), _named))
+
+    def cases(self, dataset: KeypointNet) -> Iterator[Row]:
+        """Every case with its warnings and errors."""
+        categories = self.categories or tuple(dataset.categories)
+        shapes = {name: section.learned_shape(dataset, name) for name in categories}
+        for number, category in enumerate(categories):
+            differ = models_differ(dataset, category)
+            foreign = shapes[categories[number - 1]]
+            options = {"noise_px": self.noise_px, "max_models": self.objects}
+            for place, seen in section.unseen_objects(dataset, category, self.objects, **options):
+                rng = instance_rng(0, category, str(place), "warned")
+                for name, case in self._right(dataset, seen, shapes[category], differ, rng):
+                    labels = {"category": category, "model": name}
+                    yield labels | {"data": "right"} | _outcome(case, self.noise_px)
+                    for how, wrong in _wrong(case, foreign, rng):
+                        yield labels | {"data": how} | _outcome(wrong, self.noise_px)
+
+    def _right(
+        self,
+        dataset: KeypointNet,
+        seen: UnseenObject,
+        shape: ShapeModel,
+        differ: _Differ,
+        rng: np.random.Generator,
+    ) -> Iterator[tuple[str, _Case]]:
+        """The object with each kind of right model."""
+        points, ids = seen.xyz[seen.rows], seen.ids.tolist()
+        if len(points) < _LEAST_KEYPOINTS:
+            return
+        stretch = np.exp(np.append(0.0, rng.normal(0, _STRETCH_SIGMA, 2)))
+        own = Model(points_3d=points / stretch, ids=ids)
+        yield "own", _Case(own, ids, points, seen.points_2d, seen.gt)
+        how: dict[str, Any] = {"shape_sigma": differ.shape, "stretch_sigma": differ.stretch}
+        stretch = np.exp(np.append(0.0, rng.normal(0, differ.stretch, 2)))
+        object_points = (points + rng.normal(0, differ.shape, points.shape)) * stretch
+        gt, noise = seen.gt, rng.normal(0, self.noise_px, seen.points_2d.shape)
+        while not KEYPOINT_CAMERA.contains(
+            KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
+        ).all():
+            gt = replace(gt, translation=gt.translation + _FARTHER)
+        pixels = KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
+        drawn = Model(points_3d=points, ids=ids, **how)
+        yield "similar, drawn", _Case(drawn, ids, object_points, pixels, gt)
+        others = _training_models(dataset, seen.task.category)
+        for number in rng.permutation(len(others)).tolist():
+            of_other, xyz = others[number]
+            shared = np.isin(ids, of_other)
+            if shared.sum() >= min(6, len(ids)):
+                other = Model(points_3d=xyz, ids=of_other, **how)
+                kept = [name for name in ids if name in of_other]
+                yield (
+                    "similar, other",
+                    _Case(other, kept, points[shared], seen.points_2d[shared], seen.gt),
+                )
+                break
+        known = np.isin(ids, shape.ids)
+        kept = [name for name in ids if name in shape.ids]
+        yield "learned", _Case(shape, kept, points[known], seen.points_2d[known], seen.gt)
+
+
+# Data ---------------------------------------------------------------------------------------------
+
+
+def _training_models(dataset: KeypointNet, category: str) -> list[tuple[list[int], FloatArray]]:
+    models = dataset.subset(split="train")[category]
+    return [(each.keypoints.ids.tolist(), each.keypoints.xyz) for each in models]
+
+
+def models_differ(dataset: KeypointNet, category: str) -> _Differ:
+    """How models of the split train differ from each other, shifted and stretched onto each other.
+
+    Axes along which the models are flat have no stretch.
+    """
+    models = _training_models(dataset, category)
+    rng = instance_rng(0, category, "differ")
+    squares, equations, logs = 0.0, 0, []
+    for _ in range(_PAIRS):
+        (ids, points), (other_ids, other) = (models[k] for k in rng.choice(len(models), 2, False))
+        shared = sorted(set(ids) & set(other_ids))
+        if len(shared) < _LEAST_KEYPOINTS:
+            continue
+        a = other[[other_ids.index(name) for name in shared]]
+        b = points[[ids.index(name) for name in shared]]
+        a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+        stretch = np.sqrt((b * b).sum(axis=0) / np.maximum((a * a).sum(axis=0), 1e-12))
+        thick = np.minimum(a.std(axis=0), b.std(axis=0)) > 0.02
+        if thick[0]:
+            logs += [np.log(stretch[k] / stretch[0]) for k in (1, 2) if thick[k]]
+        rest = b / np.where(thick, stretch, 1.0) - a
+        squares += float((rest**2).sum())
+        equations += rest.size - 3 - int(thick.sum())
+    return _Differ(float(np.sqrt(squares / equations)), float(np.std(logs)) if logs else 0.2)
+
+
+def _wrong(
+    case: _Case, foreign: ShapeModel, rng: np.random.Generator
+) -> Iterator[tuple[str, _Case]]:
+    """The case with a keypoint moved, two of them swapped, or another category's model."""
+    row, angle = int(rng.integers(len(case.ids))), rng.uniform(0, 2 * np.pi)
+    moved = case.points_2d.copy()
+    moved[row] += _MOVED_PX * np.array([np.cos(angle), np.sin(angle)])
+    if KEYPOINT_CAMERA.contains(moved).all():
+        yield "moved by 40 px", case._replace(points_2d=moved)
+    mirrored = case.points_3d * [-1, 1, 1]
+    pairs = [
+        (i, j)
+        for i, j in combinations(range(len(case.ids)), 2)
+        if np.linalg.norm(mirrored[i] - case.points_3d[j]) < _MIRRORED
+        and np.linalg.norm(case.points_2d[i] - case.points_2d[j]) > _MOVED_PX
+    ]
+    if pairs:
+        i, j = pairs[int(rng.integers(len(pairs)))]
+        swapped = case.points_2d.copy()
+        swapped[[i, j]] = swapped[[j, i]]
+        yield "left and right swapped", case._replace(points_2d=swapped)
+    count = min(len(case.ids), len(foreign.ids))
+    ids, model = list(foreign.ids[:count]), foreign
+    if isinstance(case.model, Model):
+        how = {"shape_sigma": case.model.shape_sigma, "stretch_sigma": case.model.stretch_sigma}
+        model = Model(points_3d=foreign.mean[:count], ids=ids, **how)
+    seen = case.points_3d[:count], case.points_2d[:count]
+    yield "another category", _Case(model, ids, *seen, case.gt)
+
+
+# Outcomes -----------------------------------------------------------------------------------------
+
+
+def _outcome(case: _Case, noise_px: float) -> Row:
+    """Whether the case is refused; kinds of its warnings, and whether the rotation is far off."""
+    view = View(KEYPOINT_CAMERA, case.points_2d, ids=case.ids, sigma=noise_px)
+    result = section.attempt(cadalign.align, case.model, view)
+    if result is None:
+        return {"refused": True}
+    texts = result.warnings
+    row: Row = {"refused": False, "texts": texts, "warned": bool(texts)}
+    kinds = {
+        kind: any(part in text for text in texts for part in parts)
+        for kind, parts in _KINDS.items()
+    }
+    return row | kinds | _errors(result, case.gt)
+
+
+def _errors(result: Result, gt: Alignment) -> Row:
+    assert result.covariance is not None
+    turn = vector_from_rotation(result.alignment.rotation @ gt.rotation.T)
+    level = probability_level(turn, result.covariance[:3, :3], result.degrees_of_freedom)
+    is_large = rotation_error(est=result.alignment, gt=gt) > _LARGE_DEG
+    return {"large": is_large, "beyond": level is not None and level > _REGION}
+
+
+def _by(rows: list[Row], names: tuple[str, str], columns: Callable[[list[Row]], Row]) -> list[Row]:
+    """Rows of a table: columns by both of two names, and by the first alone; none of refusals."""
+    first, second = names
+    rows, found = [row for row in rows if not row["refused"]], []
+    for key in dict.fromkeys(row[first] for row in rows):
+        chosen = [row for row in rows if row[first] == key]
+        for label in dict.fromkeys(row[second] for row in chosen):
+            of_both = [row for row in chosen if row[second] == label]
+            found.append({first: key, second: label} | columns(of_both))
+        found.append({first: key, second: "all"} | columns(chosen))
+    return found
+
+
+def _shares(rows: list[Row]) -> Row:
+    warned, others = ([row for row in rows if row["warned"] == way] for way in (True, False))
+    return {
+        "count": len(rows),
+        "warned": percent([row["warned"] for row in rows]),
+        **{kind: percent([row[kind] for row in rows]) for kind in _KINDS},
+        "> 10 deg, warned": _share(warned, "large"),
+        "> 10 deg, others": _share(others, "large"),
+        "beyond 99 %, warned": _share(warned, "beyond"),
+        "beyond 99 %, others": _share(others, "beyond"),
+    }
+
+
+def _share(rows: list[Row], name: str) -> float | None:
+    return percent([row[name] for row in rows]) if rows else None
+
+
+def _named(rows: list[Row]) -> Row:
+    return {
+        "count": len(rows),
+        "named": percent([row["misfit"] for row in rows]),
+        "warned": percent([row["warned"] for row in rows]),
+    }

@@ -1,0 +1,129 @@
+"""Warnings tell what the standard deviations do not: right problems seldom have one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from support.problems import problem_of
+
+from cadalign import Alignment, Camera, Model, View, align, fit
+from cadalign.datasets import KeypointNet
+from cadalign.estimation.uncertainty.summary import (
+    another_pose,
+    uncertainty_of,
+    weaknesses,
+    weaknesses_of_keypoints,
+)
+from cadalign.geometry.rotations import angle_between, rotation_from_vector
+
+CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
+POSE = Alignment(np.eye(3), [0.0, 0.0, 4.0], np.ones(3))
+MOST_RIGHT = 0.10
+
+
+def with_other(angle_deg: float, share: float, own_deg: float = 2.0) -> tuple[str, ...]:
+    """Warnings of two poses, one with that share of the probability, and of their moments."""
+    turn = np.radians([angle_deg, 0.0, 0.0])
+    other = Alignment(rotation_from_vector(turn), POSE.translation, np.ones(3))
+    covariance = np.zeros((9, 9))
+    covariance[:3, :3] = np.radians(own_deg) ** 2 * np.eye(3) + share * np.outer(turn, turn)
+    return another_pose(POSE, [(other, share / (1 - share))], covariance)
+
+
+def deviations(logs: np.ndarray) -> np.ndarray:
+    """A covariance (9, 9) with that of the log lengths (3, 3)."""
+    covariance = 1e-6 * np.eye(9)
+    covariance[6:, 6:] += logs
+    return covariance
+
+
+def test_another_pose_is_named_where_the_deviations_conceal_it() -> None:
+    (text,) = with_other(170, 0.1)
+    assert text.startswith("another pose, 170 deg away, has a probability of 10 %")
+    assert not with_other(170, 0.03)  # less than what the 95 % interval leaves
+    assert not with_other(90, 0.4)  # the deviations reach that far
+    assert not with_other(6, 0.1)
+    assert with_other(170, 0.5)  # deviations that leave all rotations open say nothing of two
+
+
+def test_poses_that_are_concealed_together_are_one_warning() -> None:
+    covariance = np.zeros((9, 9))
+    covariance[:3, :3] = np.radians(20) ** 2 * np.eye(3)
+    turns = [[170, 0, 0], [0, 160, 0]]
+    poses = [
+        Alignment(rotation_from_vector(np.radians(turn)), POSE.translation, np.ones(3))
+        for turn in turns
+    ]
+    (text,) = another_pose(POSE, [(poses[0], 0.04), (poses[1], 0.04)], covariance)
+    assert text.startswith("other poses, the likeliest 1")
+    assert "7 %" in text
+
+
+def test_the_thickness_of_a_flat_object_is_not_warned_of() -> None:
+    std = uncertainty_of(deviations(np.diag([0.01, 0.01, 2.0**2])))
+    assert weaknesses(POSE, std, np.array([0.4, 0.9, 0.02])) == ()
+    (text,) = weaknesses(POSE, std, np.array([0.4, 0.9, 0.8]))
+    assert text == "the length along z is known only to +-200 %"
+
+
+def test_a_size_that_one_image_leaves_open_is_not_warned_of() -> None:
+    """Scales that are open together, as those of a knife whose known axis is thin."""
+    points = np.random.default_rng(0).normal(size=(8, 3)) * [0.01, 1, 1]
+    common = np.array([0.0, 1.5, 1.5])
+    given: dict[str, Any] = {"redundancy": 8, "stretch_sigma": None, "doubt": None}
+    together = deviations(np.outer(common, common))
+    assert weaknesses_of_keypoints(points, POSE, together, **given) == ()
+    apart = deviations(np.diag(common**2))
+    texts = weaknesses_of_keypoints(points, POSE, apart, **given)
+    assert [text[:3] for text in texts] == ["s_y", "s_z"]
+
+
+def test_fit_names_another_pose_that_its_deviations_do_not_reach() -> None:
+    named = 0
+    for seed in range(20):
+        problem = problem_of(seed, points=4, noise_px=0.0)
+        result = fit(problem.points_3d, problem.points_2d, problem.camera, sigma=0.05)
+        angles = [
+            angle_between(each.alignment.rotation, result.alignment.rotation)
+            for each in result.alternatives
+        ]
+        assert result.std is not None
+        if any(angle > max(30, 5 * result.std.rotation_deg) for angle in angles):
+            assert any("pose" in text for text in result.warnings)
+            named += 1
+    assert named > 3
+
+
+@pytest.mark.long
+def test_right_models_seldom_have_a_warning_and_wrong_ones_do(
+    real_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "scripts")
+    from benchmarks.warned import Warned
+
+    cases = Warned(objects=12).cases(KeypointNet(real_data / "keypointnet"))
+    rows = [row for row in cases if not row["refused"]]
+    for kinds in (("own",), ("similar, drawn", "similar, other"), ("learned",)):
+        right = [row["warned"] for row in rows if row["data"] == "right" and row["model"] in kinds]
+        assert np.mean(right) <= MOST_RIGHT, kinds
+    named = {
+        (data, model): np.mean([r["misfit"] for r in rows if (r["data"], r["model"]) == key])
+        for key in {(row["data"], row["model"]) for row in rows}
+        for data, model in [key]
+    }
+    assert named["moved by 40 px", "own"] >= 0.9
+    assert named["moved by 40 px", "learned"] >= 0.5
+    assert named["left and right swapped", "own"] >= 0.95
+    assert min(rate for (data, _), rate in named.items() if data == "another category") >= 0.8
+
+
+def test_similar_models_of_right_size_have_no_warning() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-0.5, 0.5, (12, 3))
+    truth = Alignment(rotation_from_vector(rng.normal(size=3)), [0.0, 0.0, 3.0], np.ones(3))
+    pixels = CAMERA.project(truth.apply(points + rng.normal(0, 0.02, points.shape)))
+    model = Model(points_3d=points, shape_sigma=0.02)
+    assert align(model, View(CAMERA, pixels, sigma=1.0)).warnings == ()

@@ -72,13 +72,16 @@ class Warned:
     """Standard deviation of the keypoints [px]."""
     categories: tuple[str, ...] = ()
     """Categories; all by default."""
+    wrong: bool = True
+    """Measure wrong data, too."""
 
     def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
         rows = list(self.cases(KeypointNet(given.needed())))
         right = [row for row in rows if row["data"] == "right"]
         wrong = [row for row in rows if row["data"] != "right"]
         yield RatioTable("Warned of on right data [%]", _by(right, ("model", "category"), _shares))
-        yield RatioTable("Wrong data named [%]", _by(wrong, ("data", "model"), _named))
+        if wrong:
+            yield RatioTable("Wrong data named [%]", _by(wrong, ("data", "model"), _named))
 
     def cases(self, dataset: KeypointNet) -> Iterator[Row]:
         """Every case with its warnings and errors."""
@@ -93,7 +96,7 @@ class Warned:
                 for name, case in self._right(dataset, seen, shapes[category], differ, rng):
                     labels = {"category": category, "model": name}
                     yield labels | {"data": "right"} | _outcome(case, self.noise_px)
-                    for how, wrong in _wrong(case, foreign, rng):
+                    for how, wrong in list(_wrong(case, foreign, rng)) * self.wrong:
                         yield labels | {"data": how} | _outcome(wrong, self.noise_px)
 
     def _right(

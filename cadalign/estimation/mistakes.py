@@ -19,6 +19,7 @@ OTHER_SIZES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
 _LEAST_GAIN = 2.0  # of -2 log likelihood, by which corrected data must explain more
 _DECISIVE = 12.0  # the same where nothing is rejected
 _AS_LIKELY = 6.0  # difference of -2 log likelihoods of mistakes that are both named
+_SURE = 2 * math.log(100)  # the same of an uncertain shape; chance gives odds of 100 once in 100
 _LARGEST_LOG = math.log(1e6)  # of the odds, in a message
 _UPRIGHT = 0.5  # cosine between the model's y axis and the photo's upwards, at least
 _MOST_INSIDE = 0.8  # of the keypoints lie in their image
@@ -186,7 +187,7 @@ def find_likelier(
     """
 
     def likelier(tried: Tried) -> list[Explained]:
-        return [each for _, each in tried if each.score < score - _AS_LIKELY]
+        return [each for _, each in tried if each.score < score - _SURE]
 
     # About a centred principal point, flips are the same as a mirrored model.
     tried = try_mistakes(explain, count, _MISTAKES[:2])

@@ -250,7 +250,7 @@ def test_likelihoods_tell_mistakes_that_a_similar_model_follows(mistake: str) ->
                 followed += 1
                 named += any("times as likely" in text for text in texts)
     assert alarms == 0
-    assert named >= 0.6 * followed > 0
+    assert named >= 0.3 * followed > 0
 
 
 def test_what_explains_no_more_keypoints_is_no_mistake() -> None:

@@ -190,7 +190,7 @@ class TestRefusals:
 
     def test_of_a_model_without_a_mesh(self) -> None:
         shown = scene(0)
-        with pytest.raises(InputError, match="no mesh, which a photo wants"):
+        with pytest.raises(InputError, match="no mesh, which a photo needs"):
             shown.aligned(Model(points_3d=shown.mesh.vertices), image=shown.pixels)
 
     def test_of_a_wide_lens(self) -> None:

@@ -34,7 +34,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class MaskCandidates:
     """Alignments of a model to a mask, the likeliest first."""
 
     result: Result
@@ -47,7 +47,7 @@ class Candidates:
     camera: Camera
 
     @classmethod
-    def of(cls, model: Model | ShapeModel, camera: Camera, result: Result) -> Candidates:
+    def of(cls, model: Model | ShapeModel, camera: Camera, result: Result) -> MaskCandidates:
         """The candidates that a result from a mask alone states."""
         best = Candidate(result.alignment, result.points_3d, result.bounds, 1.0)
         others = (

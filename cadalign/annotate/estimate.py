@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.candidates import Candidates
+from cadalign.annotate.candidates import MaskCandidates
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.problem import LEAST_SIGMA, LIKELY_STRETCH, Known, LiveProblem
 from cadalign.arrays import BoolArray, FloatArray
@@ -52,7 +52,7 @@ class LiveAlignment:
     prior_lengths: FloatArray = field(default_factory=lambda: np.zeros(3))
     """(3,), standard deviations of the logarithms of the lengths before any pair."""
     also_used: tuple[str, ...] = ()  # evidence beyond the photo's pairs
-    candidates: Candidates | None = None  # where the mask alone says where the search begins
+    candidates: MaskCandidates | None = None  # where the mask alone says where the search begins
     chances: FloatArray = field(default_factory=lambda: np.empty(0))
     """(k,), their probabilities with the pairs; 0 for those that these rule out."""
     frames: tuple[Wireframe, ...] = ()  # lines of the model, warped to each of several candidates

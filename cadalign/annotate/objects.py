@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.annotate.candidates import Candidates
+from cadalign.annotate.candidates import MaskCandidates
 from cadalign.annotate.document import AnnotationDocument, History, Pair, Pixel
 from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.evidence import FurtherEvidence, MaskDrawing, draw_mask
@@ -61,7 +61,7 @@ class PhotoState:
         default=None, repr=False
     )
     """The last estimate of the object alone, from all photos, with the document it belongs to."""
-    by_mask: tuple[object, dict[Camera, Candidates]] | None = field(default=None, repr=False)
+    by_mask: tuple[object, dict[Camera, MaskCandidates]] | None = field(default=None, repr=False)
     """What the mask alone allows, with what it depends on."""
 
     @property
@@ -143,8 +143,8 @@ class PhotoState:
         )
 
     @property
-    def allowed_by_mask(self) -> dict[Camera, Candidates]:
-        """What the mask alone allows, which is kept until more than pairs changes."""
+    def allowed_by_mask(self) -> dict[Camera, MaskCandidates]:
+        """Alignments that the mask alone allows, kept until more than pairs changes."""
         document = self.document
         key = replace(document.evidence, start=None), document.priors, self.model
         if self.by_mask is None or self.by_mask[0] != key:

@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.annotate.candidates import Candidates
+from cadalign.annotate.candidates import MaskCandidates
 from cadalign.annotate.models import ObjectShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
@@ -68,7 +68,7 @@ class Known:
     estimates_focal: bool = False  # estimate the focal lengths of all photos
     focal_prior: FocalPrior | None = None  # on these
     uses_photos: bool = False  # as evidence
-    by_mask: dict[Camera, Candidates] = field(default_factory=dict)
+    by_mask: dict[Camera, MaskCandidates] = field(default_factory=dict)
     """What the mask alone allows, by the camera; kept while nothing but pairs changes."""
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
@@ -97,7 +97,7 @@ class LiveProblem:
     estimates_focal: bool
     focal_prior: FocalPrior | None
     init: Alignment | None = None
-    by_mask: dict[Camera, Candidates] = field(default_factory=dict)
+    by_mask: dict[Camera, MaskCandidates] = field(default_factory=dict)
 
     @classmethod
     def of(cls, known: Known, observation: Observation) -> LiveProblem:
@@ -174,13 +174,13 @@ class LiveProblem:
         return few and view.mask is not None and self.init is None
 
     @property
-    def candidates(self) -> Candidates:
-        """What the mask of the only view allows."""
+    def candidates(self) -> MaskCandidates:
+        """Alignments that the mask of the only view allows."""
         (view,) = self.views
         if view.camera not in self.by_mask:
             alone = replace(view, points_2d=(), ids=None, sigma=1.0, depth=None, image=None)
             result = align(self.model, alone, size=self.size)
-            self.by_mask[view.camera] = Candidates.of(self.model, view.camera, result)
+            self.by_mask[view.camera] = MaskCandidates.of(self.model, view.camera, result)
         return self.by_mask[view.camera]
 
     @property

@@ -24,6 +24,7 @@ from cadalign.estimation.mistakes import (
     disagreeing,
     find_mistake,
     larger_sizes,
+    log_expected_by_chance,
     share_as_moderate,
 )
 from cadalign.estimation.options import (
@@ -103,11 +104,9 @@ class RobustSearch:
 
         It carries the best score reached.
         """
-        errors = np.linalg.norm(best.residuals[best.inliers], axis=1)
-        size = SAMPLE_SIZES[MINIMAL_SOLVERS[self.ransac.minimal]]
         check_support(
-            [Support(errors, len(best.inliers), self.area)],
-            size + (self.options.focal == "estimate"),  # which half a keypoint determines
+            [self._support(best.residuals, best.inliers)],
+            self._sample_size,
             max_reproj_error=self.threshold,
             score=best.score,
             where="points_2d",
@@ -116,6 +115,30 @@ class RobustSearch:
             share=self._share_as_moderate(best.alignment),
             disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
         )
+
+    def doubt(self, residuals: FloatArray, inliers: BoolArray) -> str | None:
+        """Warn where chance supports as many, and a moderate stretch alone speaks for them.
+
+        ``residuals`` (n, 2) [px] and ``inliers`` (n,) are those of the estimate.
+        """
+        support = self._support(residuals, inliers)
+        expected = log_expected_by_chance(support, self._sample_size, SOLUTIONS_OF_FOUR)
+        if expected <= np.log(_CHANCE):
+            return None
+        return (
+            f"{int(inliers.sum())} of {len(inliers)} keypoints agree, hardly more than chance "
+            "gives: check the others, or give more"
+        )
+
+    @property
+    def _sample_size(self) -> int:
+        """Keypoints that determine an alignment; a focal length takes half of one."""
+        size = SAMPLE_SIZES[MINIMAL_SOLVERS[self.ransac.minimal]]
+        return size + (self.options.focal == "estimate")
+
+    def _support(self, residuals: FloatArray, inliers: BoolArray) -> Support:
+        errors = np.linalg.norm(residuals[inliers], axis=1)
+        return Support(errors, len(inliers), self.area)
 
     def _share_as_moderate(self, alignment: Alignment) -> float:
         """The share of alignments by chance that are stretched as little; 1 if unknown."""

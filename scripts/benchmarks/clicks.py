@@ -15,7 +15,7 @@ import numpy as np
 from benchmarks.photo import PhotoClicks, bop_cases
 from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, clocked, spread, summary
 from cadalign import Camera, Model, View, align
-from cadalign.annotate.candidates import Candidates, best_click
+from cadalign.annotate.candidates import MaskCandidates, best_click
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
@@ -174,7 +174,7 @@ class ProposalClicks:
         )
         mask = cast_geometry(scene, _CAMERA, gt).mask
         wall, _, result = clocked(lambda: align(model, View(_CAMERA, mask=mask)))
-        candidates = Candidates.of(model, _CAMERA, result)
+        candidates = MaskCandidates.of(model, _CAMERA, result)
         predicted = candidates.predicted(ids, points)
         chances = candidates.probabilities((), np.empty((0, 3)), np.empty((0, 2)))
         first, clicked = int(np.count_nonzero(chances)), list[int]()

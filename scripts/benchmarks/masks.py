@@ -262,7 +262,7 @@ def _drawn(model: _Meshed, rng: np.random.Generator, **how: Any) -> _Case | None
 
 
 def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed: int) -> Row:
-    """Where exact masks end, of objects of one distance: errors, and whether these are stated."""
+    """Ends of exact masks, of objects at one distance: errors, and whether these are stated."""
     found = []
     for number in range(count):
         rng = np.random.default_rng([seed, 3, round(100 * fill[0]), number])

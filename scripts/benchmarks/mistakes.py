@@ -25,27 +25,27 @@ _WRONG_DEG = 10.0
 _CLAUSES = ("is mirrored", "are swapped", "is flipped", "from the bottom")
 
 
-class Seen(NamedTuple):
+class SeenModel(NamedTuple):
     """Keypoints of a stretched, upright object in a photo, and its rotation."""
 
     points_3d: FloatArray
     points_2d: FloatArray
     rotation: FloatArray
 
-    def mirrored(self) -> Seen:
+    def mirrored(self) -> SeenModel:
         """The same with the model mirrored."""
         return self._replace(points_3d=self.points_3d * [-1, 1, 1])
 
-    def flipped(self) -> Seen:
+    def flipped(self) -> SeenModel:
         """The same with u counted from the other side."""
         last = _CAMERA.width - 2 * PIXEL_CENTRE
         return self._replace(points_2d=self.points_2d * [-1, 1] + [last, 0])
 
-    def swapped(self) -> Seen:
+    def swapped(self) -> SeenModel:
         """The same with u and v swapped."""
         return self._replace(points_2d=self.points_2d[:, ::-1].copy())
 
-    def with_outliers(self, rng: np.random.Generator) -> Seen:
+    def with_outliers(self, rng: np.random.Generator) -> SeenModel:
         """The same, some keypoints anywhere in the image."""
         count = len(self.points_2d)
         wrong = rng.choice(count, round(_OUTLIERS * count), replace=False)
@@ -119,7 +119,9 @@ def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: flo
     return row
 
 
-def _seen(models: list[FloatArray], rng: np.random.Generator, count: int | None = None) -> Seen:
+def _seen(
+    models: list[FloatArray], rng: np.random.Generator, count: int | None = None
+) -> SeenModel:
     """Some keypoints of a random model."""
     points = models[rng.integers(len(models))]
     most = min(len(points), _MOST)
@@ -132,10 +134,10 @@ def _seen(models: list[FloatArray], rng: np.random.Generator, count: int | None 
     rotation = np.array([right, np.cross(right, backward), -backward])
     stretched = points * np.exp([0.0, *rng.normal(0, _STRETCH_SIGMA, 2)])
     pixels = _CAMERA.project(stretched @ rotation.T + [0, 0, rng.uniform(*_DISTANCE)])
-    return Seen(points, pixels + rng.normal(0, _NOISE_PX, pixels.shape), rotation)
+    return SeenModel(points, pixels + rng.normal(0, _NOISE_PX, pixels.shape), rotation)
 
 
-def _said(seen: Seen, shape_sigma: float) -> tuple[bool, bool, bool]:
+def _said(seen: SeenModel, shape_sigma: float) -> tuple[bool, bool, bool]:
     """True for a wrong rotation without a word, for a mistake that is named, and for a refusal."""
     try:
         found = _estimate(seen, shape_sigma)
@@ -147,7 +149,7 @@ def _said(seen: Seen, shape_sigma: float) -> tuple[bool, bool, bool]:
     return not texts and turn > _WRONG_DEG, named, False
 
 
-def _estimate(seen: Seen, shape_sigma: float) -> Result:
+def _estimate(seen: SeenModel, shape_sigma: float) -> Result:
     if not shape_sigma:
         return fit(seen.points_3d, seen.points_2d, _CAMERA, ransac=RansacOptions())
     model = Model(points_3d=seen.points_3d, shape_sigma=shape_sigma)

@@ -38,7 +38,7 @@ _KINDS = {
 
 
 class _Differ(NamedTuple):
-    """How models of a category differ: standard deviations of keypoints and of log stretches."""
+    """Differences of a category's models: standard deviations of keypoints and of log stretches."""
 
     shape: float
     stretch: float
@@ -151,7 +151,7 @@ def _training_models(dataset: KeypointNet, category: str) -> list[tuple[list[int
 
 
 def models_differ(dataset: KeypointNet, category: str) -> _Differ:
-    """How models of the split train differ from each other, shifted and stretched onto each other.
+    """Differences of models of the split train, shifted and stretched onto each other.
 
     Axes along which the models are flat have no stretch.
     """
@@ -210,7 +210,7 @@ def _wrong(
 
 
 def _outcome(case: _Case, noise_px: float) -> Row:
-    """Whether the case is refused; kinds of its warnings, and whether the rotation is far off."""
+    """Refusal of the case, or kinds of its warnings and whether the rotation is far off."""
     view = View(KEYPOINT_CAMERA, case.points_2d, ids=case.ids, sigma=noise_px)
     result = section.attempt(cadalign.align, case.model, view)
     if result is None:

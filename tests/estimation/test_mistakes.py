@@ -155,16 +155,20 @@ def test_outliers_raise_no_alarm() -> None:
 
 def test_moderate_alignments_of_few_keypoints_are_no_chance() -> None:
     """Chance stretches by more: 2 outliers of 7 keypoints are found, scattered ones refused."""
-    refused = accepted = 0
+    refused = doubted = accepted = 0
     for seed in range(100):
         problem = seen(seed, BOTTLE, count=7)
-        refused += "no alignment is supported" in spoiled(problem, seed).complaint()
+        said = spoiled(problem, seed).complaint()
+        refused += "no alignment is supported" in said
+        doubted += "5 of 7 keypoints agree, hardly more than chance gives" in said
         pixels = np.random.default_rng([seed, 3]).uniform(
             problem.points_2d.min(axis=0), problem.points_2d.max(axis=0), (7, 2)
         )
         scattered = replace(problem, points_2d=pixels).complaint()
         accepted += "no alignment is supported" not in scattered
     assert refused <= 20
+    assert doubted >= 8, "these would be refused if chance were not stretched"
+    assert not any("hardly more" in seen(seed, count=12).complaint() for seed in range(20))
     assert accepted <= 2
 
 

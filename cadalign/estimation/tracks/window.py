@@ -101,7 +101,7 @@ class Window:
 
 
 class SeenMotion(NamedTuple):
-    """What frames that have left a window showed of the strength of the motion.
+    """Strength of the motion by the frames that have left a window.
 
     ``squares`` (2,) are those of residuals of rotation and translation, in squared strengths, and
     ``told`` (2,) how many numbers the evidence tells of them, in ``frames`` frames.

@@ -102,6 +102,9 @@ class KeypointStatistics(FittedKeypoints):
 
             unverified = unverified_stretch(self)
             doubts = [] if unverified is None else [unverified]
+        chance = self.search and self.search.doubt(self.residuals, self.inliers)
+        if chance:
+            doubts.append(chance)
         kept, options = self.points_3d[self.inliers], self.options
         is_estimated = options.focal == "estimate"
         weak = weaknesses_of_keypoints(

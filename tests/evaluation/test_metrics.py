@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,9 @@ from cadalign.evaluation import metrics as room
 from cadalign.evaluation import register_metric
 from cadalign.evaluation.metrics import registry
 from cadalign.evaluation.metrics.sets import score_columns
-from cadalign.evaluation.metrics.table import ROTATION, Metric
+from cadalign.evaluation.metrics.table import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.photos.protocols import SETS
+from cadalign.evaluation.plots import cumulative
 from cadalign.report import headline_text
 
 
@@ -199,3 +201,20 @@ def test_functions_are_metrics_by_their_names() -> None:
     assert simulate(metrics=depth_error, methods="epnp").method.tolist() == ["epnp"] * 3
     with pytest.raises(InputError, match="metrics: a function that is called <lambda>"):
         simulate(metrics=[lambda *, est: 0.0])
+
+
+@pytest.mark.parametrize(
+    ("metric", "places", "shares"),
+    [(ROTATION, [0.5, 1.0, 9.0], [0, 50, 75]), (BOX_IOU, [0.5, 1.0, 2.5], [75, 75, 25])],
+)
+def test_curves_count_small_errors_and_large_overlaps(
+    metric: Metric, places: list[float], shares: list[float]
+) -> None:
+    cells = {
+        "method": np.array(["mine"] * 4),
+        "status": np.array(["ok", "ok", "ok", "failed"]),
+        metric.key: np.array([1.0, 1.0, 3.0, np.nan]),
+    }
+    run: Any = SimpleNamespace(methods=("mine",), cells=cells)
+    (trace,) = cumulative([run], metric, np.array(places), title="").traces
+    assert list(trace.y) == shares

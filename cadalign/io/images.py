@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -67,8 +68,11 @@ def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
     except UnidentifiedImageError:
         reason = f"it begins like none of {', '.join(FORMATS)}"
         raise DataError(f"not an image that can be read ({reason})", where=where) from None
-    # SyntaxError: Pillow's word for a broken PNG.
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    # SyntaxError: Pillow's word for a broken PNG; the last two, for numbers of a TIFF or of EXIF.
+    except (
+        *(OSError, ValueError, SyntaxError, Image.DecompressionBombError),
+        *(TypeError, struct.error),
+    ) as error:
         what = f"not an image that can be read ({brief(error)})"
         raise DataError(what, where=where) from None
 

@@ -71,6 +71,8 @@ def test_a_prior_beside_keypoints_that_determine_nothing_leaves_a_covariance() -
         ("BOP test/000001/scene_gt.json", 1012924),  # a number of an image of 5,000 digits
         ("PASCAL3D+ CAD/chair.mat", 1000002),  # a triangle's corner that is not finite
         ("PASCAL3D+ Annotations/chair_pascal/1.mat", 1008358),  # an angle of 1e300 degrees
+        ("photo", 33876),  # EXIF with numbers that Pillow cannot write
+        ("image tiff", 41229),  # a fraction in the place of a size
     ],
 )
 def test_files_that_once_failed(name: str, seed: int, tmp_path: Path) -> None:

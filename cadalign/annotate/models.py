@@ -196,7 +196,7 @@ class ObjectShape:
         if self.learned is None:
             return True
         training = self.learned.training
-        return training is not None and any(path is not None for path in training.mesh_paths)
+        return training is not None and bool(training.rows_with_mesh)
 
     def id_of(self, point: ModelKeypoint) -> KeypointId | None:
         """The id of a model's point in the estimate; None for one that was not learned."""

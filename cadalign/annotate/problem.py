@@ -7,7 +7,7 @@ is only similar is not stretched to fit clicks.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -25,7 +25,7 @@ from cadalign.estimation.observed import model_of, views_of
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.misfit import PlacedRows, Rows, find_outliers
-from cadalign.estimation.view import View
+from cadalign.estimation.view import View, without_keypoints
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -178,7 +178,7 @@ class LiveProblem:
         """Alignments that the mask of the only view allows."""
         (view,) = self.views
         if view.camera not in self.by_mask:
-            alone = replace(view, points_2d=(), ids=None, sigma=1.0, depth=None, image=None)
+            alone = replace(without_keypoints(view), image=None)
             result = align(self.model, alone, size=self.size)
             self.by_mask[view.camera] = MaskCandidates.of(self.model, view.camera, result)
         return self.by_mask[view.camera]
@@ -190,8 +190,7 @@ class LiveProblem:
         ids = list(view.keypoint_ids)
         points = np.zeros((len(ids), 3))
         if isinstance(model, Model) and ids:
-            rows = {each: row for row, each in enumerate(model.ids or ())}
-            points = np.asarray(model.points_3d)[[rows[each] for each in ids]]
+            points = _points_of(model, ids)
         chances = self.candidates.probabilities(ids, points, np.asarray(view.points_2d))
         if not chances.any():
             missing = LEAST_JOINT_PAIRS - len(ids)
@@ -228,8 +227,7 @@ class LiveProblem:
         )
         if model is None:
             return pairs.left_out()
-        rows = {each: row for row, each in enumerate(model.ids or ())}
-        points = np.asarray(model.points_3d)[[rows[each] for each in view.keypoint_ids]]
+        points = _points_of(model, view.keypoint_ids)
         unknowns = _POSE_UNKNOWNS + _STRETCH_UNKNOWNS + self.estimates_focal
         observed = np.asarray(view.points_2d)
         return find_outliers(points, observed, pairs.fit_rows, unknowns=unknowns)
@@ -309,3 +307,9 @@ class LiveProblem:
         """The option of the fit for the pairs' standard deviations times a factor."""
         given = np.asarray(self.views[0].sigma)
         return (factor * given).tolist() if given.ndim else factor
+
+
+def _points_of(model: Model, ids: Sequence[Hashable]) -> FloatArray:
+    """Keypoints (n, 3) of a model by their ids."""
+    rows = {each: row for row, each in enumerate(model.ids or ())}
+    return np.asarray(model.points_3d)[[rows[each] for each in ids]]

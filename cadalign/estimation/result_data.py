@@ -243,7 +243,7 @@ class ResultData:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about what `std` does not tell: contradictions, other poses, nothing to test."""
+        """Warnings about what `std` does not say: contradictions, other poses, nothing to test."""
         return self.statistics.warnings
 
     @property

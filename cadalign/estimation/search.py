@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
@@ -24,7 +23,7 @@ from cadalign.estimation.prior import LENS_ROUNDS, Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.starts import Start, Starts, starts_of
 from cadalign.estimation.uncertainty.posterior import widening_of
-from cadalign.estimation.view import View
+from cadalign.estimation.view import View, without_keypoints
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.evidence import Size
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
@@ -177,14 +176,7 @@ def minima_at_start(problem: JointProblem, init: Inits) -> tuple[list[Minimum], 
 
     They are in the minima's evidence, for the outline to be found together with them.
     """
-    nothing: dict[str, Any] = {
-        "points_2d": (),
-        "ids": None,
-        "sigma": 1.0,
-        "scores": None,
-        "depth": None,
-    }
-    bare = problem._replace(views=[replace(view, **nothing) for view in problem.views])
+    bare = problem._replace(views=[without_keypoints(view) for view in problem.views])
     minima, *effort = minima_at_noise(bare, init, None)
     found = []
     for each in minima:

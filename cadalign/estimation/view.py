@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Hashable, Sequence
-from dataclasses import InitVar, dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -190,6 +190,11 @@ class View(DeclaredEvidence):
     def mask_image(self) -> FloatArray | BoolArray | None:
         """The mask (h, w), bool or probabilities."""
         return cast("FloatArray | BoolArray | None", self.mask)
+
+
+def without_keypoints(view: View) -> View:
+    """A view with the evidence that stands beside its keypoints and their depths."""
+    return replace(view, points_2d=(), ids=None, sigma=1.0, scores=None, depth=None)
 
 
 def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> FloatArray:

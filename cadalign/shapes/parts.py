@@ -139,6 +139,11 @@ class TrainingShapes:
     def __len__(self) -> int:
         return len(self.model_ids)
 
+    @property
+    def rows_with_mesh(self) -> list[int]:
+        """Rows of the models that have a mesh."""
+        return [row for row, path in enumerate(self.mesh_paths) if path is not None]
+
 
 @dataclass(frozen=True, eq=False)
 class NearestShape:

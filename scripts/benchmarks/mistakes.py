@@ -15,6 +15,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import angle_between
+from cadalign.render import look_at
 
 _CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _NOISE_PX, _OUTLIERS = 1.0, 0.3
@@ -127,14 +128,11 @@ def _seen(
     most = min(len(points), _MOST)
     size = count or int(rng.integers(_FEWEST, most + 1))
     points = points[rng.choice(len(points), size, replace=False)]
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(*_ELEVATION_DEG))
-    flat = np.cos(elevation)
-    backward = np.array([flat * np.sin(azimuth), np.sin(elevation), flat * np.cos(azimuth)])
-    right = np.cross([0, 1, 0], backward) / flat
-    rotation = np.array([right, np.cross(right, backward), -backward])
+    azimuth, elevation = rng.uniform(0, 360), rng.uniform(*_ELEVATION_DEG)
     stretched = points * np.exp([0.0, *rng.normal(0, _STRETCH_SIGMA, 2)])
-    pixels = _CAMERA.project(stretched @ rotation.T + [0, 0, rng.uniform(*_DISTANCE)])
-    return SeenModel(points, pixels + rng.normal(0, _NOISE_PX, pixels.shape), rotation)
+    pose = look_at(azimuth=azimuth, elevation=elevation, distance=rng.uniform(*_DISTANCE))
+    pixels = _CAMERA.project(pose.apply(stretched))
+    return SeenModel(points, pixels + rng.normal(0, _NOISE_PX, pixels.shape), pose.rotation)
 
 
 def _said(seen: SeenModel, shape_sigma: float) -> tuple[bool, bool, bool]:

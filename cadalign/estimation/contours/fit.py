@@ -190,7 +190,7 @@ def _is_determined(minimum: Minimum) -> bool:
 def _displaced(start: Minimum) -> list[tuple[Minimum, State]]:
     """States of an estimate without masks along the direction of which it knows least.
 
-    None where all stretches are known well enough for rims to be found from there.
+    Empty where all stretches are known well enough for rims to be found from there.
     """
     _, information = information_of(start.evidence, start.state)
     (step,) = weakest_steps(information, 1)

@@ -173,7 +173,7 @@ def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:
 
 def _varied(training: TrainingShapes, mean: FloatArray) -> list[int]:
     """Rows of training models with meshes: the nearest to the mean, and those far from others."""
-    rows = [row for row, path in enumerate(training.mesh_paths) if path is not None]
+    rows = training.rows_with_mesh
     rows = rows[:: 1 + len(rows) // _MOST_COMPARED]
     points = training.points_3d[rows].astype(np.float64)
     points = np.where(np.isfinite(points), points, mean)

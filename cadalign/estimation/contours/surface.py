@@ -188,9 +188,7 @@ def _nearest_with_mesh(
 ) -> list[tuple[Mesh, FloatArray, IntArray]]:
     """Meshes of training models whose keypoints are nearest; these, and their numbers."""
     training = model.training
-    rows = []
-    if training is not None:
-        rows = [row for row, path in enumerate(training.mesh_paths) if path is not None]
+    rows = [] if training is None else training.rows_with_mesh
     if training is None or not rows:
         fix = "learn it from a data set with meshes, such as KeypointNet beside ShapeNet's models"
         what = f"no training model has a mesh, which {wanting} needs"

@@ -105,6 +105,21 @@ def test_regions_hold_the_truth(points: int, noise_px: float) -> None:
     assert max(shares.values()) < 0.995, shares
 
 
+@pytest.mark.parametrize("stretch_sigma", [None, 0.3])
+def test_log_scales_vary_no_more_than_their_prior_by_itself(stretch_sigma: float | None) -> None:
+    worst, width = 0.0, 0.0 if stretch_sigma else np.log(USUAL_STRETCH)
+    for problem in flat_problems(15, points=6, noise_px=1.0, axes=(1, 2)):
+        result = fit_problem(problem, stretch_sigma=stretch_sigma)
+        assert result.covariance is not None
+        spread = (stretch_sigma or 0.5) ** 2 + width**2 / 3
+        most = np.log(result.alignment.scale) ** 2 + spread
+        variances = result.covariance.diagonal()[6:9]
+        assert (variances <= most * (1 + 1e-12)).all()
+        assert np.linalg.eigvalsh(result.covariance).min() > -1e-9
+        worst = max(worst, float((variances / most).max()))
+    assert worst > 0.9
+
+
 @pytest.mark.parametrize("stretch", [1 / USUAL_STRETCH + 0.01, 1.0, USUAL_STRETCH - 0.01])
 def test_the_bound_leaves_usual_stretches_as_the_keypoints_say(stretch: float) -> None:
     rng = np.random.default_rng(5)

@@ -10,6 +10,7 @@ centroid, and the logarithms of scales and focal length. The draws are the same 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -143,14 +144,30 @@ def posterior_covariance(result: FittedKeypoints) -> FloatArray:
         pairs = distinct_rows(np.concatenate([points, result.residuals[result.inliers]], axis=1))
         redundancy = max(2 * pairs - options.unknowns, 1)
         widening = widening_of(options.unknowns, redundancy * _EFFICIENCY[options.loss])
-    first = _with_noise_times(widening, result.fisher_covariance, options)
-    if len(points) > MOST_POINTS:
-        return first
-    try:
-        sampled = _sample(result, first, Likelihood.of(result), widening)
-    except (np.linalg.LinAlgError, InputError):  # coordinates come near the range of numbers
-        return first
-    return first if sampled is None else sampled
+    sampled, first = None, _with_noise_times(widening, result.fisher_covariance, options)
+    if len(points) <= MOST_POINTS:
+        # Coordinates may come near the range of numbers.
+        with suppress(np.linalg.LinAlgError, InputError):
+            sampled = _sample(result, first, Likelihood.of(result), widening)
+    return _within_prior(first if sampled is None else sampled, result)
+
+
+def _within_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray:
+    """The covariance (m, m), with log scales that vary no more than their prior does by itself.
+
+    A parabola, or an ellipsoid about a curved region, reaches past the ends of the prior: the mean
+    square of that about the estimate bounds the variance. A measurement of the log scale that leads
+    to the bound leaves what is known better, such as a ratio of scales, as it is.
+    """
+    weight, width = result.options.scale_prior
+    if not weight:
+        return covariance
+    for axis, log_scale in enumerate(np.log(result.alignment.scale), 6):
+        most = log_scale**2 + width**2 / 3 + 1 / weight
+        variance, own = covariance[axis, axis], covariance[axis]
+        if variance > most:
+            covariance = covariance - np.outer(own, own) * (variance - most) / variance**2
+    return covariance
 
 
 def widening_of(unknowns: int, redundancy: float) -> float:

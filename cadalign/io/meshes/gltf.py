@@ -1,7 +1,7 @@
 """glTF 2.0 files, text or binary: the document, and the arrays in its buffers.
 
-After the Khronos Group's specification of glTF 2.0. `cadalign.io.meshes.gltf_scene` makes a mesh of
-them.
+After the Khronos Group's specification of glTF 2.0 and of the extensions that are named; declared
+are the parts that a mesh needs, which `cadalign.io.meshes.gltf_scene` makes of them.
 """
 
 from __future__ import annotations
@@ -10,34 +10,198 @@ import base64
 import binascii
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta, field
 
 from cadalign.errors import DataError, brief, quote
-from cadalign.io.documents import convert, in_file, parse_json
+from cadalign.io.documents import (
+    Count,
+    Finite,
+    ForeignDocument,
+    Point2,
+    Point3,
+    convert,
+    in_file,
+    parse_json,
+)
 from cadalign.io.files import damaged, read_bytes, reading
-from cadalign.io.meshes.gltf_document import Accessor, Buffer, GltfDocument, Sparse
 
 Array = npt.NDArray[Any]
 _T = TypeVar("_T")
+_Point4 = tuple[Finite, Finite, Finite, Finite]
 
 _JSON_CHUNK, _BINARY_CHUNK = b"JSON", b"BIN\0"
 _NUMBERS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 # What they add is read here, or is nothing but the look of surfaces and their light.
-_EXTENSIONS = frozenset(
-    (
-        "EXT_texture_webp",
-        "KHR_lights_punctual",
-        "KHR_mesh_quantization",
-        "KHR_texture_transform",
-        "KHR_xmp_json_ld",
-    )
+_EXTENSIONS = (
+    *("EXT_texture_webp", "KHR_lights_punctual", "KHR_mesh_quantization", "KHR_texture_transform"),
+    "KHR_xmp_json_ld",
 )
 _LOOKS = "KHR_materials_"
+
+
+class _Part(ForeignDocument, rename="camel", kw_only=True):
+    """Base of the document's parts."""
+
+
+class Asset(_Part):
+    """Statements of the file about itself."""
+
+    version: str = "2.0"
+
+
+class GltfScene(_Part):
+    """The roots of a scene's trees of nodes."""
+
+    nodes: list[Count] = field(default_factory=list)
+
+
+class Node(_Part):
+    """A node, placed by a matrix (by columns) or by scale, rotation (x, y, z, w), translation."""
+
+    mesh: Count | None = None
+    children: list[Count] = field(default_factory=list)
+    matrix: Annotated[list[Finite], Meta(min_length=16, max_length=16)] | None = None
+    translation: Point3 = (0.0, 0.0, 0.0)
+    rotation: _Point4 = (0.0, 0.0, 0.0, 1.0)
+    scale: Point3 = (1.0, 1.0, 1.0)
+
+
+class Primitive(_Part):
+    """A part of a mesh with one material; attributes and indices are numbers of accessors."""
+
+    attributes: dict[str, Count]
+    indices: Count | None = None
+    material: Count | None = None
+    mode: int = 4
+
+
+class GltfMesh(_Part):
+    """The primitives of a mesh."""
+
+    primitives: list[Primitive]
+
+
+class SparsePart(_Part):
+    """Places at which a sparse accessor has values of its own, or these values."""
+
+    buffer_view: Count
+    component_type: int = 0  # of the places
+    byte_offset: Count = 0
+
+
+class Sparse(_Part):
+    """Values that a sparse accessor changes."""
+
+    count: Count
+    indices: SparsePart
+    values: SparsePart
+
+
+class Accessor(_Part):
+    """An array in a buffer."""
+
+    count: Count
+    component_type: int
+    type: str
+    buffer_view: Count | None = None
+    byte_offset: Count = 0
+    normalized: bool = False
+    sparse: Sparse | None = None
+
+
+class BufferView(_Part):
+    """A part of a buffer."""
+
+    buffer: Count
+    byte_length: Count
+    byte_offset: Count = 0
+    byte_stride: Count | None = None
+
+
+class Buffer(_Part):
+    """Bytes: a file, data in the text, or the binary part of a GLB file."""
+
+    byte_length: Count
+    uri: str | None = None
+
+
+class Image(_Part):
+    """A picture: a file, data in the text, or a part of a buffer."""
+
+    uri: str | None = None
+    buffer_view: Count | None = None
+
+
+class Texture(_Part):
+    """The picture of a texture."""
+
+    source: Count | None = None
+    extensions: Extensions = field(default_factory=lambda: Extensions())
+
+
+class TextureTransform(_Part):
+    """Change of texture coordinates: scaled, rotated [rad], moved."""
+
+    offset: Point2 = (0.0, 0.0)
+    rotation: Finite = 0.0
+    scale: Point2 = (1.0, 1.0)
+    tex_coord: Count | None = None
+
+
+class TextureUse(_Part):
+    """A texture as a material uses it, with the number of its set of coordinates."""
+
+    index: Count
+    tex_coord: Count = 0
+    extensions: Extensions = field(default_factory=lambda: Extensions())
+
+
+class BaseColor(_Part):
+    """The base colour of a material, in linear light; an older extension calls it diffuse."""
+
+    base_color_factor: _Point4 | None = None
+    base_color_texture: TextureUse | None = None
+    diffuse_factor: _Point4 | None = None
+    diffuse_texture: TextureUse | None = None
+
+
+class Extensions(_Part):
+    """The extensions that are read: of textures, of their uses, and of materials."""
+
+    webp: Texture | None = field(name="EXT_texture_webp", default=None)
+    transform: TextureTransform | None = field(name="KHR_texture_transform", default=None)
+    glossiness: BaseColor | None = field(name="KHR_materials_pbrSpecularGlossiness", default=None)
+
+
+class MaterialPart(_Part):
+    """The look of a surface."""
+
+    name: str = ""
+    pbr_metallic_roughness: BaseColor = field(default_factory=BaseColor)
+    extensions: Extensions = field(default_factory=Extensions)
+
+
+class GltfDocument(_Part):
+    """The whole document."""
+
+    asset: Asset = field(default_factory=Asset)
+    scene: Count = 0
+    scenes: list[GltfScene] = field(default_factory=list)
+    nodes: list[Node] = field(default_factory=list)
+    meshes: list[GltfMesh] = field(default_factory=list)
+    accessors: list[Accessor] = field(default_factory=list)
+    buffer_views: list[BufferView] = field(default_factory=list)
+    buffers: list[Buffer] = field(default_factory=list)
+    materials: list[MaterialPart] = field(default_factory=list)
+    textures: list[Texture] = field(default_factory=list)
+    images: list[Image] = field(default_factory=list)
+    extensions_required: list[str] = field(default_factory=list)
 
 
 class GltfFile:
@@ -78,7 +242,11 @@ class GltfFile:
         """The array (n, width) of an accessor; of normalized integers as fractions."""
         accessor = nth(self.document.accessors, number, "accessors")
         place = f"accessors[{number}]"
-        dtype, width = _form(accessor, place)
+        if accessor.component_type not in _NUMBERS:
+            raise damaged(f"componentType {accessor.component_type} is not known", place)
+        if accessor.type not in _WIDTHS:
+            raise damaged(f"{quote(accessor.type)} are no points or numbers", place)
+        dtype, width = np.dtype(_NUMBERS[accessor.component_type]), _WIDTHS[accessor.type]
         if accessor.buffer_view is None:
             if accessor.count > self.size:
                 raise damaged(f"{accessor.count} values, but no data", place)
@@ -89,7 +257,9 @@ class GltfFile:
             )
         if accessor.sparse is not None:
             values = self._with_sparse(values, accessor.sparse, place)
-        return _fractions(values) if accessor.normalized else values
+        if accessor.normalized and dtype.kind != "f":
+            values = np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return values
 
     def view(self, number: int) -> memoryview:
         """The bytes of a buffer view."""
@@ -114,18 +284,14 @@ class GltfFile:
 
     def _with_sparse(self, values: Array, sparse: Sparse, place: str) -> Array:
         """A copy of the values with some replaced."""
-        kind = _NUMBERS.get(sparse.indices.component_type, "<f4")
-        rows = self._values(
-            sparse.indices.buffer_view,
-            sparse.indices.byte_offset,
-            (sparse.count, 1),
-            np.dtype(kind),
-        )[:, 0]
-        shape = (sparse.count, values.shape[1])
-        given = self._values(
-            sparse.values.buffer_view, sparse.values.byte_offset, shape, values.dtype
-        )
-        if kind[1] != "u" or (len(rows) and rows.max() >= len(values)):
+        kind = np.dtype(_NUMBERS.get(sparse.indices.component_type, "<f4"))
+
+        def part(of: SparsePart, width: int, dtype: Any) -> Array:
+            return self._values(of.buffer_view, of.byte_offset, (sparse.count, width), dtype)
+
+        rows = part(sparse.indices, 1, kind)[:, 0]
+        given = part(sparse.values, values.shape[1], values.dtype)
+        if kind.kind != "u" or (len(rows) and rows.max() >= len(values)):
             raise damaged("its sparse indices are out of range", place)
         changed = values.copy()
         changed[rows] = given
@@ -213,19 +379,3 @@ def _check(document: GltfDocument) -> None:
             where="extensionsRequired",
             fix="export it without this extension; of compressed geometry, uncompressed",
         )
-
-
-def _form(accessor: Accessor, place: str) -> tuple[Any, int]:
-    """The type and the number of a value's components."""
-    if accessor.component_type not in _NUMBERS:
-        raise damaged(f"componentType {accessor.component_type} is not known", place)
-    if accessor.type not in _WIDTHS:
-        raise damaged(f"{quote(accessor.type)} are no points or numbers", place)
-    return np.dtype(_NUMBERS[accessor.component_type]), _WIDTHS[accessor.type]
-
-
-def _fractions(values: Array) -> Array:
-    """Integers as fractions of the largest one."""
-    if values.dtype.kind == "f":
-        return values
-    return np.maximum(values / np.iinfo(values.dtype).max, -1.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -15,13 +14,15 @@ from cadalign.geometry.mesh import GREY, Material, Mesh
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import in_file
 from cadalign.io.files import damaged
-from cadalign.io.meshes.gltf import GltfFile, embedded, nth
-from cadalign.io.meshes.gltf_document import (
-    Glossiness,
+from cadalign.io.meshes.gltf import (
+    BaseColor,
+    GltfFile,
     Node,
     Primitive,
     TextureTransform,
     TextureUse,
+    embedded,
+    nth,
 )
 from cadalign.io.meshes.join import join
 from cadalign.io.meshes.materials import WHITE, Texture, Textures
@@ -32,12 +33,8 @@ _FREE_BYTES, _EXPANSION = 2**27, 64
 _VERTEX_BYTES, _FACE_BYTES = 24 + 32, 24 + 48 + 8 + 8  # colours, texture coordinates included
 
 
-@dataclass(frozen=True)
-class _Look:
-    """A material, and how its texture is used."""
-
-    material: Material
-    use: TextureUse | None = None
+# A material, and how its texture is used.
+_Look = tuple[Material, TextureUse | None]
 
 
 def read_gltf(path: Path) -> Mesh:
@@ -53,10 +50,12 @@ def read_gltf(path: Path) -> Mesh:
     """
     file = GltfFile(path)
     with in_file(path), np.errstate(all="ignore"):  # what is not finite, Mesh refuses
-        transforms = _placed_meshes(file)
+        placed: dict[int, list[FloatArray]] = {}
+        for number, transform in _placements(file):
+            placed.setdefault(number, []).append(transform)
         primitives = [
-            (primitive, at)
-            for number, at in transforms.items()
+            (primitive, np.stack(at))
+            for number, at in placed.items()
             for primitive in nth(file.document.meshes, number, "meshes").primitives
             if _count_faces(file, primitive)
         ]
@@ -69,14 +68,6 @@ def read_gltf(path: Path) -> Mesh:
             for primitive, transforms in primitives
         ]
         return join(pieces, path)
-
-
-def _placed_meshes(file: GltfFile) -> dict[int, FloatArray]:
-    """The transforms (k, 4, 4) of the nodes with each mesh."""
-    found: dict[int, list[FloatArray]] = {}
-    for mesh, transform in _placements(file):
-        found.setdefault(mesh, []).append(transform)
-    return {mesh: np.stack(transforms) for mesh, transforms in found.items()}
 
 
 def _placements(file: GltfFile) -> Iterator[tuple[int, FloatArray]]:
@@ -150,7 +141,7 @@ class _Looks:
         self._file = file
         self._textures = Textures()
         self._images: dict[int, Texture | None] = {}
-        self._looks: dict[int | None, _Look] = {None: _Look(Material())}
+        self._looks: dict[int | None, _Look] = {None: (Material(), None)}
 
     def of(self, number: int | None) -> _Look:
         """The look of the material of a number."""
@@ -160,7 +151,7 @@ class _Looks:
 
     def _make(self, number: int) -> _Look:
         part = nth(self._file.document.materials, number, "materials")
-        metallic, older = part.pbr_metallic_roughness, part.extensions.glossiness or Glossiness()
+        metallic, older = part.pbr_metallic_roughness, part.extensions.glossiness or BaseColor()
         factor = metallic.base_color_factor or older.diffuse_factor
         use = metallic.base_color_texture or older.diffuse_texture
         texture = None if use is None else self._texture(use.index)
@@ -168,11 +159,12 @@ class _Looks:
         if factor is not None:
             red, green, blue, opacity = encoded(np.clip(factor, 0, 1)).tolist()
             color = (red, green, blue, opacity)
-        return _Look(Material(part.name, color, texture), None if texture is None else use)
+        return Material(part.name, color, texture), None if texture is None else use
 
     def _texture(self, number: int) -> Texture | None:
         part = nth(self._file.document.textures, number, "textures")
-        source = part.source if part.extensions.webp.source is None else part.extensions.webp.source
+        webp = part.extensions.webp
+        source = part.source if webp is None or webp.source is None else webp.source
         if source is None:
             return None
         if source not in self._images:
@@ -195,6 +187,7 @@ class _Looks:
 
 def _surface(file: GltfFile, primitive: Primitive, look: _Look) -> Mesh:
     """The mesh of a primitive in its own frame."""
+    material, use = look
     vertices = _columns(file, primitive, "POSITION", 3)
     corners = np.arange(len(vertices))
     if primitive.indices is not None:
@@ -203,12 +196,11 @@ def _surface(file: GltfFile, primitive: Primitive, look: _Look) -> Mesh:
     if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
         what = f"a face names vertex {faces.max()}, but there are {len(vertices)}"
         raise damaged(what, f"accessors[{primitive.indices}]")
-    uv, colors = _texture_coordinates(file, primitive, look), _colors(file, primitive)
+    uv, colors = _texture_coordinates(file, primitive, use), _colors(file, primitive)
     if len(vertices) > faces.size:  # they are shared with other primitives
         kept, faces = np.unique(faces, return_inverse=True)
         vertices, faces = vertices[kept], faces.reshape(-1, 3)
         uv, colors = (None if each is None else each[kept] for each in (uv, colors))
-    material = look.material
     if primitive.material is None and colors is not None:
         material = Material(color=WHITE)
     return Mesh(
@@ -242,12 +234,14 @@ def _triangles(corners: IntArray, mode: int) -> IntArray:
     return corners[rows]
 
 
-def _texture_coordinates(file: GltfFile, primitive: Primitive, look: _Look) -> FloatArray | None:
+def _texture_coordinates(
+    file: GltfFile, primitive: Primitive, use: TextureUse | None
+) -> FloatArray | None:
     """Texture coordinates (n, 2) from the bottom left, which glTF has from the top left."""
-    if look.use is None:
+    if use is None:
         return None
-    change = look.use.extensions.transform or TextureTransform()
-    chosen = look.use.tex_coord if change.tex_coord is None else change.tex_coord
+    change = use.extensions.transform or TextureTransform()
+    chosen = use.tex_coord if change.tex_coord is None else change.tex_coord
     name = f"TEXCOORD_{chosen}"
     if name not in primitive.attributes:
         return None

@@ -14,7 +14,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
-from cadalign.geometry.alignment import Alignment
+from cadalign.estimation.result_parts import Alternative
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 
@@ -24,22 +24,12 @@ _MOST_OFF = 5.0  # standard deviations of a click from the keypoint of a candida
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """One of the alignments, with the object's own ``points_3d`` (m, 3) and ``bounds`` (2, 3)."""
-
-    alignment: Alignment
-    points_3d: FloatArray
-    bounds: FloatArray
-    likelihood: float  # relative to the best's
-
-
-@dataclass(frozen=True, eq=False)
 class MaskCandidates:
     """Alignments of a model to a mask, the likeliest first."""
 
     result: Result
     """The estimate from the mask alone."""
-    every: tuple[Candidate, ...]
+    every: tuple[Alternative, ...]
     rows: Mapping[Hashable, int]
     """Rows of the candidates' points by the keypoints' ids."""
     spread: FloatArray
@@ -49,14 +39,10 @@ class MaskCandidates:
     @classmethod
     def of(cls, model: Model | ShapeModel, camera: Camera, result: Result) -> MaskCandidates:
         """The candidates that a result from a mask alone states."""
-        best = Candidate(result.alignment, result.points_3d, result.bounds, 1.0)
-        others = (
-            Candidate(each.alignment, each.points_3d, each.bounds, each.relative_likelihood)
-            for each in result.alternatives
-        )
+        best = Alternative(result.alignment, 1.0, camera, result.points_3d, result.bounds)
         rows = {label: row for row, label in enumerate(result.ids)}
         spread = _spread_of(model, len(result.ids))
-        return cls(result, (best, *others), rows, spread, camera)
+        return cls(result, (best, *result.alternatives), rows, spread, camera)
 
     def predicted(
         self, ids: Sequence[Hashable], points: FloatArray
@@ -78,7 +64,9 @@ class MaskCandidates:
             sigmas.append(np.hypot(self._click, self.camera.fx * size * spread / distance))
         return places, np.array(sigmas)
 
-    def points_of(self, each: Candidate, ids: Sequence[Hashable], points: FloatArray) -> FloatArray:
+    def points_of(
+        self, each: Alternative, ids: Sequence[Hashable], points: FloatArray
+    ) -> FloatArray:
         """A candidate's keypoints (n, 3); those that it does not have are the given ones."""
         known = self._rows_of(ids)
         own = np.vstack([each.points_3d, np.zeros(3)])[known]
@@ -91,7 +79,7 @@ class MaskCandidates:
         self, ids: Sequence[Hashable], points: FloatArray, pixels: FloatArray
     ) -> FloatArray:
         """Probabilities (k,) after clicks (n, 2) on keypoints; 0 for those that are ruled out."""
-        prior = np.array([each.likelihood for each in self.every])
+        prior = np.array([each.relative_likelihood for each in self.every])
         return updated(prior, *self.predicted(ids, points), np.reshape(pixels, (-1, 2)))
 
     @property

@@ -20,9 +20,9 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.evidence import LENGTHS, ImageEvidence, ObservedImage, Size
 from cadalign.io.images import read_grey
 from cadalign.io.observation import Observation
+from cadalign.io.observation_file import StartFields
 
 Point2 = tuple[float, float]
-Point3 = tuple[float, float, float]
 Segment = tuple[Point2, Point2]
 
 _SHIFT = 4  # bits of parts of a pixel in OpenCV's drawing
@@ -167,27 +167,6 @@ class MarkedLengths:
 
 
 @dataclass(frozen=True)
-class ChosenStart:
-    """An alignment that was chosen among those that a mask allows."""
-
-    rotation: tuple[Point3, Point3, Point3]
-    translation: Point3
-    scale: Point3
-
-    @classmethod
-    def of(cls, alignment: Alignment) -> ChosenStart:
-        """An alignment as a document holds it."""
-        first, second, third = (tuple(row) for row in alignment.rotation.tolist())
-        translation, scale = alignment.translation.tolist(), alignment.scale.tolist()
-        return cls((first, second, third), tuple(translation), tuple(scale))
-
-    @property
-    def alignment(self) -> Alignment:
-        """The alignment."""
-        return Alignment(np.array(self.rotation), np.array(self.translation), np.array(self.scale))
-
-
-@dataclass(frozen=True)
 class MarkedEvidence:
     """Marks in a photo beside its pairs.
 
@@ -202,7 +181,7 @@ class MarkedEvidence:
     up_sigma_deg: float | None = None
     lengths: MarkedLengths | None = None
     photo: bool = False
-    start: ChosenStart | None = None
+    start: StartFields | None = None
 
     @classmethod
     def of(cls, further: FurtherEvidence) -> Self:
@@ -215,7 +194,7 @@ class MarkedEvidence:
             up_sigma_deg=image.up_sigma_deg,
             lengths=MarkedLengths.of(further.size),
             photo=further.photo,
-            start=None if further.init is None else ChosenStart.of(further.init),
+            start=None if further.init is None else StartFields.of(further.init),
         )
 
     def shared_with(self, other: Self) -> Self:

@@ -9,7 +9,6 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.annotate.candidates import Candidate
 from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.lines import Wireframe, box_lines
 from cadalign.annotate.models import KeypointRegistry, ObjectShape
@@ -18,6 +17,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Alternative
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
@@ -128,7 +128,7 @@ def _assumed_text(photos: tuple[str, ...], camera: Camera) -> str:
 
 def _warped(
     wireframe: Wireframe,
-    result: Result | Candidate,
+    result: Result | Alternative,
     ids: Sequence[Any],
     model: Model | ShapeModel,
     known: Known,

@@ -9,7 +9,6 @@ import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, FurtherView, History, Pair, Priors
 from cadalign.annotate.evidence import (
-    ChosenStart,
     FurtherEvidence,
     MarkedEvidence,
     MarkedLengths,
@@ -28,6 +27,7 @@ from cadalign.annotate.photos import FocalChoice
 from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Count, Finite, Index, Point2, Positive, Text
+from cadalign.io.observation_file import StartFields
 
 _LONGEST_NAME = 60
 _FOCAL_RANGE = (0.05, 200.0)  # of a focal length [image widths]
@@ -329,7 +329,7 @@ def use_photo(state: PhotoState, *, on: bool) -> ActionOutcome | None:
     live, _ = state.session.live(state)
     start = evidence.start
     if live.result is not None and state.lead is None:
-        start = ChosenStart.of(live.alignment)
+        start = StartFields.of(live.alignment)
     state.mark(photo=on, mask=None, start=start)
     return ActionOutcome(message="The photo takes the place of the mask; undo brings it back.")
 
@@ -344,7 +344,7 @@ def begin_at(state: PhotoState, *, candidate: Index | None = None) -> None:
     if candidate >= len(known):
         what = f"there is no candidate {candidate}"
         raise InputError(what, where="candidate", fix="reload the page")
-    state.mark(start=ChosenStart.of(known[candidate].alignment))
+    state.mark(start=StartFields.of(known[candidate].alignment))
 
 
 OBJECT_ACTIONS = (

@@ -57,10 +57,7 @@ def rescaled_pixels(pixels: FloatArray, factor: float | FloatArray) -> FloatArra
 def check_pixels(points_2d: FloatArray, width: int, height: int, *, where: str) -> None:
     """Refuse normalised coordinates (n, 2) in the place of the pixels of an image of that size.
 
-    Raises
-    ------
-    InputError
-        If all lie within a pixel or so of the image's corner, but not in one place.
+    Raises InputError if all lie within a pixel or so of the image's corner, but not in one place.
 
     Examples
     --------
@@ -105,10 +102,7 @@ _ROUNDS = 6  # of such tables, each within a step of the one before
 def checked_coefficients(kind: object, coefficients: tuple[float, ...]) -> tuple[float, ...]:
     """The coefficients of a lens; none of a pinhole, and of a wide lens always all.
 
-    Raises
-    ------
-    InputError
-        If the kind is unknown, or has no such coefficients.
+    Raises InputError if the kind is unknown, or has no such coefficients.
     """
     if not isinstance(kind, str) or kind not in _COEFFICIENTS:
         what, fix = f"{quote(kind)} is not a kind of lens", f"known are {', '.join(_COEFFICIENTS)}"

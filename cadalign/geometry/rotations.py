@@ -162,10 +162,7 @@ def nearest_rigid(matrix: npt.ArrayLike, *, where: str) -> FloatArray:
 def rotation_from_quat_wxyz(quat_wxyz: FloatArray) -> FloatArray:
     """The rotation matrix (3, 3) of a quaternion (4,), scalar first, of any length but 0.
 
-    Raises
-    ------
-    InputError
-        If it is zero or not finite.
+    Raises InputError if it is zero or not finite.
 
     Examples
     --------

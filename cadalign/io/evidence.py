@@ -97,10 +97,9 @@ def as_arguments(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name not in more} | {"more": more}
 
 
-def _stored_as(
-    stored: Any, text: str, option: Any = None, refines: str | None = None
-) -> dict[str, Any]:
-    return {"stored": stored, "help": text, "option": option, "refines": refines}
+def _stored_as(stored: Any, text: str, option: Any = None, refines: str | None = None) -> Any:
+    declared = {"stored": stored, "help": text, "option": option, "refines": refines}
+    return field(default=None, metadata=declared)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -110,83 +109,55 @@ class DeclaredEvidence:
     `cadalign.View` describes the fields; ``more`` holds values of registered ones by name.
     """
 
-    mask: npt.ArrayLike | str | os.PathLike[str] | None = field(
-        default=None,
-        metadata=_stored_as(PathText, "Mask of the object, a grey PNG of the photo's size.", Path),
+    mask: npt.ArrayLike | str | os.PathLike[str] | None = _stored_as(
+        PathText, "Mask of the object, a grey PNG of the photo's size.", Path
     )
-    mask_sigma: float | None = field(
-        default=None,
-        metadata=_stored_as(
-            Positive,
-            "Standard deviation of the mask's contour [px]; estimated by default.",
-            float,
-            refines="mask",
-        ),
+    mask_sigma: float | None = _stored_as(
+        Positive,
+        "Standard deviation of the mask's contour [px]; estimated by default.",
+        float,
+        refines="mask",
     )
-    depth: npt.ArrayLike | str | os.PathLike[str] | None = field(
-        default=None,
-        metadata=_stored_as(
-            PathText,
-            "Depth image that is registered to the photo, a PNG of 16 bits; 0 where unknown.",
-            Path,
-        ),
+    depth: npt.ArrayLike | str | os.PathLike[str] | None = _stored_as(
+        PathText,
+        "Depth image that is registered to the photo, a PNG of 16 bits; 0 where unknown.",
+        Path,
     )
-    depth_scale: float | None = field(
-        default=None,
-        metadata=_stored_as(
-            Positive,
-            "Units per count of the depth image; 0.001 by default, millimetres to metres.",
-            float,
-            refines="depth",
-        ),
+    depth_scale: float | None = _stored_as(
+        Positive,
+        "Units per count of the depth image; 0.001 by default, millimetres to metres.",
+        float,
+        refines="depth",
     )
-    depth_sigma: npt.ArrayLike | None = field(
-        default=None,
-        metadata=_stored_as(
-            Positive,
-            "Relative standard deviation of the depths; 0.01 by default.",
-            float,
-            refines="depth",
-        ),
+    depth_sigma: npt.ArrayLike | None = _stored_as(
+        Positive,
+        "Relative standard deviation of the depths; 0.01 by default.",
+        float,
+        refines="depth",
     )
-    up: npt.ArrayLike | None = field(
-        default=None,
-        metadata=_stored_as(
-            Point3,
-            "Upward direction in the camera's frame, whose y points down: 0 -1 0 for a level one.",
-            _AXIS,
-        ),
+    up: npt.ArrayLike | None = _stored_as(
+        Point3,
+        "Upward direction in the camera's frame, whose y points down: 0 -1 0 for a level one.",
+        _AXIS,
     )
-    up_sigma_deg: npt.ArrayLike | None = field(
-        default=None,
-        metadata=_stored_as(
-            Positive,
-            "Standard deviation of this direction [degrees]; 1 by default.",
-            float,
-            refines="up",
-        ),
+    up_sigma_deg: npt.ArrayLike | None = _stored_as(
+        Positive,
+        "Standard deviation of this direction [degrees]; 1 by default.",
+        float,
+        refines="up",
     )
-    camera_height: float | None = field(
-        default=None,
-        metadata=_stored_as(
-            Positive, "Height of the camera above the plane that the object stands on.", float
-        ),
+    camera_height: float | None = _stored_as(
+        Positive, "Height of the camera above the plane that the object stands on.", float
     )
-    camera_height_sigma: float | None = field(
-        default=None,
-        metadata=_stored_as(
-            Positive,
-            "Relative standard deviation of this height; 0.02 by default.",
-            float,
-            refines="camera_height",
-        ),
+    camera_height_sigma: float | None = _stored_as(
+        Positive,
+        "Relative standard deviation of this height; 0.02 by default.",
+        float,
+        refines="camera_height",
     )
-    cam_from_rig: npt.ArrayLike | None = field(
-        default=None,
-        metadata=_stored_as(
-            tuple[_Row4, _Row4, _Row4, _Row4],
-            "The camera's known pose in the frame that the views share.",
-        ),
+    cam_from_rig: npt.ArrayLike | None = _stored_as(
+        tuple[_Row4, _Row4, _Row4, _Row4],
+        "The camera's known pose in the frame that the views share.",
     )
     more: Mapping[str, Any] = field(default_factory=dict)
 

@@ -115,10 +115,7 @@ def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
     Every file that somebody names is opened here: a device has no end, and a pipe may have no other
     end.
 
-    Raises
-    ------
-    DataError
-        If it is missing, no regular file, larger, or cannot be read.
+    Raises DataError if it is missing, no regular file, larger, or cannot be read.
     """
     with reading(path), InputFile(path) as file:
         if not stat.S_ISREG(file.status.st_mode):
@@ -214,10 +211,7 @@ class Seal:
     def unwrap(self, content: Any, where: str) -> memoryview:
         """Check the header and the checksum; returns the payload, which is not copied.
 
-        Raises
-        ------
-        DataError
-            If the content is of another format or version, truncated or damaged.
+        Raises DataError if the content is of another format or version, truncated or damaged.
         """
         view = memoryview(content).cast("B")
         if len(view) < _HEADER.size or bytes(view[:16]) != self.magic:

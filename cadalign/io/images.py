@@ -52,10 +52,8 @@ def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
     Left to itself, Pillow goes by the content and tries all the formats that it knows; of some,
     such as EPS, it starts other programs.
 
-    Raises
-    ------
-    DataError
-        If it is of another format, damaged, or has far more pixels than its bytes can describe.
+    Raises DataError if it is of another format, damaged, or has far more pixels than its bytes can
+    describe.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -80,10 +78,8 @@ def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
 def _check_pixels(image: Image, file_size: int) -> None:
     """Refuse an image whose pixels take far more memory than its file can describe.
 
-    Raises
-    ------
-    ValueError
-        If they are more than 64 MB and 1032 times the file's bytes, the most that PNG compresses.
+    Raises ValueError if they are more than 64 MB and 1032 times the file's bytes, the most that PNG
+    compresses.
     """
     width, height = image.size
     if 3 * width * height > _FREE_BYTES + _COMPRESSION * file_size:

@@ -264,10 +264,7 @@ class Observation(ObservedImage):
 def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None = None) -> Camera:
     """The camera with a known focal length [px] or horizontal field of view [degrees], if given.
 
-    Raises
-    ------
-    InputError
-        If both are given, or one is not possible.
+    Raises InputError if both are given, or one is not possible.
     """
     if fov is None:
         return camera if focal is None else camera.with_focal(focal)
@@ -309,10 +306,8 @@ class ObservationChanges:
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
         """The observation with all of this in the place of its own; ``where`` is its file.
 
-        Raises
-        ------
-        InputError
-            If the observation has several views, which one camera or mask does not fit.
+        Raises InputError if the observation has several views, which one camera or mask does not
+        fit.
         """
         own = observation.camera
         camera = self.read_camera((own.width, own.height))

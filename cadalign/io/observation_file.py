@@ -113,32 +113,36 @@ class SizeFields(Document):
     sigma: Positive | list[Positive] | None = None
 
 
-class StartFields(Document):
+class StartFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The entry ``init``."""
 
     rotation: tuple[Point3, Point3, Point3]
     translation: Point3
     scale: Point3 = (1.0, 1.0, 1.0)
 
+    @classmethod
+    def of(cls, alignment: Alignment) -> StartFields:
+        """The entry of an alignment."""
+        return cast("StartFields", convert(alignment.to_dict(), cls))
 
-class _ImageFields(Document, kw_only=True):
-    """Fields of one image, beside its keypoints and `cadalign.io.evidence`."""
+    @property
+    def alignment(self) -> Alignment:
+        """The alignment; raises InputError if the rotation is none, or a scale is not positive."""
+        return Alignment(np.array(self.rotation), np.array(self.translation), np.array(self.scale))
+
+
+class ViewFields(Document, kw_only=True):
+    """One entry of ``views``, beside the fields of `cadalign.io.evidence`."""
 
     camera: Any  # in the form of `Camera.from_dict`
     pixel_origin: PixelOrigin = "center"  # of the keypoints' uv
     image: PathText | None = None
-
-
-class ViewFields(_ImageFields, kw_only=True):
-    """One entry of ``views``."""
-
     keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
 
 
-class OneView(_ImageFields, kw_only=True):
-    """A file of one image."""
+class _ObjectFields(Document, kw_only=True):
+    """Fields of a file beyond those of its images."""
 
-    keypoints: Annotated[list[KeypointFields], Meta(min_length=1)]
     model: PathText | None = None
     shape: PathText | None = None
     size: SizeFields | None = None
@@ -148,6 +152,15 @@ class OneView(_ImageFields, kw_only=True):
     unfinished: Any = None  # the annotator's
     init: StartFields | None = None
     fit: FitFields = msgspec.field(default_factory=FitFields)
+
+
+class OneView(_ObjectFields, kw_only=True):
+    """A file of one image."""
+
+    camera: Any  # as of `ViewFields`
+    pixel_origin: PixelOrigin = "center"
+    image: PathText | None = None
+    keypoints: Annotated[list[KeypointFields], Meta(min_length=1)]
 
 
 class StartedView(OneView, kw_only=True):
@@ -156,19 +169,10 @@ class StartedView(OneView, kw_only=True):
     keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
 
 
-class SeveralViews(Document, kw_only=True):
+class SeveralViews(_ObjectFields, kw_only=True):
     """A file of several images."""
 
     views: Annotated[list[ViewFields], Meta(min_length=1)]
-    model: PathText | None = None
-    shape: PathText | None = None
-    size: SizeFields | None = None
-    object: Text | None = None
-    up_axis: Literal["x", "y", "z"] | None = "y"
-    symmetry: Any = None  # in a form of `Symmetry.from_dict`
-    unfinished: Any = None  # the annotator's
-    init: StartFields | None = None
-    fit: FitFields = msgspec.field(default_factory=FitFields)
 
 
 def with_evidence(fields: type[Declared]) -> type[Declared]:
@@ -189,10 +193,7 @@ def _with_evidence(fields: type[Declared], evidence: tuple[EvidenceField, ...]) 
 def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | OneView, ...]]:
     """Check the parsed form of a file; returns its fields and those of its views.
 
-    Raises
-    ------
-    DataError
-        If a field is missing, unknown or invalid.
+    Raises DataError if a field is missing, unknown or invalid.
     """
     if not isinstance(data, Mapping) or "views" not in data:
         is_started = isinstance(data, Mapping) and data.get("init") is not None
@@ -212,10 +213,7 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
 def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> ObservedImage:
     """An image from its checked fields; paths are relative to ``folder``.
 
-    Raises
-    ------
-    InputError
-        If the camera is invalid, or fields contradict each other.
+    Raises InputError if the camera is invalid, or fields contradict each other.
     """
     names = _column(read.keypoints, "name")
     ids = _column(read.keypoints, "semantic_id")
@@ -246,10 +244,7 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
 def read_size(read: SizeFields | None) -> Size | None:
     """The known lengths, if there are any.
 
-    Raises
-    ------
-    InputError
-        If it has no length, or neither one standard deviation nor three.
+    Raises InputError if it has no length, or neither one standard deviation nor three.
     """
     return None if read is None else Size(**msgspec.structs.asdict(read))
 
@@ -257,15 +252,12 @@ def read_size(read: SizeFields | None) -> Size | None:
 def read_start(read: StartFields | None) -> Alignment | None:
     """The alignment to start from, if there is any.
 
-    Raises
-    ------
-    DataError
-        If the rotation is none, or a scale is not positive.
+    Raises DataError if the rotation is none, or a scale is not positive.
     """
     if read is None:
         return None
     with within("init"):
-        return Alignment(np.array(read.rotation), np.array(read.translation), np.array(read.scale))
+        return read.alignment
 
 
 def write_image_fields(

@@ -17,7 +17,6 @@ differ by one. Two reflections make a rotation, which the rule finds.
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,14 +31,6 @@ _FOLDS = (2, 3, 4, 5, 6, 8)
 _AXIS_TOLERANCE_DEG = 10.0
 
 
-class FoundRotations(NamedTuple):
-    """Rotations (g, 3, 3) about a point (3,), the identity first, and an axis (3,) of any angle."""
-
-    center: FloatArray
-    rotations: FloatArray
-    axis: FloatArray | None = None
-
-
 def annotated_symmetry(xyz: FloatArray, symmetries: Symmetries) -> Symmetry:
     """The symmetry of a model with the keypoints (k, 3), by the module's rule."""
     center, rotations, axis = rotations_of(xyz, symmetries)
@@ -49,16 +40,22 @@ def annotated_symmetry(xyz: FloatArray, symmetries: Symmetries) -> Symmetry:
     return Symmetry(motions, () if axis is None else (SymmetryAxis(axis, center),))
 
 
-def rotations_of(xyz: FloatArray, symmetries: Symmetries) -> FoundRotations:
-    """Find the rotations that map a model's keypoints (k, 3) onto itself, by the module's rule."""
-    trivial = FoundRotations(np.zeros(3), np.eye(3)[None])
+def rotations_of(
+    xyz: FloatArray, symmetries: Symmetries
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Find the rotations that map a model's keypoints (k, 3) onto itself, by the module's rule.
+
+    They are a point (3,), rotations (g, 3, 3) about it, the identity first, and an axis (3,) of any
+    angle.
+    """
+    trivial = np.zeros(3), np.eye(3)[None], None
     if not symmetries.reflections and not symmetries.rotations:
         return trivial
     tolerance = _TOLERANCE * float(np.linalg.norm(np.ptp(xyz, axis=0)))
     revolution = _axis_of_revolution(xyz, symmetries, tolerance)
     if revolution is not None:
         center, axis = revolution
-        return FoundRotations(center, np.eye(3)[None], axis)
+        return center, np.eye(3)[None], axis
     from cadalign.datasets.models.rotated_onto import rotations_onto_themselves  # compiled
 
     center, equivalent = xyz.mean(axis=0), _equivalent(len(xyz), symmetries)
@@ -67,7 +64,7 @@ def rotations_of(xyz: FloatArray, symmetries: Symmetries) -> FoundRotations:
     kept = rotations_onto_themselves(shifted, equivalent, _candidates(), *most)
     if not kept.any():
         return trivial
-    return FoundRotations(center, np.concatenate([np.eye(3)[None], _candidates()[kept]]))
+    return center, np.concatenate([np.eye(3)[None], _candidates()[kept]]), None
 
 
 def _axis_of_revolution(

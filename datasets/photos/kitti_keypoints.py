@@ -233,10 +233,7 @@ def read_track_keypoints(path: Path) -> list[ImageKeypoints]:
 
     The image of a frame is called ``<sequence>/<frame>.png``.
 
-    Raises
-    ------
-    DataError
-        If the file, or a frame in it, cannot be read.
+    Raises DataError if the file, or a frame in it, cannot be read.
     """
     found = []
     for each in list_tracks(path):

@@ -8,15 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.sample.model import (
-    Color,
-    Draft,
-    Point,
-    Solid,
-    lathe,
-    palette,
-    pick,
-)
+from cadalign.datasets.sample.model import Color, Draft, Point, Solid, lathe, palette, pick
 
 _EDGE = 0.022  # radius of the rounded edge of the bottom
 

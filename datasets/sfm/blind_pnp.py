@@ -15,11 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, as_floats
-from cadalign.datasets.sfm.correspondences import (
-    Correspondences,
-    CorrespondenceSet,
-    rigid_pose,
-)
+from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment

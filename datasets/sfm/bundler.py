@@ -15,11 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.sfm.correspondences import (
-    Correspondences,
-    CorrespondenceSet,
-    rigid_pose,
-)
+from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES

@@ -42,11 +42,8 @@ def read_gltf(path: Path) -> Mesh:
 
     `cadalign.load_mesh` is the public way to it.
 
-    Raises
-    ------
-    DataError
-        If it is no glTF 2.0 file or damaged, has no faces, is no tree of nodes, needs an extension
-        that is not read, or repeats its meshes to more than 128 MB and 64 times its bytes.
+    Raises DataError if it is no glTF 2.0 file or damaged, has no faces, is no tree of nodes, needs
+    an extension that is not read, or repeats its meshes to more than 128 MB and 64 times its bytes.
     """
     file = GltfFile(path)
     with in_file(path), np.errstate(all="ignore"):  # what is not finite, Mesh refuses

@@ -98,12 +98,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
 def as_mesh(given: object, *, where: str) -> Mesh:
     """A mesh, or the one that a path names.
 
-    Raises
-    ------
-    InputError
-        If it is neither.
-    DataError
-        If the file cannot be read.
+    Raises InputError if it is neither, DataError if the file cannot be read.
     """
     if isinstance(given, Mesh):
         return given

@@ -9,7 +9,6 @@ import io
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +30,18 @@ def read_ply(path: Path) -> Mesh:
     """Read a PLY file, ASCII or binary; `cadalign.load_mesh` is the public way to it."""
     data = read_bytes(path)
     with _parsing(path):
-        header = _header(data, path)
-        if not header.counts.get("face"):
+        counts, texture_name = _header(data, path)
+        if not counts.get("face"):
             raise DataError("the PLY file has no faces", where=str(path))
         mesh = trimesh.load(io.BytesIO(data), "ply", skip_materials=True, process=False)
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.vertices) or mesh.visual is None:
             raise damaged("no triangles could be read", path)
         textured = mesh.visual.kind == "texture"
-        vertices, faces = header.counts.get("vertex", 0), header.counts["face"]
+        vertices, faces = counts.get("vertex", 0), counts["face"]
         if len(mesh.vertices) < vertices and not textured:
             raise _short(path, "vertices", len(mesh.vertices), vertices)
         if len(mesh.faces) == faces:
-            texture = Textures().read(path, header.texture) if textured and header.texture else None
+            texture = Textures().read(path, texture_name) if textured and texture_name else None
             return _mesh(mesh, path, texture)
         if textured:
             raise DataError("polygons with texture coordinates are not read", where=str(path))
@@ -88,28 +87,20 @@ def _parsing(path: Path) -> Iterator[None]:
         raise damaged(f"cannot be read as a {kind} file ({reason})", path) from None
 
 
-@dataclass
-class _Header:
-    """Header of a PLY file: numbers of elements, and the name of a texture."""
-
-    counts: dict[str, int] = field(default_factory=dict)
-    texture: str = ""
-
-
-def _header(data: bytes, path: Path) -> _Header:
-    """Read a PLY file's header."""
-    file, header = io.BytesIO(data), _Header()
+def _header(data: bytes, path: Path) -> tuple[dict[str, int], str]:
+    """Read a PLY file's header: numbers of elements, and the name of a texture or none."""
+    file, counts, texture = io.BytesIO(data), dict[str, int](), ""
     if file.readline(100).strip().lower() != b"ply":
         raise DataError("not a PLY file", where=str(path), fix="does it begin with 'ply'?")
     for _ in range(_MAX_HEADER_LINES):
         line = file.readline(10_000)
         words = line.split()
         if words == [b"end_header"]:
-            return header
+            return counts, texture
         if len(words) == 3 and words[0] == b"element" and words[2].isdigit():
-            header.counts[words[1].decode("ascii", errors="replace")] = int(words[2])
+            counts[words[1].decode("ascii", errors="replace")] = int(words[2])
         if len(words) > 2 and [word.lower() for word in words[:2]] == [b"comment", b"texturefile"]:
-            header.texture = line.split(maxsplit=2)[2].strip().decode("utf-8", errors="replace")
+            texture = line.split(maxsplit=2)[2].strip().decode("utf-8", errors="replace")
     raise damaged("the PLY header has no end", path)
 
 

@@ -18,10 +18,7 @@ def write_obj_mesh(path: Path, mesh: Mesh) -> None:
     Faces keep their order and polygons their corners' texture coordinates; vertex colours follow
     the coordinates, as MeshLab reads them.
 
-    Raises
-    ------
-    DataError
-        If a file cannot be written.
+    Raises DataError if a file cannot be written.
     """
     _make_folder(path)
     library = path.with_suffix(".mtl")
@@ -42,10 +39,7 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
 
     A surface without vertex colours has its materials'; PLY has no textures. Folders are made.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
+    Raises DataError if the file cannot be written.
     """
     import trimesh  # takes long to import, which OBJ files need not
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ from cadalign.io.documents import (
     read_json,
     within,
 )
-from cadalign.io.evidence import ImageEvidence, ObservedImage
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SeenKeypoint
@@ -86,24 +86,18 @@ class _Unfinished(Document):
 
 
 @dataclass(frozen=True, eq=False)
-class StoredView:
-    """A further photo of an earlier session's annotation."""
+class Stored:
+    """An earlier session's annotation of a photo; ``camera`` is None without an observation file.
+
+    ``views`` are those of the object's further photos.
+    """
 
     image: Path
-    document: AnnotationDocument
-    camera: Camera
-    evidence: ImageEvidence
-
-
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """An earlier session's annotation; ``camera`` is None without an observation file."""
-
-    document: AnnotationDocument
-    camera: Camera | None
-    further: FurtherEvidence
-    fit_options: Mapping[str, Any]
-    views: tuple[StoredView, ...] = ()
+    document: AnnotationDocument = field(default_factory=AnnotationDocument)
+    camera: Camera | None = None
+    further: FurtherEvidence = field(default_factory=FurtherEvidence)
+    fit_options: Mapping[str, Any] = field(default_factory=dict)
+    views: tuple[Stored, ...] = ()
 
     def priors_or(self, likely: Priors) -> Priors:
         """The priors of `cadalign fit` on the stored pairs; the likely ones before there are any.
@@ -134,7 +128,7 @@ class AnnotationFiles:
     def read(self, model: OpenedModel, shape: ObjectShape | None = None) -> Stored:
         """Read an earlier session's annotation; new model points are added to the registry."""
         registry, tolerance = model.registry, SAME_PLACE * model.cad.diagonal
-        stored = Stored(AnnotationDocument(), None, FurtherEvidence(), {})
+        stored = Stored(self.image)
         parts = []
         if self.observation.exists():
             observation = self._load()
@@ -143,14 +137,13 @@ class AnnotationFiles:
             self._warn_of_options(observation, further, shape)
             document = _document_of(photo, registry, tolerance)
             document = replace(document, name=observation.object_name or "")
-            views = tuple(
-                StoredView(
-                    view.image, _document_of(view, registry, tolerance), view.camera, view.evidence
-                )
-                for view in further.others
-                if view.image is not None and view.image.exists()
-            )
-            stored = Stored(document, photo.camera, further, observation.fit_options, views)
+            views = []
+            for view in further.others:
+                if view.image is not None and view.image.exists():
+                    own = _document_of(view, registry, tolerance), view.camera
+                    views.append(Stored(view.image, *own, FurtherEvidence(view.evidence)))
+            options = observation.fit_options
+            stored = Stored(self.image, document, photo.camera, further, options, tuple(views))
             with in_file(self.observation), within("unfinished"):
                 parts.append(convert(observation.unfinished or {}, _Unfinished))
         earlier = self._earlier_unfinished()
@@ -226,7 +219,7 @@ class AnnotationFiles:
                 continue
             with in_file(self.observation), within(f"unfinished.views[{number}]"):
                 camera = Camera.from_dict(each.camera)
-            new = StoredView(image, AnnotationDocument(), camera, ImageEvidence())
+            new = Stored(image, camera=camera)
             view = views.get(image.resolve(), new)
             own = _with_halves(view.document, each.pairs, registry)
             views[image.resolve()] = replace(view, document=own)

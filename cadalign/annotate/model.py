@@ -47,19 +47,6 @@ _MIRROR_APART = 0.05  # least distance of a point and its mirror image [diagonal
 _MIRROR_CANDIDATES = 8  # samples near a point, on whose triangles the nearest one is searched for
 
 
-@dataclass(frozen=True, eq=False)
-class Displayed:
-    """Triangles as they are displayed: simplified, and of those in one place one for each side.
-
-    ``color`` (m, 4) is linear, with the opacity; ``is_doubled`` (m,) are those of which another one
-    shows the back.
-    """
-
-    mesh: Mesh
-    color: npt.NDArray[np.float32]
-    is_doubled: BoolArray
-
-
 class ClickableModel:
     """A mesh that can be clicked on; centre and diagonal are its box's [model units]."""
 
@@ -159,8 +146,12 @@ class ClickableModel:
         return Scene(Mesh(small.vertices, small.faces))
 
     @cached_property
-    def displayed(self) -> Displayed:
-        """The triangles that are displayed."""
+    def displayed(self) -> tuple[Mesh, npt.NDArray[np.float32], BoolArray]:
+        """The triangles that are displayed: simplified, of those in one place one for each side.
+
+        With them linear colours and opacities (m, 4), and those (m,) of which another one shows the
+        back.
+        """
         small = simplify(self.scene.mesh, max_faces=MOST_FACES)
         alike, opposite = coincident_faces(small.vertices, small.faces)
         first = np.flatnonzero(alike == np.arange(len(alike)))
@@ -168,7 +159,7 @@ class ClickableModel:
         triangles: FaceArray = small.source[first].astype(np.int32)
         color = self.scene.surface.color(triangles, weights)
         mesh = Mesh(small.vertices, small.faces[first])
-        return Displayed(mesh, color, opposite[first] != alike[first])
+        return mesh, color, opposite[first] != alike[first]
 
     def _snapped(
         self, origin: FloatArray, direction: FloatArray, reach: float
@@ -216,8 +207,7 @@ def display_bytes(model: ClickableModel) -> bytes:
     header with ``shown`` and ``all``, the numbers of faces; then positions (faces, 3, 3) float32 in
     display coordinates, normals (faces, 3, 3) float32, and sRGB colours (faces, 3) uint8.
     """
-    displayed = model.displayed
-    mesh = displayed.mesh
+    mesh, color, _ = model.displayed
     shown = Mesh(model.to_display(mesh.vertices), mesh.faces)
     header = json.dumps({"shown": len(mesh.faces), "all": len(model.scene.mesh.faces)}).encode()
     header += b" " * (-len(header) % 4)
@@ -227,7 +217,7 @@ def display_bytes(model: ClickableModel) -> bytes:
             header,
             shown.triangles.astype("<f4").tobytes(),
             Scene(shown).corner_normals.astype("<f4").tobytes(),
-            bytes_from_linear(displayed.color[:, :3]).tobytes(),
+            bytes_from_linear(color[:, :3]).tobytes(),
         ]
     )
 
@@ -239,13 +229,14 @@ def detail_bytes(model: ClickableModel, creases: FloatArray) -> bytes:
     them; opacities (faces,) uint8; and sides (faces,) uint8, which are 1 for a triangle that only
     its front shows, since another one lies in its place, wound the other way.
     """
-    opacity = np.round(255 * np.clip(model.displayed.color[:, 3], 0, 1)).astype(np.uint8)
+    _, color, is_doubled = model.displayed
+    opacity = np.round(255 * np.clip(color[:, 3], 0, 1)).astype(np.uint8)
     return b"".join(
         [
             len(creases).to_bytes(4, "little"),
             model.to_display(creases).astype("<f4").tobytes(),
             opacity.tobytes(),
-            model.displayed.is_doubled.astype(np.uint8).tobytes(),
+            is_doubled.astype(np.uint8).tobytes(),
         ]
     )
 

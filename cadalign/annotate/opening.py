@@ -18,7 +18,7 @@ from cadalign.annotate.document import (
     read_history,
 )
 from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
-from cadalign.annotate.files import AnnotationFiles, StoredView
+from cadalign.annotate.files import AnnotationFiles, Stored
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.models import SAME_PLACE, Models, ObjectShape
 from cadalign.annotate.names import (
@@ -249,7 +249,7 @@ def _intrinsics(
 
 
 def _with_view(
-    owner: PhotoState, document: AnnotationDocument, stored: StoredView
+    owner: PhotoState, document: AnnotationDocument, stored: Stored
 ) -> AnnotationDocument:
     """The object's document with a further photo, of which the state is added to the owner's."""
     try:
@@ -259,7 +259,7 @@ def _with_view(
         logger.warning("%s: kept, but not opened: %s", owner.files.observation.name, error)
         return document
     view = owner.add_view(photo, intrinsics)
-    view.further = FurtherEvidence(stored.evidence)
+    view.further = stored.further
     own = replace(
         stored.document,
         focal=focal,

@@ -159,11 +159,14 @@ class KeypointNet:
         self.root = Path(root)
         if not self.root.is_dir():
             raise DataError("no such folder", where=str(self.root), fix="give KeypointNet's root")
-        self._source = _Source(self.root, MeshLocator(self.root, shapenet_root))
-        self.categories = self._source.categories
-        """The categories' names, sorted."""
+        self._locator = MeshLocator(self.root, shapenet_root)
         self._allowed: frozenset[ModelKey] | None = None
         self._with_mesh = False
+        folder = self.root / "annotations"
+        self._files = {path.stem: path for path in folder.glob("*.json") if path.stem != _ALL}
+        self._loaded = {} if self._files else self._load_all(folder)
+        self.categories = tuple(sorted({*self._files, *self._loaded}))
+        """The categories' names, sorted."""
 
     @property
     def splits(self) -> tuple[str, ...]:
@@ -238,7 +241,7 @@ class KeypointNet:
 
     def mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
         """All mesh files there are of a model, the one that `AnnotatedModel` names first."""
-        return self._source.mesh_paths(self._require(category), model_id)
+        return self._mesh_paths(self._require(category), model_id)
 
     @overload
     def __getitem__(self, key: str) -> tuple[AnnotatedModel, ...]: ...
@@ -258,7 +261,7 @@ class KeypointNet:
             models = self._models(self._require(key)).values()
             return tuple(model for model in models if isinstance(model, AnnotatedModel))
         name, model_id = self._require(key[0]), key[1]
-        found = self._source.load(name).get(model_id)
+        found = self._load(name).get(model_id)
         if isinstance(found, DataError):
             # A copy: the raised one keeps the frames that it passes through alive.
             raise copy.copy(found)
@@ -280,51 +283,40 @@ class KeypointNet:
         return require_category(category, self.categories, where=str(self.root))
 
     def _models(self, category: str) -> _Models:
-        models = self._source.load(category).items()
+        models = self._load(category).items()
         return {model_id: found for model_id, found in models if self._has(category, model_id)}
 
     def _has(self, category: str, model_id: str) -> bool:
         if self._allowed is not None and (category, model_id) not in self._allowed:
             return False
-        return not self._with_mesh or bool(self._source.mesh_paths(category, model_id))
+        return not self._with_mesh or bool(self._mesh_paths(category, model_id))
 
+    def _mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
+        synset, model = synset_of_name(category), self._load(category).get(model_id)
+        if isinstance(model, AnnotatedModel):
+            synset = model.class_id
+        return self._locator.paths(synset, model_id)
 
-class _Source:
-    """Reads the annotation files, each once."""
-
-    def __init__(self, root: Path, locator: MeshLocator) -> None:
-        self._locator = locator
-        self._loaded: dict[str, _Models] = {}
-        folder = root / "annotations"
-        self._files = {path.stem: path for path in folder.glob("*.json") if path.stem != _ALL}
-        if not self._files:
-            single = (folder / f"{_ALL}.json", root / f"{_ALL}.json", root / "keypointnet.json")
-            path = next(filter(Path.is_file, single), None)
-            if path is None:
-                fix = "give the folder that holds KeypointNet's annotations/ and splits/"
-                raise DataError("no annotations/*.json below it", where=str(root), fix=fix)
-            # Entries of all categories are told apart by their class id.
-            grouped: dict[str, list[tuple[int, object]]] = {}
-            for position, entry in enumerate(read_entries(path)):
-                class_id = entry.get("class_id") if isinstance(entry, dict) else None
-                name = name_of_synset(class_id) if isinstance(class_id, str) else "unknown"
-                grouped.setdefault(name, []).append((position, entry))
-            self._loaded = {name: self._build(name, path, found) for name, found in grouped.items()}
-        self.categories = tuple(sorted({*self._files, *self._loaded}))
-
-    def load(self, category: str) -> _Models:
+    def _load(self, category: str) -> _Models:
+        """All models of a category, whose file is read once, also for subsets."""
         if category not in self._loaded:
             path = self._files[category]
             self._loaded[category] = self._build(category, path, enumerate(read_entries(path)))
         return self._loaded[category]
 
-    def mesh_paths(self, category: str, model_id: str) -> tuple[Path, ...]:
-        """All mesh files of a model, also of a malformed one."""
-        model = self.load(category).get(model_id)
-        synset = synset_of_name(category)
-        if isinstance(model, AnnotatedModel):
-            synset = model.class_id
-        return self._locator.paths(synset, model_id)
+    def _load_all(self, folder: Path) -> dict[str, _Models]:
+        """All models of a single file, by the names of their class ids."""
+        single = folder / f"{_ALL}.json", self.root / f"{_ALL}.json", self.root / "keypointnet.json"
+        path = next(filter(Path.is_file, single), None)
+        if path is None:
+            fix = "give the folder that holds KeypointNet's annotations/ and splits/"
+            raise DataError("no annotations/*.json below it", where=str(self.root), fix=fix)
+        grouped: dict[str, list[tuple[int, object]]] = {}
+        for position, entry in enumerate(read_entries(path)):
+            class_id = entry.get("class_id") if isinstance(entry, dict) else None
+            name = name_of_synset(class_id) if isinstance(class_id, str) else "unknown"
+            grouped.setdefault(name, []).append((position, entry))
+        return {name: self._build(name, path, found) for name, found in grouped.items()}
 
     def _build(self, category: str, path: Path, entries: Iterable[tuple[int, object]]) -> _Models:
         models: _Models = {}

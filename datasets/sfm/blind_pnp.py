@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -29,18 +29,11 @@ _LARGEST_IMAGE = 2**30
 _PAIRED = 0.05
 
 
-class _Layout(NamedTuple):
-    """The names of the pickles; rotations and translations are the last two of the required."""
-
-    required: tuple[str, ...]
-    optional: tuple[str, ...]
-
-
-_MATCHES = _Layout(("matches", "R", "t"), ("inlier_matches", "focal"))
-_PREPROCESSED = _Layout(
-    ("p2d", "p3d", "R_gt", "t_gt"), ("W_gt", "num_points_2d", "num_points_3d", "focal")
-)
-LAYOUTS = (_MATCHES, _PREPROCESSED)
+# Names of the required pickles of a layout, rotations and translations last: the optional ones.
+LAYOUTS = {
+    ("matches", "R", "t"): ("inlier_matches", "focal"),
+    ("p2d", "p3d", "R_gt", "t_gt"): ("W_gt", "num_points_2d", "num_points_3d", "focal"),
+}
 FOLDERS = (".", "preprocessed")
 
 
@@ -94,11 +87,11 @@ class BlindPnP(CorrespondenceSet):
         if focal is not None and not (np.isfinite(focal) and focal > 0):
             raise InputError(f"{focal!r} is not a focal length", where="focal")
         self._focal = focal
-        folder, layout = _find_layout(Path(path))
-        self._is_matches = layout == _MATCHES
-        *_, self._rotation, self._translation = layout.required
-        optional = [name for name in layout.optional if (folder / f"{name}.pkl").is_file()]
-        self._files = {name: folder / f"{name}.pkl" for name in (*layout.required, *optional)}
+        folder, required = _find_layout(Path(path))
+        self._is_matches = "matches" in required
+        *_, self._rotation, self._translation = required
+        optional = [name for name in LAYOUTS[required] if (folder / f"{name}.pkl").is_file()]
+        self._files = {name: folder / f"{name}.pkl" for name in (*required, *optional)}
         # The smallest file is enough to count the samples.
         translations = _load_samples(self._files[self._translation])
         self._data: dict[str, Any] = {self._translation: translations}
@@ -202,16 +195,16 @@ class BlindPnP(CorrespondenceSet):
             raise InputError("there is no such sample", where=name) from None
 
 
-def _find_layout(root: Path) -> tuple[Path, _Layout]:
+def _find_layout(root: Path) -> tuple[Path, tuple[str, ...]]:
     if not root.is_dir():
         raise DataError("no such folder", where=str(root), fix="give a split's folder")
     closest: tuple[int, str] = (0, "there are no correspondences")
     for folder in (root / name for name in FOLDERS):
-        for layout in LAYOUTS:
-            missing = [n for n in layout.required if not (folder / f"{n}.pkl").is_file()]
+        for required in LAYOUTS:
+            missing = [name for name in required if not (folder / f"{name}.pkl").is_file()]
             if not missing:
-                return folder, layout
-            found = len(layout.required) - len(missing)
+                return folder, required
+            found = len(required) - len(missing)
             text = ", ".join(f"{name}.pkl" for name in missing)
             closest = max(closest, (found, f"{text} missing in {folder}"))
     fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl, or preprocessed/"

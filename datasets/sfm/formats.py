@@ -58,9 +58,9 @@ _FORMATS = {
         "matches.pkl, R.pkl and t.pkl, or p2d.pkl, p3d.pkl, R_gt.pkl and t_gt.pkl "
         "(also in preprocessed)",
         tuple(
-            tuple(f"{folder}/{stem}.pkl" for stem in layout.required)
+            tuple(f"{folder}/{stem}.pkl" for stem in required)
             for folder in blind_pnp.FOLDERS
-            for layout in blind_pnp.LAYOUTS
+            for required in blind_pnp.LAYOUTS
         ),
     ),
 }

@@ -143,12 +143,6 @@ class _PlainUnpickler(pickle.Unpickler):
         return self._allowed[current, name]
 
 
-class _ArrayType:
-    """Stands for ``numpy.ndarray``, which pickles name but need not call."""
-
-    __slots__ = ()
-
-
 class _Dtype:
     """Stands for ``numpy.dtype`` while a pickle is read."""
 
@@ -191,7 +185,7 @@ def _make_allowed() -> dict[tuple[str, str], Any]:
 
     Made anew for each file: a pickle can set attributes of the functions that it is given.
     """
-    array_type = _ArrayType()
+    array_type = object()  # for ``numpy.ndarray``, which pickles name but need not call
 
     def reconstruct(kind: Any, shape: Any, code: Any) -> _Array:
         if kind is not array_type:

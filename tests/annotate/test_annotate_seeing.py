@@ -156,9 +156,9 @@ def test_of_doubled_faces_each_shows_its_side() -> None:
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 2, 3], [0, 1, 4]])
     model = ClickableModel(Mesh(corners, faces))
-    displayed = model.displayed
-    assert displayed.mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 1, 4]]
-    assert displayed.is_doubled.tolist() == [True, False, True, False]
+    mesh, _, is_doubled = model.displayed
+    assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 2, 1], [0, 1, 4]]
+    assert is_doubled.tolist() == [True, False, True, False]
     wireframe = Wireframe.of_model(model)
     data = detail_bytes(model, wireframe.creases)
     lines = int.from_bytes(data[:4], "little")

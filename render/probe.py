@@ -168,6 +168,7 @@ logger = logging.getLogger("cadalign")
 
 AUTO = "auto"
 
+# Of OpenGL's devices, programs that run on the processor.
 _IMITATIONS = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
 
 
@@ -222,7 +223,8 @@ def make_renderer(name: str = AUTO, *, studio: Studio | None = None) -> Renderer
 def best_renderer() -> str:
     """The renderer that "auto" takes here, by name; ray casting needs no proof."""
     found = probe_renderer("pyrender")
-    if found.works and not _is_imitation(found.detail):
+    is_imitation = any(name in found.detail.lower() for name in _IMITATIONS)
+    if found.works and not is_imitation:
         logger.info("renderer: pyrender (%s)", found.detail)
         return "pyrender"
     if found.works:
@@ -231,11 +233,6 @@ def best_renderer() -> str:
         reason = f"pyrender does not work here: {found.detail}"
     logger.info("renderer: raycast (%s)", reason)
     return "raycast"
-
-
-def _is_imitation(device: str) -> bool:
-    """OpenGL's device is a program that runs on the processor."""
-    return any(name in device.lower() for name in _IMITATIONS)
 
 
 # Remedies -----------------------------------------------------------------------------------------

@@ -67,7 +67,6 @@ def perform(
 
 @cache
 def _arguments_of(function: Callable[..., ActionOutcome | None]) -> type[msgspec.Struct]:
-    """The document of a function's keyword arguments."""
     hints = get_type_hints(function, include_extras=True)
     fields = [
         (name, hints[name], msgspec.NODEFAULT if each.default is each.empty else each.default)

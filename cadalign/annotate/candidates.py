@@ -53,6 +53,7 @@ class MaskCandidates:
         camera are NaN.
         """
         known = self._rows_of(ids)
+        click = _CLICK * max(self.camera.width, self.camera.height)
         spread = np.append(self.spread, self.spread.max(initial=0.0))[known]
         places, sigmas = np.full((len(self.every), len(known), 2), np.nan), []
         for uv, each in zip(places, self.every, strict=True):
@@ -61,7 +62,7 @@ class MaskCandidates:
             uv[ahead] = self.camera.project(in_camera[ahead])
             distance = np.linalg.norm(in_camera, axis=1)
             size = float(np.linalg.norm(each.alignment.scale)) / np.sqrt(3)
-            sigmas.append(np.hypot(self._click, self.camera.fx * size * spread / distance))
+            sigmas.append(np.hypot(click, self.camera.fx * size * spread / distance))
         return places, np.array(sigmas)
 
     def points_of(
@@ -81,10 +82,6 @@ class MaskCandidates:
         """Probabilities (k,) after clicks (n, 2) on keypoints; 0 for those that are ruled out."""
         prior = np.array([each.relative_likelihood for each in self.every])
         return updated(prior, *self.predicted(ids, points), np.reshape(pixels, (-1, 2)))
-
-    @property
-    def _click(self) -> float:
-        return _CLICK * max(self.camera.width, self.camera.height)
 
 
 def updated(

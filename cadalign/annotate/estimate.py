@@ -72,17 +72,14 @@ class LiveAlignment:
                 sigma, options = known.sigma, {"sigma": known.sigma}
             text = assumed.format(reason="" if reason is None else reason.what)
             found = cls(result, text, attempt, sigma, options)
-            return found if not attempt.is_by_mask else found._among(attempt)
+            if attempt.is_by_mask:  # with the mask's candidates that the pairs leave
+                # `cadalign fit` knows neither the model's other keypoints nor where to begin.
+                text = text or ("" if attempt.exact else _PROPOSAL)
+                candidates, chances = attempt.candidates, attempt.chances
+                found = replace(found, message=text, candidates=candidates, chances=chances)
+            return found
         assert reason is not None
         raise reason
-
-    def _among(self, problem: LiveProblem) -> LiveAlignment:
-        """The estimate with the mask's candidates that the pairs leave."""
-        # `cadalign fit` knows neither the model's other keypoints nor where the search begins.
-        message = self.message or ("" if problem.exact else _PROPOSAL)
-        return replace(
-            self, message=message, candidates=problem.candidates, chances=problem.chances
-        )
 
     @property
     def provisional(self) -> bool:

@@ -300,7 +300,6 @@ def _extent(live: LiveAlignment, axis: str, shape: ObjectShape | None, *, in_len
 
 
 def _rotation(sigma: float) -> Fact:
-    """Standard deviation of the rotation [degrees]."""
     if sigma > _UNCERTAIN_DEG:
         return Fact("Rotation", *_UNDETERMINED)
     return Fact("Rotation", f"known to ± {short(sigma)}°", "")

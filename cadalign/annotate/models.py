@@ -395,7 +395,6 @@ def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
 
 
 def _is_others(path: Path, model: Path) -> bool:
-    """True for a keypoints file of another model."""
     if not path.exists():
         return False
     named = ModelKeypoints.load(path).model

@@ -329,7 +329,6 @@ def _object(state: PhotoState) -> dict[str, Any]:
 
 
 def _view(state: PhotoState) -> dict[str, Any]:
-    """One photo of the object."""
     number, slot = state.place
     return {
         "number": number,

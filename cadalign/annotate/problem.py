@@ -299,7 +299,6 @@ class LiveProblem:
 
     @property
     def _unknowns(self) -> int:
-        """Number of unknowns of poses and stretch."""
         is_rigid = self.views[0].cam_from_rig is not None
         return _POSE_UNKNOWNS * (1 if is_rigid else len(self.views)) + _STRETCH_UNKNOWNS
 

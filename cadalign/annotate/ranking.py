@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.objects import filled
+from cadalign.annotate.problem import LEAST_PAIRS
 from cadalign.annotate.session import Session
 from cadalign.annotate.suggestion import evidence_text, how_text, left_text, name_of, present, rank
 from cadalign.errors import CadalignError
 from cadalign.retrieval.page import score_text
 
-_LEAST_PAIRS = 4
 _FOCAL = "With a known focal length, a mask, another photo and lengths are ranked here too."
 
 
@@ -71,9 +71,9 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
         known, complete = choice.ids_on(state.files.model), state.document.complete_pairs
         pairs = [pair for pair in complete if pair.keypoint in known]
         others = len(complete) - len(pairs)
-        if len(pairs) < _LEAST_PAIRS:
+        if len(pairs) < LEAST_PAIRS:
             note = (
-                f"Mark {_LEAST_PAIRS - len(pairs)} more of the named keypoints, which all models "
+                f"Mark {LEAST_PAIRS - len(pairs)} more of the named keypoints, which all models "
                 "of the library share: the rings on the model, also listed under Next keypoint."
             )
             counted = f" {others} pairs of other points don't count." if others else ""

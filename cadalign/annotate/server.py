@@ -229,12 +229,10 @@ def _asset(name: str, media_type: str, request: Request) -> Response:
 
 
 def _kept(thumbnail: bytes) -> Response:
-    """A picture that the browser keeps for an hour."""
     return Response(thumbnail, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
 
 
 def _as_file(name: str, data: bytes, media_type: str) -> Response:
-    """A file that the browser saves under a name."""
     headers = {"Content-Disposition": f"attachment; filename*=UTF-8''{quote(name)}"}
     return Response(data, media_type=media_type, headers=headers)
 

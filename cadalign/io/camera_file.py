@@ -70,7 +70,8 @@ def _read_form(path: Path) -> dict[str, Any]:
     if path.suffix.lower() == _ARRAY:
         return {"matrix": _read_array(path)}
     if not _is_json(path):
-        return {"matrix": _read_numbers(path)}
+        numbers = read_text(path).replace(",", " ").replace(";", " ").split()
+        return {"matrix": _square(numbers, path)}
     data = read_json(path)
     if isinstance(data, list) and len(data) in (3, 9):
         return {"matrix": _square(data, path)}
@@ -98,12 +99,6 @@ def _read_array(path: Path) -> Any:
         what = f"not a NumPy array that can be read ({brief(error)})"
         raise DataError(what, where=str(path)) from None
     return _square(values, path)
-
-
-def _read_numbers(path: Path) -> Any:
-    """Numbers of a text file, separated by blanks, commas or semicolons."""
-    text = read_text(path)
-    return _square(text.replace(",", " ").replace(";", " ").split(), path)
 
 
 def _square(values: Any, path: Path) -> Any:

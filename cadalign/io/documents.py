@@ -252,7 +252,8 @@ def _parts_at(kind: Any, path: str | None, name: str) -> list[Any]:
     """The fields or values of the types declared at a path; none within a hostile field name."""
     kind = msgspec.inspect.type_info(kind)
     for step in _STEP.finditer((path or "$")[1:]):
-        kind = _without_none(kind)
+        if isinstance(kind, msgspec.inspect.UnionType):  # an optional type
+            kind = next(k for k in kind.types if not isinstance(k, msgspec.inspect.NoneType))
         if isinstance(kind, msgspec.inspect.StructType | msgspec.inspect.DataclassType):
             types = {each.encode_name: each.type for each in kind.fields}
             kind = types.get(step["name"])
@@ -260,10 +261,3 @@ def _parts_at(kind: Any, path: str | None, name: str) -> list[Any]:
             kind = getattr(kind, "value_type" if step["row"] == "..." else "item_type", None)
     kinds = kind.types if isinstance(kind, msgspec.inspect.UnionType) else (kind,)
     return [part for each in kinds for part in getattr(each, name, ())]
-
-
-def _without_none(kind: Any) -> Any:
-    """The type that an optional type is of."""
-    if not isinstance(kind, msgspec.inspect.UnionType):
-        return kind
-    return next(each for each in kind.types if not isinstance(each, msgspec.inspect.NoneType))

@@ -179,7 +179,6 @@ class DeclaredEvidence:
         )
 
     def _check_more(self) -> None:
-        """Check the values of registered fields."""
         if not self.more:
             return
         checked = {}

@@ -87,10 +87,6 @@ def reading(path: Path) -> Iterator[None]:
         raise DataError(f"cannot be read ({reason})", where=printable(path)) from None
 
 
-def _open_at_once(path: str, flags: int) -> int:
-    return os.open(path, flags | _NOT_WAITING)
-
-
 class InputFile(io.BufferedReader):
     """A file that is read; ``size`` is that at its opening.
 
@@ -99,7 +95,7 @@ class InputFile(io.BufferedReader):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(io.FileIO(path, opener=_open_at_once))
+        super().__init__(io.FileIO(path, opener=lambda p, flags: os.open(p, flags | _NOT_WAITING)))
         self.status = os.fstat(self.fileno())
         self.size = self.status.st_size
 
@@ -178,23 +174,12 @@ class Seal:
 
     The header holds, in little-endian order, the 16 bytes that name the format, its version (4
     bytes), 4 bytes of zero, the payload's length (8 bytes) and its BLAKE2b checksum (32 bytes).
-
-    Parameters
-    ----------
-    magic : bytes
-        The 16 bytes that name it.
-    version : int
-        The version that is written and read.
-    noun : str
-        Its name in messages, such as "library file".
-    fix : str
-        How to make such a file.
     """
 
-    magic: bytes
-    version: int
-    noun: str
-    fix: str
+    magic: bytes  # the 16 bytes
+    version: int  # that is written and read
+    noun: str  # its name in messages, such as "library file"
+    fix: str  # how to make such a file
 
     def write(self, path: Path, payload: Any) -> None:
         """Write a file atomically; ``payload`` is bytes or a buffer."""

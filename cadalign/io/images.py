@@ -153,21 +153,11 @@ _MOST_BYTES = 2**40
 
 @dataclass(frozen=True)
 class Video:
-    """A video whose pictures are read when they are asked for.
+    """A video whose pictures are read when they are asked for."""
 
-    Parameters
-    ----------
-    path : Path
-        A file that FFmpeg reads, or a folder of photos.
-    size : tuple of 2 int
-        Width and height of its pictures, as they are seen [px].
-    rate : float or None
-        Frames in a second; None where the video does not say.
-    """
-
-    path: Path
-    size: tuple[int, int]
-    rate: float | None
+    path: Path  # a file that FFmpeg reads, or a folder of photos
+    size: tuple[int, int]  # width and height of its pictures, as they are seen [px]
+    rate: float | None  # frames in a second; None where the video does not say
 
     @classmethod
     def open(cls, path: Path) -> Video:

@@ -1,76 +1,6 @@
 """Observations: one object's keypoints in one or more images, as a JSON file.
 
-The file of one image holds one object::
-
-    {
-      "camera": {"model": "PINHOLE", "width": 640, "height": 480,
-                 "params": [935.0, 935.0, 320.0, 240.0]},
-      "keypoints": [
-        {"xyz": [0.11, 0.42, -0.08], "uv": [351.2, 204.9], "sigma": 1.0, "semantic_id": 3,
-         "name": "back, top left", "score": 0.93},
-        ...
-      ],
-      "image": "photo.png",
-      "model": "chair.obj",
-      "fit": {"sigma": null, "loss": "linear"}
-    }
-
-``camera`` is COLMAP's form, or a calibration ``matrix``, see `cadalign.Camera.from_dict`; an
-unknown focal length is ``null`` there, or ``{"width": 640, "height": 480}`` is all that is given.
-``xyz`` is in model units, ``uv`` in pixels of the photo as it is seen: turned upright where EXIF
-says so. ``pixel_origin`` says where pixel (0, 0) lies: ``"center"`` of the top-left pixel, or
-``"corner"`` of the image, half a pixel away. In ``camera`` it is that of the principal point, by
-default ``"corner"`` for COLMAP's ``params`` and ``"center"`` for a ``matrix``; beside ``keypoints``
-it is that of ``uv``, by default ``"center"``. `Observation.save` states both.
-``sigma`` [px], ``semantic_id``, ``name`` and ``score`` (a detector's, not negative) are optional,
-each given for all keypoints or for none. ``image`` and ``model`` are optional paths, relative to
-the file. ``fit`` holds options for `cadalign.fit` where they are not its defaults:
-``method``, ``sigma`` (one for all keypoints or a list, in place of theirs; ``null`` estimates it),
-``loss``, ``loss_scale``, ``stretch``, ``stretch_sigma``, ``known_axis``, ``focal`` and
-``focal_prior`` (``{"focal": 1100, "relative_sigma": 0.4}``, ``"usual"`` for that of usual lenses,
-``null`` for none; by default that of the first photo's EXIF data, unless another photo's differ,
-and otherwise the usual one); ``shape_sigma`` of
-`cadalign.Model`, for a model that is only similar; and ``"image": true``, to take the photos
-themselves as evidence (``image`` of `cadalign.View`).
-
-``object`` is the object's name, to tell the objects of a photo apart. ``unfinished`` has what an
-annotator has marked and a fit cannot use, such as a point of the photo without one of the model.
-
-``up_axis`` is the model's axis that points up, ``"y"`` by default, for ``up`` and
-``camera_height``; ``null`` for none.
-
-``symmetry`` says what takes the model to itself, in any form of `cadalign.Symmetry.from_dict`:
-``"__SYM_ROTATE_UP_4"``, ``{"axis": [0, 1, 0], "fold": null}``, or BOP's lists.
-
-Evidence beyond keypoints stands beside them, each field optional, sigmas and scales as
-`cadalign.View` and `cadalign.Size` describe them::
-
-      "mask": "photo.mask.png", "mask_sigma": 1.5,
-      "depth": "photo.depth.png", "depth_scale": 0.001, "depth_sigma": 0.01,
-      "up": [0.02, -0.97, 0.24], "up_sigma_deg": 1.0,
-      "camera_height": 1.45, "camera_height_sigma": 0.02,
-      "size": {"width": 0.45, "height": 0.91, "length": 0.52, "sigma": 0.01},
-      "shape": "chair.shape",
-      "init": {"rotation": [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
-               "translation": [0.1, 0.05, 2.4], "scale": [1, 1.1, 0.9]}
-
-``mask`` and ``depth`` are PNG files of the camera's size, ``depth`` of 16 bits with ``depth_scale``
-units per count; in its place keypoints may have a ``depth`` [units], left out where unknown.
-``shape`` is a file of `cadalign shape learn`, which takes the model's place. ``init`` is an
-alignment to start from, as `cadalign.align` takes it, in the form of ``alignment`` in a fit.json;
-its ``scale`` is 1 unless given. With it ``keypoints`` may be few, or none. Several images of one
-object stand in ``views``, each with camera, image, keypoints (or none) and evidence of its own; and
-``cam_from_rig``, a 4 x 4 matrix by rows, for all of them or for none, if the cameras' motion is
-known. Keypoints of the same ``semantic_id`` (or else ``name``, or else ``xyz``) are the same::
-
-    {
-      "model": "chair.obj",
-      "views": [
-        {"camera": ..., "image": "left.png", "keypoints": [...], "mask": "left.mask.png",
-         "cam_from_rig": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]},
-        {"camera": ..., "image": "right.png", "keypoints": [...], "cam_from_rig": [...]}
-      ]
-    }
+The file is described in docs/formats/observation.md.
 """
 
 from __future__ import annotations
@@ -115,7 +45,7 @@ class Observation(ObservedImage):
     model : Path, optional
         The CAD model.
     fit_options : mapping
-        Keyword arguments for `cadalign.fit` where they are not its defaults; see the module.
+        Keyword arguments for `cadalign.fit` where they are not its defaults, as the file has them.
     others : tuple of ObservedImage
         The other images.
     size : Size, optional
@@ -275,27 +205,14 @@ def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None =
 
 @dataclass(frozen=True)
 class ObservationChanges:
-    """Camera, evidence and size in the place of those of observations.
+    """Camera, evidence and size in the place of those of observations."""
 
-    Parameters
-    ----------
-    camera : Path, optional
-        File of the calibrated camera; see `cadalign.io.camera_file.read_camera`.
-    pixel_origin : {"center", "corner"}, optional
-        Of that camera.
-    evidence : mapping
-        Fields of `ImageEvidence`.
-    size : Size, optional
-    focal, fov : float, optional
-        Focal length [px] or horizontal field of view [degrees] of all cameras.
-    """
-
-    camera: Path | None = None
-    pixel_origin: PixelOrigin | None = None
-    evidence: Mapping[str, Any] = field(default_factory=dict)
+    camera: Path | None = None  # file of the calibrated camera, see `camera_file.read_camera`
+    pixel_origin: PixelOrigin | None = None  # of that camera
+    evidence: Mapping[str, Any] = field(default_factory=dict)  # fields of `ImageEvidence`
     size: Size | None = None
-    focal: float | None = None
-    fov: float | None = None
+    focal: float | None = None  # focal length of all cameras [px]
+    fov: float | None = None  # or their horizontal field of view [degrees]
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""

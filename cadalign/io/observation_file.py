@@ -1,6 +1,6 @@
 """The declared fields of observation files, and their conversion to and from images.
 
-`cadalign.io.observation` documents the format.
+The format is described in docs/formats/observation.md.
 """
 
 from __future__ import annotations

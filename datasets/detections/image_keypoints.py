@@ -232,7 +232,6 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _is_image(name: str | None, wanted: str) -> bool:
-    """True if a file's name or id for an image means the wanted one."""
     return name is not None and (
         name == wanted or Path(name).name == Path(wanted).name or name == Path(wanted).stem
     )

@@ -121,8 +121,6 @@ class Symmetries:
 
 
 class _MeshInfo(ForeignDocument):
-    """Place on the mesh: a face and the weights of its corners."""
-
     face_index: Count
     face_uv: Point3
 
@@ -134,8 +132,6 @@ class _MeshInfo(ForeignDocument):
 
 
 class _CloudInfo(ForeignDocument):
-    """Nearest point of the point cloud."""
-
     point_index: Count
 
 

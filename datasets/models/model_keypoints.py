@@ -256,7 +256,6 @@ class ModelKeypoints:
 
 
 def _on_face(mesh: Mesh, entry: _Entry, where: str) -> tuple[float, float, float]:
-    """The point on the mesh where the entry's face and barycentric coordinates place it."""
     try:
         place = mesh.surface_points(np.array([entry.face_index]), np.array([entry.barycentric]))
     except CadalignError as error:

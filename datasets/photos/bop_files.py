@@ -149,7 +149,14 @@ def read_scene_gt(path: Path) -> Estimates:
     ):
         try:
             with in_file(path):
-                poses.append(_pose_of_entry(entry, scene, image, f"{image}[{row}]"))
+                if not image.isdecimal():
+                    what = f"{quote(image)} is not the number of an image"
+                    raise InputError(what, where=image)
+                place = f"{image}[{row}]"
+                pose: ScenePose = convert(entry, ScenePose, place)
+                with within(place):
+                    own = object_name(pose.obj_id), pose.alignment()
+                poses.append(PoseEstimate(scene, str(int(image)), *own))
         except DataError as error:
             problems.append(error)
     return _estimates(path, poses, problems)
@@ -159,14 +166,6 @@ def _estimates(path: Path, poses: list[PoseEstimate], problems: list[DataError])
     if problems and not poses:
         raise problems[0]
     return Estimates(path, tuple(poses), tuple(problems))
-
-
-def _pose_of_entry(entry: Any, scene: str, image: str, where: str) -> PoseEstimate:
-    if not image.isdecimal():
-        raise InputError(f"{quote(image)} is not the number of an image", where=image)
-    pose: ScenePose = convert(entry, ScenePose, where)
-    with within(where):
-        return PoseEstimate(scene, str(int(image)), object_name(pose.obj_id), pose.alignment())
 
 
 def _pose_of_row(row: list[str]) -> PoseEstimate:
@@ -213,7 +212,6 @@ def _number(text: str, where: str) -> int:
 
 
 def _numbers(pose: PoseEstimate, number: int, *fields: str) -> Iterator[int]:
-    """The ids of a pose as numbers."""
     for field in fields:
         text = getattr(pose, field)
         text = text.removeprefix("obj_") if field == "model_id" else text
@@ -322,7 +320,6 @@ def write_models_info(folder: Path, entries: Mapping[int, dict[str, float]]) -> 
 
 
 def _diameter(mesh: Mesh) -> float:
-    """The largest distance of two vertices."""
     from scipy.spatial import ConvexHull, QhullError  # only writing needs SciPy
     from scipy.spatial.distance import pdist
 

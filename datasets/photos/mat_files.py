@@ -89,7 +89,6 @@ class _Elements:
         return self._place < len(self._data)
 
     def next(self) -> tuple[int, memoryview]:
-        """The kind and the content of the next element."""
         if len(self._data) - self._place < _TAG:
             raise InputError("it is cut short")
         kind, size = struct.unpack_from(f"{self._order}II", self._data, self._place)
@@ -112,7 +111,6 @@ class _Elements:
         return struct.unpack(f"{self._order}{len(content) // 4}i", content)
 
     def _numbers(self) -> npt.NDArray[Any]:
-        """The numbers of the next element."""
         kind, content = self.next()
         if kind not in _NUMBERS:
             raise InputError(f"numbers of the unknown type {kind}")

@@ -175,12 +175,10 @@ def list_annotations(folder: Path) -> list[Path]:
     return sorted(path for path in found if path.name != _GEOMETRY)
 
 
-def has_annotations(folder: Path) -> bool:
-    """True if there are annotation files, as told by their ending, or their content where JSON."""
-    return any(path.suffix == ".pbdata" or _is_sequence(path) for path in list_annotations(folder))
-
-
 def _is_sequence(path: Path) -> bool:
+    """True for an annotation file, by its ending or, where it is JSON, its content."""
+    if path.suffix == ".pbdata":
+        return True
     with suppress(DataError), open_input(path) as file:
         begin = file.read(_BEGINNING)
         return b"frame_annotations" in begin or b"frameAnnotations" in begin
@@ -273,7 +271,6 @@ def _sequence(placed: PlacedObject) -> dict[str, Any]:
 
 
 def _projection(camera: Camera) -> FloatArray:
-    """The projection matrix of the sensor on its side."""
     width, height = camera.width, camera.height
     matrix = np.zeros((4, 4))
     matrix[0, 0], matrix[1, 1] = 2 * camera.fy / height, 2 * camera.fx / width
@@ -287,7 +284,7 @@ def _projection(camera: Camera) -> FloatArray:
 FORMAT = PhotoFormat(
     "objectron",
     f"Objectron: .pbdata files, or JSON files in {ANNOTATIONS}",
-    has_annotations,
+    lambda folder: any(map(_is_sequence, list_annotations(folder))),
     Objectron,
     write_objectron,
 )

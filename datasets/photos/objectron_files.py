@@ -180,14 +180,12 @@ def _snake_case(value: Any) -> Any:
         return [_snake_case(each) for each in value]
     if isinstance(value, dict):
         return {
-            _JSON_NAMES.get(name, _CAPITAL.sub(_lower, name)): _snake_case(each)
+            _JSON_NAMES.get(
+                name, _CAPITAL.sub(lambda found: f"_{found[1].lower()}", name)
+            ): _snake_case(each)
             for name, each in value.items()
         }
     return value
-
-
-def _lower(found: re.Match[str]) -> str:
-    return f"_{found[1].lower()}"
 
 
 def decode(data: bytes, fields: Mapping[int, Field]) -> dict[str, Any]:

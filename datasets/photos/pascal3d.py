@@ -163,7 +163,6 @@ def _object(
 
 
 def _anchors(anchors: MatStruct | None) -> PhotoKeypoints | None:
-    """The anchors that are visible."""
     marked: dict[str, FloatArray] = {}
     for name in anchors.names if anchors else ():
         each = anchors.struct(name) if anchors else None
@@ -223,7 +222,6 @@ def _load_mesh(path: Path, category: str, index: int) -> Mesh:
 
 
 def _load_keypoints(path: Path, category: str, index: int) -> NamedPoints | None:
-    """The anchors that a model has."""
     found = _find_cad(path, category, index)
     with in_file(f"{path}: model {index}"):
         names = [name for name in found.texts("pnames") if name in found.names]

@@ -262,7 +262,6 @@ def _rectangle(box: Box, camera: Camera) -> FloatArray | None:
 
 
 def _inverse(alignment: Alignment) -> Alignment:
-    """The inverse of an alignment with equal scales."""
     scale = alignment.scale
     if np.ptp(scale) > 1e-9 * scale.max():
         raise InputError(f"the scan has unequal scales {scale.tolist()}", where="trs.scale")
@@ -272,7 +271,6 @@ def _inverse(alignment: Alignment) -> Alignment:
 
 
 def _annotation_file(path: Path) -> tuple[Path, Path]:
-    """The folder and the annotation file that a path means."""
     if existing(path):
         return path.parent, path
     found = first_existing(path / name for name in (FULL, *_SAMPLES))

@@ -57,7 +57,6 @@ class _Vessel:
         return self.draft / (self.draft + self.freeboard)
 
     def edge(self, z: npt.ArrayLike) -> FloatArray:
-        """Heights of the side's edge."""
         z, (bow, stern) = np.asarray(z), self.sheer
         rise = bow * np.clip((0.05 - z) / 0.55, 0, 1) ** 2
         return np.asarray(self.freeboard + rise + stern * np.clip((z - 0.1) / 0.4, 0, 1) ** 2)
@@ -156,7 +155,6 @@ def _storey(low: float, roof: Level, *, slope: float = 0.0, color: Color = _WHIT
 
 
 def _funnel(top: Point, low: float, radius: float, color: Color) -> list[Solid]:
-    """A funnel with a black top."""
     _, high, z = top
     bend = low + 0.8 * (high - low)
     lower, upper = (

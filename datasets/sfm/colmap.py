@@ -297,7 +297,6 @@ class _Cursor:
         return start
 
     def finish(self) -> None:
-        """Check that nothing is left."""
         if self.offset != len(self._data):
             what = f"{len(self._data) - self.offset} bytes too many from offset {self.offset} on"
             raise DataError(what, where=str(self._path), fix="is it the file that its name says?")

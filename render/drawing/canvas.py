@@ -183,7 +183,6 @@ class Canvas:
     def _draw_swatches(
         self, entries: list[LegendEntry], left: float, width: float, middles: FloatArray
     ) -> None:
-        """Draw the legend's samples, one under the other."""
         for entry, y in zip(entries, middles, strict=True):
             middle = np.array([left + width / 2, y])
             if entry.marker == "ring":
@@ -278,7 +277,6 @@ def _encoded_squares() -> ByteImage:
 
 @cache
 def _decoded_bytes() -> LinearArray:
-    """The linear light of every byte."""
     return linear_from_srgb(np.arange(256, dtype=np.float32) / np.float32(255))
 
 

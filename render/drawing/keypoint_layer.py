@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -65,7 +64,12 @@ class KeypointMarks:
 
     def placed(self, canvas: Canvas) -> KeypointMarks:
         """The same marks in pixels of a canvas."""
-        return KeypointMarks(*(None if each is None else canvas.place(each) for each in self._all))
+        return KeypointMarks(
+            **{
+                name: each if each is None else canvas.place(each)
+                for name, each in vars(self).items()
+            }
+        )
 
     def draw(self, canvas: Canvas) -> None:
         """Draw regions, then unobserved keypoints, residuals, rings and crosses."""
@@ -101,10 +105,6 @@ class KeypointMarks:
         """Pixels of the keypoints, (n, 2)."""
         points = [each for each in (self.seen, self.back, self.unseen) if each is not None]
         return np.concatenate([np.empty((0, 2)), *points])
-
-    @property
-    def _all(self) -> tuple[Any, ...]:
-        return self.seen, self.back, self.residuals, self.unseen, self.regions
 
 
 def confidence_regions(points_2d: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -204,7 +204,6 @@ def _edge_strokes(box: Box, color: Color, camera: Camera) -> list[_Stroke]:
 
 
 def _axis_strokes(box: Box, camera: Camera) -> list[_Stroke]:
-    """Arrows from the box's centre to its faces."""
     strokes: list[_Stroke] = []
     for k, (name, color) in enumerate(zip("xyz", AXIS_COLORS, strict=True)):
         tip = box.center + box.rotation[:, k] * box.extents[k] / 2
@@ -285,7 +284,6 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
 
 
 def _legend_entries(gt_box: Box | None, predicted: bool, *, axes: bool) -> list[LegendEntry]:
-    """Names and colours of boxes, model and axes."""
     entries = []
     if gt_box is not None:
         entries.append(LegendEntry("ground truth", GT_COLOR))

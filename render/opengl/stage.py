@@ -48,7 +48,6 @@ def _mesh(scene: Scene, faces: IntArray, *, turned: bool) -> Any:
 
 
 def _primitive(scene: Scene, material: Material, faces: IntArray, *, turned: bool) -> Any:
-    """Triangles of one material."""
     mesh = scene.mesh
     textured = material.texture is not None and mesh.corner_uv is not None
     factor = np.asarray(material.color, dtype=np.float32)

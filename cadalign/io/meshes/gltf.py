@@ -207,22 +207,10 @@ class GltfDocument(_Part):
 class GltfFile:
     """A glTF file: its document, and the arrays of its buffers, which are read when asked for.
 
-    Errors of arrays name their place in the document; who asks for them names the file.
+    Errors of arrays name their place in the document; who asks for them names the file. ``size``
+    counts the bytes read so far, of the files that it names, too.
 
-    Parameters
-    ----------
-    path : Path
-
-    Attributes
-    ----------
-    document : GltfDocument
-    size : int
-        The bytes read so far, of the files that it names, too.
-
-    Raises
-    ------
-    DataError
-        If it is no glTF 2.0 file, is cut short, or needs an extension that is not read.
+    Raises DataError if it is no glTF 2.0 file, cut short, or needs an extension that is not read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -283,7 +271,6 @@ class GltfFile:
         return np.ndarray(shape, dtype, buffer=data, offset=offset, strides=strides)
 
     def _with_sparse(self, values: Array, sparse: Sparse, place: str) -> Array:
-        """A copy of the values with some replaced."""
         kind = np.dtype(_NUMBERS.get(sparse.indices.component_type, "<f4"))
 
         def part(of: SparsePart, width: int, dtype: Any) -> Array:

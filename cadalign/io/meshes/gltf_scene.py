@@ -112,20 +112,15 @@ def _count_faces(file: GltfFile, primitive: Primitive) -> int:
     return max(count - 2, 0) if primitive.mode in (_STRIP, _FAN) else 0
 
 
-def _count_vertices(file: GltfFile, primitive: Primitive) -> int:
-    """The largest number of vertices that a primitive can have: many may share one array."""
-    number = primitive.attributes["POSITION"]
-    count = nth(file.document.accessors, number, "accessors").count
-    return min(count, 3 * _count_faces(file, primitive))
-
-
 def _check_size(file: GltfFile, primitives: list[tuple[Primitive, FloatArray]]) -> None:
     """Refuse a scene that repeats its meshes to far more than its file."""
-    vertices = sum(len(at) * _count_vertices(file, each) for each, at in primitives)
-    faces = sum(len(at) * _count_faces(file, each) for each, at in primitives)
+    vertices = faces = 0
+    for each, at in primitives:
+        count = _count_faces(file, each)
+        faces += len(at) * count
+        # Many primitives may share one array; files that are named count as well.
+        vertices += len(at) * min(len(file.array(each.attributes["POSITION"])), 3 * count)
     size = _VERTEX_BYTES * vertices + _FACE_BYTES * faces
-    for each, _ in primitives:  # files that are named count as well
-        file.array(each.attributes["POSITION"])
     if size > _FREE_BYTES + _EXPANSION * file.size:
         what = f"its nodes repeat meshes to {faces} faces, from {file.size} bytes"
         raise DataError(what, fix="simplify it, or leave copies out")
@@ -141,7 +136,6 @@ class _Looks:
         self._looks: dict[int | None, _Look] = {None: (Material(), None)}
 
     def of(self, number: int | None) -> _Look:
-        """The look of the material of a number."""
         if number not in self._looks:
             self._looks[number] = self._make(int(number or 0))
         return self._looks[number]

@@ -13,26 +13,20 @@ from cadalign.io.meshes.gltf_scene import read_gltf
 from cadalign.io.meshes.obj import read_obj
 
 
-def _read_ply(path: Path) -> Mesh:
+def _read_by_trimesh(path: Path) -> Mesh:
     # Only here: trimesh takes longer to import than an OBJ file to be read.
-    from cadalign.io.meshes.trimesh_files import read_ply
+    from cadalign.io.meshes.trimesh_files import read_ply, read_solids
 
-    return read_ply(path)
-
-
-def _read_solids(path: Path) -> Mesh:
-    from cadalign.io.meshes.trimesh_files import read_solids  # trimesh, as above
-
-    return read_solids(path)
+    return read_ply(path) if path.suffix.lower() == ".ply" else read_solids(path)
 
 
 _READERS = {
     ".obj": read_obj,
-    ".ply": _read_ply,
+    ".ply": _read_by_trimesh,
     ".glb": read_gltf,
     ".gltf": read_gltf,
-    ".stl": _read_solids,
-    ".off": _read_solids,
+    ".stl": _read_by_trimesh,
+    ".off": _read_by_trimesh,
 }
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 FLAT_TOLERANCE = 1e-5

@@ -149,13 +149,8 @@ def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
     """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
     # A tab may separate the keyword too.
     lines = data.replace(b"\t", b" ").split(b"\n")
-    return _joined(enumerate(map(bytes.strip, lines), start=1))
-
-
-def _joined(lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
     parts: list[bytes] = []
-    number = 0
-    for number, line in lines:
+    for number, line in enumerate(map(bytes.strip, lines), start=1):
         if line[-1:] == b"\\":
             parts.append(line[:-1])
         elif parts:
@@ -164,7 +159,7 @@ def _joined(lines: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
         else:
             yield number, line
     if parts:
-        yield number, b" ".join(parts)
+        yield len(lines), b" ".join(parts)
 
 
 def _require_complete(statements: _Statements, path: Path) -> None:

@@ -58,19 +58,13 @@ def _make_folder(path: Path) -> None:
 def _vertex_colors(mesh: Mesh) -> FloatArray:
     if mesh.vertex_colors is not None:
         return np.asarray(mesh.vertex_colors)
-    palette = np.array(
-        [
-            each.color if each.texture is None else (*_mean_color(each.texture), each.color[3])
-            for each in mesh.materials
-        ]
-    )
+    palette = np.array([each.color for each in mesh.materials])
+    for row, each in enumerate(mesh.materials):
+        if each.texture is not None:
+            palette[row, :3] = each.texture[..., :3].reshape(-1, 3).mean(axis=0) / 255
     colors = np.ones((len(mesh.vertices), 4))
     colors[mesh.faces] = palette[mesh.face_material][:, None]
     return colors
-
-
-def _mean_color(texture: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> tuple[float, ...]:
-    return tuple((texture[..., :3].reshape(-1, 3).mean(axis=0) / 255).tolist())
 
 
 def _vertex_lines(mesh: Mesh) -> list[str]:

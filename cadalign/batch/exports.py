@@ -27,10 +27,10 @@ from cadalign.export.aligned_object import FORMS, AlignedObject, ExportView, pho
 from cadalign.export.camera_files import write_nerf
 from cadalign.export.formats import export_object, format_of
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.mesh import join
 from cadalign.io.documents import parse_json
 from cadalign.io.files import write_json, writing
 from cadalign.io.images import write_image
-from cadalign.io.meshes.join import join
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model
 from cadalign.render.scene import LIGHT_GREY
@@ -187,7 +187,7 @@ def _write_glb(path: Path, objects: Iterator[RunObject], left_out: list[Cadalign
         except InputError as error:
             left_out.append(error)
     if view is not None:
-        export_object(path, AlignedObject((view,), mesh=join(placed, path), name="objects"))
+        export_object(path, AlignedObject((view,), mesh=join(placed, str(path)), name="objects"))
     return count
 
 

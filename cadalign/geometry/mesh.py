@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -163,6 +164,44 @@ class Mesh:
             of_materials = np.array([material.color for material in self.materials])
             colors = {"face_colors": _bytes(of_materials[self.face_material])}
         return trimesh.Trimesh(self.vertices, self.faces, process=False, **colors)
+
+
+def join(pieces: Sequence[Mesh], source: str) -> Mesh:
+    """Put meshes together, such as those of a file, faces one after the other."""
+    first_vertex = first_material = 0
+    faces, materials = [], []
+    for piece in pieces:
+        faces.append(piece.faces + first_vertex)
+        materials.append(piece.face_material + first_material)
+        first_vertex += len(piece.vertices)
+        first_material += len(piece.materials)
+    colored = any(piece.vertex_colors is not None for piece in pieces)
+    textured = any(piece.corner_uv is not None for piece in pieces)
+    uv = [
+        np.zeros((len(piece.faces), 3, 2)) if piece.corner_uv is None else piece.corner_uv
+        for piece in pieces
+    ]
+    return Mesh(
+        vertices=np.concatenate([piece.vertices for piece in pieces]),
+        faces=np.concatenate(faces),
+        vertex_colors=np.concatenate([_piece_colors(piece) for piece in pieces])
+        if colored
+        else None,
+        corner_uv=np.concatenate(uv) if textured else None,
+        materials=tuple(material for piece in pieces for material in piece.materials),
+        face_material=np.concatenate(materials),
+        source=source,
+    )
+
+
+def _piece_colors(piece: Mesh) -> FloatArray:
+    """Vertex colours of a piece among coloured ones: its materials' where it has none."""
+    if piece.vertex_colors is not None:
+        return piece.vertex_colors
+    palette = np.array([material.color for material in piece.materials])
+    colors = np.ones((len(piece.vertices), 4))
+    colors[piece.faces] = palette[piece.face_material][:, None]
+    return colors
 
 
 def _with_texture(mesh: Mesh, corner_uv: FloatArray) -> Any:

@@ -49,12 +49,6 @@ class Document(Struct, forbid_unknown_fields=True):
     """Base of declared formats; unknown fields are refused."""
 
 
-class Labelled(Document, kw_only=True):
-    """Base of what may name a keypoint by its semantic id."""
-
-    semantic_id: Index | None = None
-
-
 def require_unique(keypoints: Sequence[Any], field: str) -> None:
     """Refuse a field's value, other than None, that two of the keypoints have."""
     first: dict[Any, int] = {}

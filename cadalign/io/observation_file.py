@@ -21,7 +21,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of
 from cadalign.io.documents import (
     Document,
-    Labelled,
+    Index,
     NotNegative,
     PathText,
     Point2,
@@ -46,9 +46,10 @@ from cadalign.io.evidence import (
 Declared = TypeVar("Declared", bound=Document)
 
 
-class SeenKeypoint(Labelled, kw_only=True):
+class SeenKeypoint(Document, kw_only=True):
     """Fields of a keypoint that a photo, or its detector, gives."""
 
+    semantic_id: Index | None = None
     sigma: Positive | None = None
     score: NotNegative | None = None
     confidence: NotNegative | None = None  # the earlier name of the score

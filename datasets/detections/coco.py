@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Meta
+from msgspec import Meta, field
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
@@ -74,20 +74,17 @@ class _Category(ForeignDocument):
                 raise InputError(f"{quote(name)} occurs twice", where=f"keypoints[{row}]")
 
 
-class _Annotations(ForeignDocument):
-    annotations: list[_Object]
-    images: list[_Image] | None = None
-    categories: list[_Category] | None = None
-
-
 class _Meta(ForeignDocument):
     keypoint_id2name: dict[str, Text] | None = None
 
 
-class _Predictions(ForeignDocument):
-    """MMPose's file of predictions."""
+class _File(ForeignDocument):
+    """COCO's annotations, or MMPose's predictions: the last two fields."""
 
-    instance_info: list[_Object]
+    annotations: list[_Object] = field(default_factory=list)
+    images: list[_Image] | None = None
+    categories: list[_Category] | None = None
+    instance_info: list[_Object] = field(default_factory=list)
     meta_info: _Meta | None = None
 
 
@@ -106,15 +103,15 @@ def _read(data: Any) -> list[ImageKeypoints]:
         entries = enumerate(convert(data, list[_Object]))
         return [_image_keypoints(entry, f"[{row}]", names=None) for row, entry in entries]
     if isinstance(data, dict) and "annotations" in data:
-        return _from_annotations(convert(data, _Annotations))
+        return _from_annotations(convert(data, _File))
     if isinstance(data, dict) and "instance_info" in data:
-        return _from_predictions(convert(data, _Predictions))
+        return _from_predictions(convert(data, _File))
     if not isinstance(data, dict):
         raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
     raise DataError("neither annotations nor instance_info", where="top level", fix=_FIX)
 
 
-def _from_annotations(data: _Annotations) -> list[ImageKeypoints]:
+def _from_annotations(data: _File) -> list[ImageKeypoints]:
     images = {image.id: image for image in data.images or []}
     names = {category.id: category.keypoints for category in data.categories or []}
     objects = []
@@ -140,7 +137,7 @@ def _from_annotations(data: _Annotations) -> list[ImageKeypoints]:
     return objects
 
 
-def _from_predictions(data: _Predictions) -> list[ImageKeypoints]:
+def _from_predictions(data: _File) -> list[ImageKeypoints]:
     by_number = data.meta_info.keypoint_id2name if data.meta_info else None
     names = None
     if by_number is not None:

@@ -21,7 +21,6 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import (
     Document,
     Index,
-    Labelled,
     PathText,
     Point3,
     Text,
@@ -45,9 +44,10 @@ _SUM_TOLERANCE = 0.01
 _WANTED = "give a file of model keypoints; see cadalign.datasets.ModelKeypoints"
 
 
-class _Entry(Labelled, kw_only=True):
+class _Entry(Document, kw_only=True):
     """One keypoint of the file, as the module's documentation describes it."""
 
+    semantic_id: Index | None = None
     name: Text
     xyz: Point3 | None = None
     face_index: Index | None = None

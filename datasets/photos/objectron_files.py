@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,39 +26,29 @@ _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _MAX_VARINT = 10
 
 
-@dataclass(frozen=True)
-class Field:
-    """One field of a message."""
-
-    name: str
-    kind: str | Mapping[int, Field]  # "int", "float", "double", "text", or the fields of a message
-    repeated: bool = False  # whether it is a list; numbers in it may be packed
-
-
-_POINT_2D = {1: Field("x", "float"), 2: Field("y", "float"), 3: Field("depth", "float")}
-_KEYPOINT = {1: Field("id", "int"), 3: Field("point_2d", _POINT_2D)}
-_ANNOTATION = {
-    1: Field("object_id", "int"),
-    2: Field("keypoints", _KEYPOINT, repeated=True),
-    3: Field("visibility", "float"),
+# Fields of messages by number: name and kind, "int", "float", "double", "text" or the fields of a
+# message; in a list if it is one, of which numbers may be packed.
+Fields = dict[int, tuple[str, Any]]
+_POINT_2D: Fields = {1: ("x", "float"), 2: ("y", "float"), 3: ("depth", "float")}
+_KEYPOINT: Fields = {1: ("id", "int"), 3: ("point_2d", _POINT_2D)}
+_ANNOTATION: Fields = {
+    1: ("object_id", "int"),
+    2: ("keypoints", [_KEYPOINT]),
+    3: ("visibility", "float"),
 }
-_CAMERA = {
-    5: Field("image_resolution_width", "int"),
-    6: Field("image_resolution_height", "int"),
-    8: Field("projection_matrix", "float", repeated=True),
-    9: Field("view_matrix", "float", repeated=True),
+_CAMERA: Fields = {
+    5: ("image_resolution_width", "int"),
+    6: ("image_resolution_height", "int"),
+    8: ("projection_matrix", ["float"]),
+    9: ("view_matrix", ["float"]),
 }
-_FRAME = {
-    1: Field("frame_id", "int"),
-    2: Field("annotations", _ANNOTATION, repeated=True),
-    3: Field("camera", _CAMERA),
-}
-_OBJECT = {
-    1: Field("id", "int"),
-    2: Field("category", "text"),
-    4: Field("rotation", "float", repeated=True),
-    5: Field("translation", "float", repeated=True),
-    6: Field("scale", "float", repeated=True),
+_FRAME: Fields = {1: ("frame_id", "int"), 2: ("annotations", [_ANNOTATION]), 3: ("camera", _CAMERA)}
+_OBJECT: Fields = {
+    1: ("id", "int"),
+    2: ("category", "text"),
+    4: ("rotation", ["float"]),
+    5: ("translation", ["float"]),
+    6: ("scale", ["float"]),
 }
 _OBJECTS, _FRAMES = 1, 2
 # MessageToJson's name of a field whose name has a digit after an underscore.
@@ -141,7 +131,7 @@ class Sequence:
                 return found
         raise InputError(f"there is no object {object_id}", where="object_id")
 
-    def _decode(self, message: Any, fields: dict[int, Field], kind: Any, where: str) -> Any:
+    def _decode(self, message: Any, fields: Fields, kind: Any, where: str) -> Any:
         with in_file(self.path):
             try:
                 data = decode(message, fields) if isinstance(message, bytes) else message
@@ -188,21 +178,20 @@ def _snake_case(value: Any) -> Any:
     return value
 
 
-def decode(data: bytes, fields: Mapping[int, Field]) -> dict[str, Any]:
+def decode(data: bytes, fields: Fields) -> dict[str, Any]:
     """Decode a message; unknown fields are skipped, lists without entries are empty.
 
     Raises InputError if the data are no such message, or cut short.
     """
-    found: dict[str, Any] = {field.name: [] for field in fields.values() if field.repeated}
+    found: dict[str, Any] = {name: [] for name, kind in fields.values() if isinstance(kind, list)}
     for number, wire, value in entries(data):
-        field = fields.get(number)
-        if field is None:
+        if number not in fields:
             continue
-        values = _values(field.kind, wire, value)
-        if field.repeated:
-            found[field.name] += values
-        elif values:
-            found[field.name] = values[-1]
+        name, kind = fields[number]
+        if isinstance(kind, list):
+            found[name] += _values(kind[0], wire, value)
+        elif values := _values(kind, wire, value):
+            found[name] = values[-1]
     return found
 
 
@@ -240,7 +229,7 @@ def _varint(data: bytes, place: int) -> tuple[int, int]:
     raise InputError(f"cut short or no protocol buffer at byte {place}")
 
 
-def _values(kind: str | Mapping[int, Field], wire: int, value: Any) -> list[Any]:
+def _values(kind: str | Fields, wire: int, value: Any) -> list[Any]:
     """The values of one entry: one, or those that are packed in it."""
     if not isinstance(kind, str):
         return [decode(_as_bytes(value, wire), kind)]

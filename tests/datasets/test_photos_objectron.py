@@ -13,7 +13,7 @@ from support.photo_data import assert_damage_is_told, message, rigid, write_phot
 import cadalign.datasets
 from cadalign.datasets import Objectron
 from cadalign.datasets.photos.objectron import read_video_frame
-from cadalign.datasets.photos.objectron_files import Field, decode, read_sequence
+from cadalign.datasets.photos.objectron_files import decode, read_sequence
 from cadalign.errors import DataError, InputError
 
 SCALE = [0.2, 0.5, 0.3]
@@ -191,7 +191,7 @@ def test_damaged_files_are_told(tmp_path):
 
 def test_decoding_follows_the_wire_format():
     """From the documentation of the encoding: field 1 = 150 is 08 96 01; -1 takes ten bytes."""
-    fields = {1: Field("a", "int"), 4: Field("e", "int", repeated=True), 2: Field("b", "text")}
+    fields = {1: ("a", "int"), 4: ("e", ["int"]), 2: ("b", "text")}
     assert decode(bytes.fromhex("089601"), fields) == {"a": 150, "e": []}
     assert decode(bytes.fromhex("08" + "ff" * 9 + "01"), fields)["a"] == -1
     assert decode(bytes.fromhex("120774657374696e67"), fields)["b"] == "testing"

@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError
-from cadalign.geometry.mesh import GREY, Material, Mesh
+from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import in_file
 from cadalign.io.files import damaged
@@ -24,7 +24,6 @@ from cadalign.io.meshes.gltf import (
     embedded,
     nth,
 )
-from cadalign.io.meshes.join import join
 from cadalign.io.meshes.materials import WHITE, Texture, Textures
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -64,7 +63,7 @@ def read_gltf(path: Path) -> Mesh:
             _copies(_surface(file, primitive, looks.of(primitive.material)), transforms)
             for primitive, transforms in primitives
         ]
-        return join(pieces, path)
+        return join(pieces, str(path))
 
 
 def _placements(file: GltfFile) -> Iterator[tuple[int, FloatArray]]:

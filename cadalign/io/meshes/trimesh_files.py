@@ -17,9 +17,8 @@ import numpy.typing as npt
 import trimesh
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.geometry.mesh import GREY, Material, Mesh
+from cadalign.geometry.mesh import GREY, Material, Mesh, join
 from cadalign.io.files import damaged, read_bytes
-from cadalign.io.meshes.join import join
 from cadalign.io.meshes.materials import WHITE, Texture, Textures
 from cadalign.io.meshes.obj import fan_triangles
 
@@ -61,7 +60,7 @@ def read_solids(path: Path) -> Mesh:
         ]
         if not pieces:
             raise DataError("the file has no faces", where=str(path), fix="is it whole?")
-        mesh = join(pieces, path)
+        mesh = join(pieces, str(path))
         if path.suffix.lower() == ".off":
             declared = _declared_off_faces(data)
             if len(mesh.faces) < declared:

@@ -109,29 +109,23 @@ class AnnotationDocument:
 
     def view(self, photo: str) -> AnnotationDocument | None:
         """The document of a further photo, with what is the object's; None if there is none."""
-        for view in self.further_views:
-            if view.photo == photo:
-                own = view.document
-                return replace(
-                    own,
-                    priors=replace(own.priors, stretch=self.priors.stretch),
-                    evidence=self.evidence.shared_with(own.evidence),
-                    name=self.name,
-                )
-        return None
+        own = next((view.document for view in self.further_views if view.photo == photo), None)
+        if own is None:
+            return None
+        return replace(
+            own,
+            priors=replace(own.priors, stretch=self.priors.stretch),
+            evidence=self.evidence.shared_with(own.evidence),
+            name=self.name,
+        )
 
     def with_view(self, photo: str, document: AnnotationDocument) -> AnnotationDocument:
         """The document with that of a further photo, which is added if it has none."""
-        others = [view.photo for view in self.further_views]
-        views = [
-            FurtherView(photo, document) if view.photo == photo else view
-            for view in self.further_views
-        ]
-        if photo not in others:
-            views.append(FurtherView(photo, document))
+        views = {view.photo: view for view in self.further_views}
+        views[photo] = FurtherView(photo, document)
         return replace(
             self,
-            further_views=tuple(views),
+            further_views=tuple(views.values()),
             priors=replace(self.priors, stretch=document.priors.stretch),
             evidence=document.evidence.shared_with(self.evidence),
             name=document.name,
@@ -376,11 +370,11 @@ def _add_points(
     points: Sequence[ModelKeypoint], registry: KeypointRegistry, tolerance: float
 ) -> bool:
     """Register model points; False, and none is, if one lies elsewhere than that of its id."""
-    known = [point for point in points if (point.semantic_id or 0) in registry]
-    for point in known:
-        own = registry[point.semantic_id or 0]
-        if np.linalg.norm(np.subtract(own.xyz, point.xyz)) > tolerance:
-            return False
+    for point in points:
+        if point.semantic_id in registry:
+            own = registry[point.semantic_id or 0]
+            if np.linalg.norm(np.subtract(own.xyz, point.xyz)) > tolerance:
+                return False
     for point in points:
         if point.semantic_id not in registry:
             registry.add(point)

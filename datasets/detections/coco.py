@@ -74,10 +74,6 @@ class _Category(ForeignDocument):
                 raise InputError(f"{quote(name)} occurs twice", where=f"keypoints[{row}]")
 
 
-class _Meta(ForeignDocument):
-    keypoint_id2name: dict[str, Text] | None = None
-
-
 class _File(ForeignDocument):
     """COCO's annotations, or MMPose's predictions: the last two fields."""
 
@@ -85,7 +81,7 @@ class _File(ForeignDocument):
     images: list[_Image] | None = None
     categories: list[_Category] | None = None
     instance_info: list[_Object] = field(default_factory=list)
-    meta_info: _Meta | None = None
+    meta_info: dict[str, Any] | None = None
 
 
 def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
@@ -138,8 +134,8 @@ def _from_annotations(data: _File) -> list[ImageKeypoints]:
 
 
 def _from_predictions(data: _File) -> list[ImageKeypoints]:
-    by_number = data.meta_info.keypoint_id2name if data.meta_info else None
-    names = None
+    names, given = None, (data.meta_info or {}).get("keypoint_id2name")
+    by_number = convert(given, dict[str, Text] | None, where="meta_info.keypoint_id2name")
     if by_number is not None:
         listed = [by_number.get(str(number)) for number in range(len(by_number))]
         names = convert(listed, list[Text], where="meta_info.names")

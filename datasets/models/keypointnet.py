@@ -328,8 +328,7 @@ class KeypointNet:
                     model_id = f"{model_id}#{position}"
                     raise DataError("the model occurs twice", where=where, fix="remove one entry")
                 annotation = parse_entry(entry, where=where)
-                paths = self._locator.paths(annotation.class_id, annotation.model_id)
-                mesh_path = paths[0] if paths else None
+                mesh_path = next(iter(self._locator.paths(*annotation[:2])), None)
                 models[model_id] = AnnotatedModel(category, *annotation, mesh_path)
             except DataError as error:
                 logger.warning("left out: %s", error)

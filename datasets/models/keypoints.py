@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -193,15 +193,6 @@ class _Entry(ForeignDocument):
                     )
 
 
-class Annotation(NamedTuple):
-    """One model's entry of an annotation file."""
-
-    class_id: str
-    model_id: str
-    keypoints: Keypoints
-    symmetries: Symmetries
-
-
 def read_entries(path: Path) -> list[Any]:
     """Read an annotation file's list of models, not yet checked."""
     try:
@@ -220,15 +211,18 @@ def entry_id(entry: Any, position: int) -> str:
     return model_id if isinstance(model_id, str) and model_id else f"#{position}"
 
 
-def parse_entry(entry: Any, *, where: str) -> Annotation:
-    """Check a model's entry, parsed JSON; ``where`` is file and model id, for messages."""
+def parse_entry(entry: Any, *, where: str) -> tuple[str, str, Keypoints, Symmetries]:
+    """Class id, model id, keypoints and symmetries of a model's entry, parsed JSON.
+
+    ``where`` is file and model id, for messages.
+    """
     try:
         read: _Entry = convert(entry, _Entry)
         symmetries = Symmetries() if read.symmetries is None else _symmetries(read.symmetries)
     except DataError as error:
         place = f"{where}, {error.where}" if error.where else where
         raise DataError(error.what, where=place, fix=_FIX) from None
-    return Annotation(read.class_id, read.model_id, _keypoints(read.keypoints), symmetries)
+    return read.class_id, read.model_id, _keypoints(read.keypoints), symmetries
 
 
 def _keypoints(entries: list[_Keypoint]) -> Keypoints:

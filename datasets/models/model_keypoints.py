@@ -208,8 +208,8 @@ class ModelKeypoints:
         for position, entry in enumerate(data):
             model_id = entry_id(entry, position)
             if model_id in ids:
-                annotation = parse_entry(entry, where=f"{path}, {model_id}")
-                return cls._of_keypoints(annotation.keypoints, model, {})
+                _, _, keypoints, _ = parse_entry(entry, where=f"{path}, {model_id}")
+                return cls._of_keypoints(keypoints, model, {})
         what = "has no annotations of a model whose id occurs in the model's path"
         raise DataError(what, where=str(path), fix=f"is {model} of this category?")
 

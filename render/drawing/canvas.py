@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 
 import cv2
@@ -29,13 +28,8 @@ _LINE_CASING, _MARKER_CASING = 0.6, 0.75
 _Strokes = tuple[tuple[Color, int], tuple[Color, int]]
 
 
-@dataclass(frozen=True)
-class LegendEntry:
-    """A line of the legend; its marker is a "line", "ring" or "cross"."""
-
-    text: str
-    color: Color
-    marker: str = "line"
+LegendEntry = tuple[str, Color, str]
+"""A line of the legend: text, colour, and its marker, a "line", "ring" or "cross"."""
 
 
 class Canvas:
@@ -160,7 +154,7 @@ class Canvas:
         size = round(12.5 * self.unit)
         font = ImageFont.load_default(size=size)
         pad, swatch, pitch = 0.7 * size, 1.9 * size, 1.45 * size
-        width = round(3 * pad + swatch + max(font.getlength(entry.text) for entry in entries))
+        width = round(3 * pad + swatch + max(font.getlength(text) for text, _, _ in entries))
         height = round(2 * pad + pitch * len(entries) - (pitch - size))
         rows, columns = self.image.shape[:2]
         if width + size > columns or height + size > rows:
@@ -175,22 +169,22 @@ class Canvas:
         part.paste(CASING, (0, 0), plate)
         pen = ImageDraw.Draw(part)
         middles = [pad + size / 2 + pitch * number for number in range(len(entries))]
-        for entry, y in zip(entries, middles, strict=True):
-            pen.text((2 * pad + swatch, y), entry.text, fill=(245,) * 3, font=font, anchor="lm")
+        for (text, _, _), y in zip(entries, middles, strict=True):
+            pen.text((2 * pad + swatch, y), text, fill=(245,) * 3, font=font, anchor="lm")
         self.image[block] = np.asarray(part)
         self._draw_swatches(entries, left + pad, swatch, top + np.array(middles))
 
     def _draw_swatches(
         self, entries: list[LegendEntry], left: float, width: float, middles: FloatArray
     ) -> None:
-        for entry, y in zip(entries, middles, strict=True):
+        for (_, color, marker), y in zip(entries, middles, strict=True):
             middle = np.array([left + width / 2, y])
-            if entry.marker == "ring":
-                self.ring(middle, entry.color, radius=4.5)
-            elif entry.marker == "cross":
-                self.cross(middle, entry.color, radius=4)
+            if marker == "ring":
+                self.ring(middle, color, radius=4.5)
+            elif marker == "cross":
+                self.cross(middle, color, radius=4)
             else:
-                self.line(np.array([[left, y], [left + width, y]]), entry.color, width=2.5)
+                self.line(np.array([[left, y], [left + width, y]]), color, width=2.5)
 
     def _emptiest_corner(
         self, width: int, height: int, gap: int, keep_clear: FloatArray

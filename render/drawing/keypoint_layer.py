@@ -89,15 +89,15 @@ class KeypointMarks:
     @property
     def legend(self) -> list[LegendEntry]:
         """Names and colours of what is drawn."""
-        entries = []
+        entries: list[LegendEntry] = []
         if self.seen is not None:
-            entries.append(LegendEntry("observed", OBSERVED_COLOR, "ring"))
+            entries.append(("observed", OBSERVED_COLOR, "ring"))
         if self.back is not None:
-            entries.append(LegendEntry("reprojected", REPROJECTED_COLOR, "cross"))
+            entries.append(("reprojected", REPROJECTED_COLOR, "cross"))
         if self.unseen is not None and len(self.unseen):
-            entries.append(LegendEntry("not observed", UNSEEN_COLOR, "ring"))
+            entries.append(("not observed", UNSEEN_COLOR, "ring"))
         if self.regions is not None and len(self.regions):
-            entries.append(LegendEntry(f"{100 * REGION_SHARE:.0f} % region", UNSEEN_COLOR))
+            entries.append((f"{100 * REGION_SHARE:.0f} % region", UNSEEN_COLOR, "line"))
         return entries
 
     @property

@@ -284,14 +284,14 @@ def _draw_strokes(canvas: Canvas, strokes: list[_Stroke]) -> None:
 
 
 def _legend_entries(gt_box: Box | None, predicted: bool, *, axes: bool) -> list[LegendEntry]:
-    entries = []
+    entries: list[LegendEntry] = []
     if gt_box is not None:
-        entries.append(LegendEntry("ground truth", GT_COLOR))
+        entries.append(("ground truth", GT_COLOR, "line"))
     if predicted:
-        entries.append(LegendEntry("prediction", EST_COLOR))
+        entries.append(("prediction", EST_COLOR, "line"))
     if axes:
         names = zip("xyz", AXIS_COLORS, strict=True)
-        entries += [LegendEntry(f"{name} axis", color) for name, color in names]
+        entries += [(f"{name} axis", color, "line") for name, color in names]
     return entries
 
 

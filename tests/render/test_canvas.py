@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.render.drawing.canvas import Canvas, LegendEntry, _dashes
+from cadalign.render.drawing.canvas import Canvas, _dashes
 
 RED = (255, 0, 0)
 NOWHERE = np.zeros((0, 2))
@@ -13,7 +13,7 @@ NOWHERE = np.zeros((0, 2))
 
 def test_texts_of_a_legend_stand_beside_their_samples() -> None:
     canvas = Canvas(np.zeros((480, 640, 3), np.uint8))
-    canvas.legend([LegendEntry("found", RED)], keep_clear=NOWHERE)
+    canvas.legend([("found", RED, "line")], keep_clear=NOWHERE)
     light = (canvas.image.min(axis=2) > 180).any(axis=0)
     red = (canvas.image[:, :, 0].astype(int) - canvas.image[:, :, 1] > 100).any(axis=0)
     assert np.flatnonzero(light).min() > np.flatnonzero(red).max()
@@ -23,7 +23,7 @@ def test_texts_of_a_legend_stand_beside_their_samples() -> None:
 def test_a_legend_that_has_no_room_is_left_out(size: tuple[int, int]) -> None:
     before = np.full((*size, 3), 90, np.uint8)
     canvas = Canvas(before)
-    canvas.legend([LegendEntry(f"line {n}", RED) for n in range(6)], keep_clear=NOWHERE)
+    canvas.legend([(f"line {n}", RED, "line") for n in range(6)], keep_clear=NOWHERE)
     np.testing.assert_array_equal(canvas.finished(), before)
 
 

@@ -64,20 +64,9 @@ class Equal:
         return np.asarray((points - self.motion[:3, 3]) @ self.motion[:3, :3])
 
 
-@dataclass(frozen=True, eq=False)
-class _Branch:
-    """Rotations P, or all rotations Rot(axis, angle) P, or any rotation at all."""
-
-    rotation: FloatArray
-    axis: FloatArray | None = None
-    is_any: bool = False
-
-    @property
-    def free(self) -> FloatArray:
-        """Directions (k, 3), after its motion, of the axes about which any rotation is equal."""
-        if self.is_any:
-            return np.eye(3)
-        return np.empty((0, 3)) if self.axis is None else (self.rotation.T @ self.axis)[None]
+# A rotation P, with the axes (k, 3) of all rotations Rot(axis, angle) P; three are any rotation.
+_Branch = tuple[FloatArray, FloatArray]
+_NO_AXES = np.empty((0, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +140,8 @@ class SymmetryGroup:
             for branch, scale in self._kept(alignment.scale, held, tolerance)
         ]
         best = max(found, key=lambda each: _rank(alignment.rotation @ each[0], references))
-        rotation, scale, branch = best
+        rotation, scale, (turn, axes) = best
+        free = np.reshape([turn.T @ axis for axis in axes], (-1, 3))
         motion = np.eye(4)
         motion[:3, :3], motion[:3, 3] = rotation, self.center - rotation @ self.center
         result = alignment
@@ -159,7 +149,7 @@ class SymmetryGroup:
             shift = alignment.linear @ motion[:3, 3]
             turned = alignment.rotation @ rotation
             result = Alignment(turned, alignment.translation + shift, scale)
-        return Equal(result, motion, branch.free, self.center)
+        return Equal(result, motion, free, self.center)
 
     def nearest(self, alignment: Alignment, rotation: FloatArray, *, tolerance: float) -> Equal:
         """The one of all equal alignments whose rotation is nearest to a given one."""
@@ -168,7 +158,7 @@ class SymmetryGroup:
     def count(self, alignment: Alignment, held: tuple[bool, bool, bool]) -> int | None:
         """Number of alignments that are equal to one; None for any number."""
         kept = list(self._kept(alignment.scale, held, 1e-4))
-        return None if any(len(branch.free) for branch, _ in kept) else len(kept)
+        return None if any(len(axes) for (_, axes), _ in kept) else len(kept)
 
     def _kept(
         self, scale: FloatArray, held: tuple[bool, bool, bool], tolerance: float
@@ -176,7 +166,7 @@ class SymmetryGroup:
         """Rotations of the group that lead to an alignment, and its scale."""
         fixed = np.array(held)
         for branch in self._branches(scale, tolerance):
-            turned = (branch.rotation.T * scale**2) @ branch.rotation
+            turned = (branch[0].T * scale**2) @ branch[0]
             squares = turned.diagonal()
             if np.abs(turned - np.diag(squares)).max() > 2 * tolerance * squares.max():
                 continue
@@ -189,12 +179,12 @@ class SymmetryGroup:
         if self.is_free:
             return _free_branches(scale, tolerance)
         if self.axis is None:
-            return [_Branch(rotation) for rotation in self.rotations]
+            return [(rotation, _NO_AXES) for rotation in self.rotations]
         about = self.axis
         if _keeps_turns(about, scale, tolerance):
-            return [_Branch(rotation, about) for rotation in self.rotations]
+            return [(rotation, about[None]) for rotation in self.rotations]
         turns = [rotation_from_vector(angle * about) for angle in _ANGLES]
-        return [_Branch(turn @ each) for each, turn in product(self.rotations, turns)]
+        return [(turn @ each, _NO_AXES) for each, turn in product(self.rotations, turns)]
 
 
 @lru_cache(maxsize=64)
@@ -211,20 +201,21 @@ def _nearest(
     With N = P T' R the trace of T' R Rot(a, angle) P is A cos(angle) + B sin(angle) + a'N a
     with A = tr N - a'N a, B = -a . vee(N - N').
     """
-    if branch.is_any:
+    rotation, axes = branch
+    if len(axes) == 3:
         return np.asarray(alignment.rotation.T @ references[0])
-    if branch.axis is None:
-        return branch.rotation
-    axis = branch.axis
+    if not len(axes):
+        return rotation
+    axis = axes[0]
     for reference in references:
-        n = branch.rotation @ reference.T @ alignment.rotation
+        n = rotation @ reference.T @ alignment.rotation
         along = float(axis @ n @ axis)
         turn = np.array([n[2, 1] - n[1, 2], n[0, 2] - n[2, 0], n[1, 0] - n[0, 1]])
         sine, cosine = -float(axis @ turn), float(np.trace(n)) - along
         if np.hypot(sine, cosine) > _TIE:
             break
     angle = float(np.arctan2(sine, cosine))
-    return np.asarray(rotation_from_vector(angle * axis) @ branch.rotation)
+    return np.asarray(rotation_from_vector(angle * axis) @ rotation)
 
 
 def _rank(rotation: FloatArray, references: tuple[FloatArray, ...]) -> tuple[float, ...]:
@@ -283,10 +274,10 @@ def _free_branches(scale: FloatArray, tolerance: float) -> list[_Branch]:
     """Rotations of a sphere that a stretch keeps."""
     same: BoolArray = np.abs(scale[:, None] - scale) <= tolerance * scale
     if same.all():
-        return [_Branch(np.eye(3), is_any=True)]
+        return [(np.eye(3), np.eye(3))]
     signed = _closure([np.array(quarter) for quarter in _QUARTERS])  # axes go to axes
     for axis in range(3):
         first, second = (other for other in range(3) if other != axis)
         if same[first, second]:
-            return [_Branch(each, np.eye(3)[axis]) for each in signed]
-    return [_Branch(each) for each in signed]
+            return [(each, np.eye(3)[[axis]]) for each in signed]
+    return [(each, _NO_AXES) for each in signed]

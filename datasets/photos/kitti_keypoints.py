@@ -6,7 +6,7 @@ The files are described in docs/formats/photo_files.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.placed import LEVEL_UP, PlacedObject, write_entries
+from cadalign.datasets.photos.placed import LEVEL_UP, PlacedObject, list_writer
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -298,16 +298,11 @@ def _object(
     )
 
 
-def write_cars(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
-    """Write objects as ``cars.json``, with boxes that stand upright before a level camera.
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    """The entry of an object, with a box that stands upright before a level camera.
 
     A model whose y is up is taken to face -z, as ShapeNet's do; one whose z is up to face -y.
-    Returns why objects were left out.
     """
-    return write_entries(folder / CARS, numbered, _written)
-
-
-def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
     placed.require_plain_camera("KITTI")
     pose = placed.pose
     is_z_up = (pose.rotation[:, 2] @ UP) > (pose.rotation[:, 1] @ UP)
@@ -333,6 +328,10 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
         "rotation_y": yaw_of_car(cam_from_car),
         "keypoints": keypoints,
     }
+
+
+write_cars = list_writer(CARS, _written)
+"""Write objects as ``cars.json``; returns why objects were left out."""
 
 
 def car_shape(folder: Path) -> ShapeModel | None:

@@ -189,7 +189,7 @@ def _keypoints(annotation: ObjectronAnnotation, camera: Camera) -> PhotoKeypoint
     if len(annotation.keypoints) != len(_NAMES):
         raise InputError(f"{len(annotation.keypoints)}, expected {len(_NAMES)}", where="keypoints")
     ordered = sorted(annotation.keypoints, key=lambda each: each.id)
-    share = np.array([(each.point_2d.x, each.point_2d.y) for each in ordered])
+    share = np.array([[each.point_2d.get(name, 0.0) for name in "xy"] for each in ordered])
     pixels = share * (camera.width, camera.height) - PIXEL_CENTRE
     return PhotoKeypoints(pixels, _NAMES, np.ones(len(_NAMES), dtype=bool))
 

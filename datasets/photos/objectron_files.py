@@ -60,17 +60,13 @@ _Nine = Annotated[list[Finite], Meta(min_length=9, max_length=9)]
 _Sixteen = Annotated[list[Finite], Meta(min_length=16, max_length=16)]
 
 
-class Point2D(ForeignDocument):
-    """A point in the photo, held upright: 0 at its left and upper border, 1 at the others."""
-
-    x: Finite = 0.0
-    y: Finite = 0.0
-
-
 class ObjectronKeypoint(ForeignDocument):
-    """One of the nine keypoints of a box: its centre, id 0, and its corners."""
+    """One of the nine keypoints of a box: its centre, id 0, and its corners.
 
-    point_2d: Point2D
+    Its x and y are in the photo, held upright: 0 at the left and upper border, 1 at the others.
+    """
+
+    point_2d: dict[str, Finite]
     id: int = 0
 
 

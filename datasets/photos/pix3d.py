@@ -6,7 +6,7 @@ Sun et al., "Pix3D: Dataset and Methods for Single-Image 3D Shape Modeling", CVP
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,7 +24,7 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject, write_entries
+from cadalign.datasets.photos.placed import PlacedObject, list_writer
 from cadalign.datasets.photos.scannet import read_matrix, write_matrix
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
@@ -157,15 +157,8 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
     return PhotoKeypoints(mean, names, np.ones(len(rows), dtype=bool))
 
 
-def write_pix3d(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
-    """Write objects as entries of ``pix3d.json``: a rigid pose of the stretched mesh [m].
-
-    Returns why objects were left out.
-    """
-    return write_entries(folder / ANNOTATIONS, numbered, _written)
-
-
 def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    """The entry of an object: a rigid pose of the stretched mesh [m]."""
     camera, category = placed.camera, placed.category
     placed.require_plain_camera("Pix3D")
     middle = (camera.width - 1) / 2, (camera.height - 1) / 2
@@ -204,4 +197,6 @@ def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
     }
 
 
-FORMAT = PhotoFormat("pix3d", f"Pix3D: {ANNOTATIONS}", has(ANNOTATIONS), Pix3D, write_pix3d)
+FORMAT = PhotoFormat(
+    "pix3d", f"Pix3D: {ANNOTATIONS}", has(ANNOTATIONS), Pix3D, list_writer(ANNOTATIONS, _written)
+)

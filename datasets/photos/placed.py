@@ -227,15 +227,17 @@ def converted(
     return entries, problems
 
 
-def write_entries(
-    path: Path,
-    numbered: Iterable[tuple[int, PlacedObject]],
-    convert: Callable[[Path, int, PlacedObject], Any],
-) -> list[InputError]:
-    """Write a JSON list of the objects' entries, made in its folder; see `converted`."""
-    entries, problems = converted(numbered, partial(convert, path.parent))
-    write_json(path, entries)
-    return problems
+def list_writer(
+    name: str, convert: Callable[[Path, int, PlacedObject], Any]
+) -> Callable[[Path, Iterable[tuple[int, PlacedObject]]], list[InputError]]:
+    """The writer of a JSON list of the objects' entries, made in its folder; see `converted`."""
+
+    def write(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
+        entries, problems = converted(numbered, partial(convert, folder))
+        write_json(folder / name, entries)
+        return problems
+
+    return write
 
 
 @contextmanager

@@ -37,7 +37,7 @@ from cadalign.datasets.photos.photo import (
     existing,
     first_existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject, upright_rotation, write_entries
+from cadalign.datasets.photos.placed import PlacedObject, list_writer, upright_rotation
 from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames, write_frame
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
@@ -330,16 +330,12 @@ def scan_entry(
     return {"id_scan": scan_id, "trs": trs, "n_aligned_models": 1, "aligned_models": [model]}
 
 
-def write_scan2cad(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
-    """Write each object as the only model of a scan of one frame, whose z points up.
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    """The entry of an object, the only model of a scan of one frame, whose z points up.
 
     Keypoints are pairs: on the CAD model, and on the scan, where the marked pixel's ray has the
-    depth of the model's keypoint. Returns why objects were left out.
+    depth of the model's keypoint.
     """
-    return write_entries(folder / FULL, numbered, _written)
-
-
-def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
     placed.require_plain_camera("Scan2CAD")
     scene, category = f"scene{number:04d}_00", placed.category
     model_id = f"{number:06d}-{placed.model_id}"
@@ -377,5 +373,9 @@ def _trs_of(alignment: Alignment) -> dict[str, Any]:
 
 
 FORMAT = PhotoFormat(
-    "scan2cad", f"Scan2CAD: {FULL} or annot.json", has(FULL, *_SAMPLES), Scan2CAD, write_scan2cad
+    "scan2cad",
+    f"Scan2CAD: {FULL} or annot.json",
+    has(FULL, *_SAMPLES),
+    Scan2CAD,
+    list_writer(FULL, _written),
 )

@@ -107,11 +107,13 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[ByteImage], *, fp
         raise InputError(f"{path.name} is no movie", where="path", fix=fix)
     write = _write_gif if ending == ".gif" else _write_video
     # Encoders report little about what they cannot write, so the file is moved when it is done.
+    checked = _checked(frames)
+    first = next(checked, None)
+    if first is None:
+        raise InputError("no frames are given", where="frames")
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / f"movie{ending}"
-        count = write(draft, _checked(frames), fps)
-        if not count:
-            raise InputError("no frames are given", where="frames")
+        count = write(draft, first, checked, fps)
         write_whole(path, lambda unfinished: shutil.copyfile(draft, unfinished))
     return count
 
@@ -126,11 +128,8 @@ def _checked(frames: Iterable[ByteImage]) -> Iterator[ByteImage]:
         yield image
 
 
-def _write_gif(path: Path, frames: Iterator[ByteImage], fps: float) -> int:
+def _write_gif(path: Path, first: ByteImage, frames: Iterator[ByteImage], fps: float) -> int:
     """Write an endless GIF; returns the number of frames."""
-    first = next(frames, None)
-    if first is None:
-        return 0
     rest = [Image.fromarray(image).quantize(256) for image in frames]
     Image.fromarray(first).quantize(256).save(
         path,
@@ -142,11 +141,8 @@ def _write_gif(path: Path, frames: Iterator[ByteImage], fps: float) -> int:
     return 1 + len(rest)
 
 
-def _write_video(path: Path, frames: Iterator[ByteImage], fps: float) -> int:
+def _write_video(path: Path, first: ByteImage, frames: Iterator[ByteImage], fps: float) -> int:
     """Write a video that browsers play; returns the number of frames."""
-    first = next(frames, None)
-    if first is None:
-        return 0
     import av  # on first use: it brings FFmpeg with it
 
     height, width = _even(first).shape[:2]

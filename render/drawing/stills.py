@@ -139,18 +139,17 @@ def turntable(
     """
     low, high = scene.bounds
     # The box about all the turned boxes: as wide as the farthest corner from the axis is.
-    middle, half = (low + high) / 2, (high - low) / 2 * np.asarray(scale, dtype=float)
+    stretch = np.asarray(scale, dtype=float)
+    middle, half = (low + high) / 2, (high - low) / 2 * stretch
     reach = float(np.hypot(half[0], half[2]))
     wide = np.array([reach, half[1], reach])
-    around = Alignment(np.eye(3), np.zeros(3), np.asarray(scale, dtype=float))
     first = look_at(azimuth=angles.azimuth, elevation=angles.elevation, distance=1.0).rotation
     placed = frame_object(np.array([-wide, wide]), camera, rotation=first, fill=_FILL)
     depth = placed.translation
     for number in range(count):
         turned = replace(angles, azimuth=angles.azimuth + 360.0 * number / count)
         rotation = look_at(**asdict(turned), distance=1.0).rotation
-        center = rotation @ (middle * around.scale)
-        yield Alignment(rotation, depth - center, around.scale)
+        yield Alignment(rotation, depth - rotation @ (middle * stretch), stretch)
 
 
 def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -281,8 +281,7 @@ class Size:
     @property
     def lengths(self) -> FloatArray:
         """Lengths (3,) along x, y, z; NaN where unknown."""
-        given = cast("list[float | None]", [getattr(self, name) for name in LENGTHS])
-        return np.array([np.nan if each is None else each for each in given])
+        return np.array([getattr(self, name) for name in LENGTHS], dtype=float)
 
     @property
     def deviations(self) -> FloatArray:

@@ -167,24 +167,19 @@ class Observation(ObservedImage):
         is_of_mask = not len(self.points_2d) and self.evidence.mask is not None
         listed = bool(self.others) or is_of_mask
         data: dict[str, Any] = {"views": written} if listed else written[0]
-        for name, path in (("model", self.model), ("shape", self.shape)):
-            if path is not None:
-                data[name] = written_path(path, folder=folder)
-        if self.object_name is not None:
-            data["object"] = self.object_name
-        if self.size is not None:
-            data["size"] = self.size.given
-        if self.up_axis != "y":
-            data["up_axis"] = self.up_axis
-        if self.symmetry is not None:
-            data["symmetry"] = self.symmetry.to_dict()
-        if self.init is not None:
-            data["init"] = self.init.to_dict()
-        if self.unfinished:
-            data["unfinished"] = dict(self.unfinished)
-        if self.fit_options:
-            data["fit"] = dict(self.fit_options)
-        return data
+        further = {
+            "model": self.model and written_path(self.model, folder=folder),
+            "shape": self.shape and written_path(self.shape, folder=folder),
+            "object": self.object_name,
+            "size": self.size and self.size.given,
+            **({} if self.up_axis == "y" else {"up_axis": self.up_axis}),
+            "symmetry": self.symmetry and self.symmetry.to_dict(),
+            "init": self.init and self.init.to_dict(),
+            "unfinished": dict(self.unfinished or {}) or None,
+            "fit": dict(self.fit_options) or None,
+        }
+        known = (pair for pair in further.items() if pair[1] is not None or pair[0] == "up_axis")
+        return data | dict(known)
 
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""

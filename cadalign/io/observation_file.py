@@ -332,5 +332,5 @@ def _column(keypoints: Sequence[KeypointFields], name: str) -> Any:
 
 def _depths(keypoints: Sequence[KeypointFields]) -> FloatArray | None:
     """Depths of the keypoints, NaN where unknown; None where all are."""
-    depths = [np.nan if each.depth is None else each.depth for each in keypoints]
-    return np.array(depths) if np.isfinite(depths).any() else None
+    depths = np.array([each.depth for each in keypoints], dtype=float)  # NaN for None
+    return depths if np.isfinite(depths).any() else None

@@ -21,13 +21,13 @@ from cadalign.io.evidence import LENGTHS, ImageEvidence, ObservedImage, Size
 from cadalign.io.images import read_grey
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import StartFields
+from cadalign.retrieval.by_mask import grab_cut
 
 Point2 = tuple[float, float]
 Segment = tuple[Point2, Point2]
 
 _SHIFT = 4  # bits of parts of a pixel in OpenCV's drawing
 _LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
-_CUT_ROUNDS = 5
 _LEAST_BOX = 4.0  # [px]
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
@@ -305,11 +305,10 @@ def decode_runs(runs: tuple[int, ...], width: int, height: int) -> BoolArray:
 
 
 def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> BoolArray:
-    """Segment the object in a box of the photo (h, w, 3) by its colours.
+    """Segment the object in a box of the photo (h, w, 3) by its colours; see `grab_cut`.
 
-    GrabCut: Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated
-    graph cuts" (2004). ``corners`` (2, 2) are two of the box [px]. Raises InputError if the box is
-    too small, fills the photo, or holds nothing that differs.
+    ``corners`` (2, 2) are two of the box [px]. Raises InputError if the box is too small, fills the
+    photo, or holds nothing that differs.
     """
     height, width = photo.shape[:2]
     scale = min(1.0, _LONGEST_CUT / max(width, height))
@@ -326,13 +325,7 @@ def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> B
         raise InputError(
             "the box fills the photo", where="box", fix="draw it close around the object"
         )
-    cv2.setRNGSeed(0)
-    colors = np.zeros((2, 1, 65))
-    image = cv2.cvtColor(small, cv2.COLOR_RGB2BGR)
-    cv2.grabCut(
-        image, labels, (0, 0, 1, 1), colors[0], colors[1], _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK
-    )
-    found = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
+    found = grab_cut(small, labels).astype(np.uint8)
     if not found.any():
         raise InputError(
             "nothing in the box differs from what is around it",

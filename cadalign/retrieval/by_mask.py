@@ -261,10 +261,19 @@ def _segment(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera)
     right, bottom = np.clip(points.max(axis=0) + margin, 0, last).astype(int).tolist()
     labels: npt.NDArray[Any] = np.full(pixels.shape[:2], cv2.GC_BGD, dtype=np.uint8)
     labels[top : bottom + 1, left : right + 1] = cv2.GC_PR_FGD
-    if (labels == cv2.GC_BGD).any() and (labels != cv2.GC_BGD).any():
-        cv2.setRNGSeed(0)
-        bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-        colors = np.zeros((2, 1, 65))
-        whole = (0, 0, 1, 1)  # not used with a mask
-        cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _GRAB_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    is_split = (labels == cv2.GC_BGD).any() and (labels != cv2.GC_BGD).any()
+    return grab_cut(pixels, labels) if is_split else labels == cv2.GC_PR_FGD
+
+
+def grab_cut(pixels: npt.NDArray[Any], labels: npt.NDArray[Any]) -> BoolArray:
+    """Segment an image (h, w, 3) by its colours, from OpenCV's labels (h, w) of a part of it.
+
+    Rother, Kolmogorov, Blake, "GrabCut: interactive foreground extraction using iterated graph
+    cuts" (2004).
+    """
+    cv2.setRNGSeed(0)
+    bgr = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    colors = np.zeros((2, 1, 65))
+    whole = (0, 0, 1, 1)  # not used with labels
+    cv2.grabCut(bgr, labels, whole, colors[0], colors[1], _GRAB_ROUNDS, cv2.GC_INIT_WITH_MASK)
     return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))

@@ -21,6 +21,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
+from cadalign.retrieval.by_mask import grab_cut
 
 _FEWEST = 3
 _CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
@@ -28,7 +29,6 @@ _CLICK_PX = 2.0
 _SIMILAR_DEG = 30.0
 _MARGIN = 0.05  # of a box that is dragged around an object, relative to its larger side
 _BAND = 0.1  # about an estimated outline, relative to the larger side of its box
-_GRAB_ROUNDS = 5
 _RAPID_STEPS = 20
 _RAPID_LINES, _RAPID_REACH = 100, 20  # search lines, and their length to either side [px]
 
@@ -239,7 +239,7 @@ def _by_grabcut(clicks: PhotoClicks) -> Alignment:
     labels = np.where(pixels > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     labels[cv2.dilate(pixels, disc) == 0] = cv2.GC_BGD
     labels[cv2.erode(pixels, disc) > 0] = cv2.GC_FGD
-    mask = _grabbed(clicks.case.pixels, labels)
+    mask = grab_cut(clicks.case.pixels, labels)
     return clicks.aligned(mask=mask).alignment if mask.any() else _by_clicks(clicks)
 
 
@@ -251,7 +251,7 @@ def _by_box(clicks: PhotoClicks) -> Alignment | None:
     (left, top), (right, bottom) = np.maximum(box + margin * np.array([[-1], [1]]), 0).astype(int)
     labels = np.full(truth.shape, cv2.GC_BGD, dtype=np.uint8)
     labels[top : bottom + 1, left : right + 1] = cv2.GC_PR_FGD
-    mask = _grabbed(case.pixels, labels)
+    mask = grab_cut(case.pixels, labels)
     if not mask.any():
         return None
     if len(clicks.pixels):
@@ -261,15 +261,6 @@ def _by_box(clicks: PhotoClicks) -> Alignment | None:
 
 def _outline(clicks: PhotoClicks, pose: Alignment) -> np.ndarray:
     return cast_geometry(Scene(clicks.case.mesh), clicks.case.camera, pose).mask
-
-
-def _grabbed(pixels: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    cv2.setRNGSeed(0)
-    models = np.zeros((2, 1, 65))
-    bgr = np.ascontiguousarray(pixels[:, :, ::-1])
-    whole = (0, 0, 1, 1)  # not used with labels
-    cv2.grabCut(bgr, labels, whole, models[0], models[1], _GRAB_ROUNDS, cv2.GC_INIT_WITH_MASK)
-    return np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
 
 
 def _box_of(mask: np.ndarray) -> np.ndarray:

@@ -12,95 +12,100 @@ better; one that is more than 20 % worse than in benchmark_ratios.json makes the
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
-from dataclasses import dataclass, field, make_dataclass
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import make_dataclass
+from functools import partial, wraps
+from typing import Annotated, Any
 
 import tyro
-from benchmarks.accuracy import Solvers, UnknownFocal, WideLenses
-from benchmarks.annotator import Annotator
-from benchmarks.cameras import PhotoLenses, Scenes
-from benchmarks.cars import NoiseOfDetector, RealDetections
-from benchmarks.clicks import Clicks, OutlineMethods, ProposalClicks
-from benchmarks.coverage import Coverage
-from benchmarks.gradients import GradientErrors, TorchLayer
-from benchmarks.masks import MaskAlone, Masks
-from benchmarks.mistakes import Mistakes
-from benchmarks.photo import Photos, PhotoTimes
-from benchmarks.retrieval import MaskRetrieval, Retrieval, UnseenRetrieval
-from benchmarks.runs import Evaluation, Fits, Ransac
-from benchmarks.section import BenchmarkData, NotGivenError, RatioTable, Row, Section
-from benchmarks.shapes import Align, FocalShapes, Similar
-from benchmarks.speed import Calls, Cold, Rendering
-from benchmarks.tracks import Tracks
-from benchmarks.warned import Warned
+from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
+from benchmarks.annotator import annotator
+from benchmarks.cameras import photo_lenses, scenes
+from benchmarks.cars import noise_of_detector, real_detections
+from benchmarks.clicks import clicks, outline_methods, proposal_clicks
+from benchmarks.coverage import coverage
+from benchmarks.gradients import gradient_errors, torch_layer
+from benchmarks.masks import mask_alone, masks
+from benchmarks.mistakes import mistakes
+from benchmarks.photo import photo_times, photos
+from benchmarks.retrieval import mask_retrieval, retrieval, unseen_retrieval
+from benchmarks.runs import evaluation, fits, ransac
+from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables
+from benchmarks.shapes import align, focal_shapes, similar
+from benchmarks.speed import calls, cold, rendering
+from benchmarks.tracks import tracks
+from benchmarks.warned import warned
 from rich.console import Console
 from rich.table import Table
 
 from cadalign.cli import plain_help
 from cadalign.io.files import write_json
 
-SECTIONS: dict[str, type[Section]] = {
-    "solvers": Solvers,
-    "cold": Cold,
-    "calls": Calls,
-    "wide": WideLenses,
-    "focal": UnknownFocal,
-    "focal_shapes": FocalShapes,
-    "lenses": PhotoLenses,
-    "scenes": Scenes,
-    "calibration": Coverage,
-    "render": Rendering,
-    "annotator": Annotator,
-    "masks": Masks,
-    "mask_alone": MaskAlone,
-    "mistakes": Mistakes,
-    "photo": Photos,
-    "photo_times": PhotoTimes,
-    "clicks": Clicks,
-    "outlines": OutlineMethods,
-    "proposals": ProposalClicks,
-    "align": Align,
-    "retrieval": Retrieval,
-    "evaluation": Evaluation,
-    "fits": Fits,
-    "detections": RealDetections,
-    "ransac": Ransac,
-    "unseen_retrieval": UnseenRetrieval,
-    "mask_retrieval": MaskRetrieval,
-    "similar": Similar,
-    "torch": TorchLayer,
-    "gradients": GradientErrors,
-    "noise": NoiseOfDetector,
-    "tracks": Tracks,
-    "warned": Warned,
+SECTIONS: dict[str, Callable[..., Tables]] = {
+    "solvers": solvers,
+    "cold": cold,
+    "calls": calls,
+    "wide": wide_lenses,
+    "focal": unknown_focal,
+    "focal_shapes": focal_shapes,
+    "lenses": photo_lenses,
+    "scenes": scenes,
+    "calibration": coverage,
+    "render": rendering,
+    "annotator": annotator,
+    "masks": masks,
+    "mask_alone": mask_alone,
+    "mistakes": mistakes,
+    "photo": photos,
+    "photo_times": photo_times,
+    "clicks": clicks,
+    "outlines": outline_methods,
+    "proposals": proposal_clicks,
+    "align": align,
+    "retrieval": retrieval,
+    "evaluation": evaluation,
+    "fits": fits,
+    "detections": real_detections,
+    "ransac": ransac,
+    "unseen_retrieval": unseen_retrieval,
+    "mask_retrieval": mask_retrieval,
+    "similar": similar,
+    "torch": torch_layer,
+    "gradients": gradient_errors,
+    "noise": noise_of_detector,
+    "tracks": tracks,
+    "warned": warned,
 }
 ON_REQUEST = (
     *("mask_alone", "mistakes", "photo", "photo_times", "clicks", "outlines", "proposals"),
     *("detections", "unseen_retrieval", "mask_retrieval", "similar", "tracks", "warned"),
 )
-STORED = Path(__file__).parent / "benchmark_ratios.json"
 TOLERANCE = 0.2
 
 
-@dataclass
-class Common(BenchmarkData):
-    """Options of all sections."""
+def options_of(section: Callable[..., Tables]) -> Callable[..., Any]:
+    """The section as a function of its options, which returns it with these."""
 
-    sections: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Sections to run; by default all that need no asking for."""
-    stored: Path = STORED
-    """Ratios to compare with."""
-    store: bool = False
-    """Store the measured ratios."""
+    @wraps(section)
+    def chosen(**options: Any) -> Callable[..., Tables]:
+        return partial(section, **options)
+
+    signature = inspect.signature(section)
+    _, *options = signature.parameters.values()
+    vars(chosen)["__signature__"] = signature.replace(parameters=options)
+    return chosen
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the sections; return 1 if a ratio got worse."""
-    own = [(name, kind, field(default_factory=kind)) for name, kind in SECTIONS.items()]
-    options_type: Any = make_dataclass("Options", own, bases=(Common,))
+    own = [
+        (name, Annotated[Any, tyro.conf.arg(constructor=options_of(section))])
+        for name, section in SECTIONS.items()
+    ]
+    options_type: Any = make_dataclass("Options", own, bases=(BenchmarkData,), kw_only=True)
     options = tyro.cli(options_type, description=__doc__, args=arguments, registry=plain_help())
     named = [name.replace("-", "_") for name in options.sections]
     unknown = ", ".join(name for name in named if name not in SECTIONS)
@@ -109,20 +114,19 @@ def main(arguments: list[str] | None = None) -> int:
     stored = json.loads(options.stored.read_text()) if options.stored.is_file() else {}
     figures: list[Row] = []
     for name in named or [each for each in SECTIONS if each not in ON_REQUEST]:
-        section: Section = getattr(options, name)
-        tables = []
+        tables: dict[str, list[Row]] = {}
         try:
-            for table in section.run(options):
-                tables.append(table)
-                show(table, stored)
+            for title, rows in getattr(options, name)(options):
+                tables[title] = list(rows)
+                show(title, tables[title], stored)
         except NotGivenError as error:
             if name in named:
                 sys.exit(f"{name}: {error}")
             print(f"{name} is left out: {error}")
             continue
         options.out.mkdir(parents=True, exist_ok=True)
-        write_json(options.out / f"{name}.json", {each.title: each.rows for each in tables})
-        figures += [row for table in tables for row in table.rows if "ratio" in row]
+        write_json(options.out / f"{name}.json", tables)
+        figures += [row for rows in tables.values() for row in rows if "ratio" in row]
     if options.store:
         ratios = stored | {row["name"]: row["ratio"] for row in figures}
         options.stored.write_text(json.dumps(ratios, indent=2, sort_keys=True) + "\n")
@@ -138,12 +142,11 @@ def is_worse(row: Row, stored: dict[str, float]) -> bool:
     return row["ratio"] > stored.get(row["name"], float("inf")) * (1 + TOLERANCE)
 
 
-def show(table: RatioTable, stored: dict[str, float]) -> None:
+def show(title: str, rows: list[Row], stored: dict[str, float]) -> None:
     """Print a table; figures with the stored ratios beside theirs."""
-    printed = Table(title=table.title)
+    printed = Table(title=title)
     rows = [
-        row if "ratio" not in row else row | {"stored": stored.get(row["name"])}
-        for row in table.rows
+        row if "ratio" not in row else row | {"stored": stored.get(row["name"])} for row in rows
     ]
     columns = list(dict.fromkeys(column for row in rows for column in row))
     for column in columns:

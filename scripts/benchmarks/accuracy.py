@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import BenchmarkData, RatioTable, Row
+from benchmarks.section import BenchmarkData, Row, Table, Tables
 from cadalign import Alignment, Camera, RansacOptions
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
@@ -57,80 +56,77 @@ Draw = Callable[[np.random.Generator], Problem]
 # Known focal length -------------------------------------------------------------------------------
 
 
-@dataclass
-class Solvers:
+def solvers(given: BenchmarkData, *, problems: int = 2000, repetitions: int = 300) -> Tables:
     """Accuracy against the Cramer-Rao bound, speed against OpenCV.
 
     Everything runs in one process on the same problems; speeds are ratios of medians. KeypointNet
     adds rows on real keypoints.
+
+    Parameters
+    ----------
+    problems : int
+        Random problems per row.
+    repetitions : int
+        Timed calls per figure; the median counts.
     """
-
-    problems: int = 2000
-    """Random problems per row."""
-    repetitions: int = 300
-    """Timed calls per figure; the median counts."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        sources: list[tuple[str, float, Draw]] = [
-            (f"{n} points, {px:g} px", px, partial(simulate_problem, points=n, noise_px=px))
-            for n, px in _ROWS
-        ]
-        if given.keypointnet is not None:
-            sources += _keypointnet_sources(given.keypointnet)
-        yield _accuracy_table(sources, self.problems, given.seed)
-        title = "4 points: the truth among the minimal solver's solutions"
-        yield RatioTable(title, [self._minimal(given.seed)])
-        rng = np.random.default_rng(given.seed)
-        rows = []
-        for points in _SPEED_SIZES:
-            problem = simulate_problem(rng, points=points, noise_px=1.0)
-            rows += _speed(problem, points, self.repetitions)
-        yield RatioTable("Time over OpenCV's, which does not stretch", rows)
-
-    def _minimal(self, seed: int) -> Row:
-        """Rate of the truth among the solutions, and their number."""
-        rng = np.random.default_rng(seed)
-        found = solutions = 0
-        for _ in range(self.problems):
-            problem = simulate_problem(rng, points=4, noise_px=0.0)
-            rays = problem.camera.normalize(problem.points_2d)
-            rotations, translations, scales = ap4p(problem.points_3d, rays)
-            poses = np.concatenate([rotations.reshape(-1, 9), translations, scales], axis=1)
-            solutions += len(poses)
-            found += bool((np.abs(poses - problem.alignment.packed) < 1e-4).all(axis=1).any())
-        share, mean = 100 * found / self.problems, solutions / self.problems
-        return {"truth found %": share, "solutions on average": mean}
+    sources: list[tuple[str, float, Draw]] = [
+        (f"{n} points, {px:g} px", px, partial(simulate_problem, points=n, noise_px=px))
+        for n, px in _ROWS
+    ]
+    if given.keypointnet is not None:
+        sources += _keypointnet_sources(given.keypointnet)
+    yield _accuracy_table(sources, problems, given.seed)
+    title = "4 points: the truth among the minimal solver's solutions"
+    yield title, [_minimal(given.seed, problems)]
+    rng = np.random.default_rng(given.seed)
+    rows = []
+    for points in _SPEED_SIZES:
+        problem = simulate_problem(rng, points=points, noise_px=1.0)
+        rows += _speed(problem, points, repetitions)
+    yield "Time over OpenCV's, which does not stretch", rows
 
 
-@dataclass
-class WideLenses:
+def _minimal(seed: int, problems: int) -> Row:
+    """Rate of the truth among the solutions, and their number."""
+    rng = np.random.default_rng(seed)
+    found = solutions = 0
+    for _ in range(problems):
+        problem = simulate_problem(rng, points=4, noise_px=0.0)
+        rays = problem.camera.normalize(problem.points_2d)
+        rotations, translations, scales = ap4p(problem.points_3d, rays)
+        poses = np.concatenate([rotations.reshape(-1, 9), translations, scales], axis=1)
+        solutions += len(poses)
+        found += bool((np.abs(poses - problem.alignment.packed) < 1e-4).all(axis=1).any())
+    share, mean = 100 * found / problems, solutions / problems
+    return {"truth found %": share, "solutions on average": mean}
+
+
+def wide_lenses(given: BenchmarkData, *, problems: int = 1000, points: int = 20) -> Tables:
     """Accuracy of fits with wide lenses against the Cramer-Rao bound.
 
     Objects lie anywhere in the field of view, which fills an image of 1000 x 1000 px.
+
+    Parameters
+    ----------
+    problems : int
+        Random problems per row.
+    points : int
+        Keypoints of an object.
     """
-
-    problems: int = 1000
-    """Random problems per row."""
-    points: int = 20
-    """Keypoints of an object."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        half, omega = (_WIDE_SIDE - 1) / 2, 0.9
-        sources: list[tuple[str, float, Draw]] = []
-        for field in _FIELDS:
-            reach = np.radians(field / 2)
-            bend = np.arctan2(2 * np.tan(omega / 2) * np.sin(reach), np.cos(reach)) / omega
-            for lens, slope, coefficients in (("fisheye", reach, ()), ("fov", bend, (omega,))):
-                size, focal = (_WIDE_SIDE, _WIDE_SIDE), half / slope
-                camera = Camera(*size, focal, focal, half, half, coefficients, lens=lens)
-                draw = partial(_wide_problem, camera, reach, self.points)
-                sources.append((f"{lens}, {field} degrees", 1.0, draw))
-        yield _accuracy_table(sources, self.problems, given.seed)
+    half, omega = (_WIDE_SIDE - 1) / 2, 0.9
+    sources: list[tuple[str, float, Draw]] = []
+    for field in _FIELDS:
+        reach = np.radians(field / 2)
+        bend = np.arctan2(2 * np.tan(omega / 2) * np.sin(reach), np.cos(reach)) / omega
+        for lens, slope, coefficients in (("fisheye", reach, ()), ("fov", bend, (omega,))):
+            size, focal = (_WIDE_SIDE, _WIDE_SIDE), half / slope
+            camera = Camera(*size, focal, focal, half, half, coefficients, lens=lens)
+            draw = partial(_wide_problem, camera, reach, points)
+            sources.append((f"{lens}, {field} degrees", 1.0, draw))
+    yield _accuracy_table(sources, problems, given.seed)
 
 
-def _accuracy_table(
-    sources: Iterable[tuple[str, float, Draw]], count: int, seed: int
-) -> RatioTable:
+def _accuracy_table(sources: Iterable[tuple[str, float, Draw]], count: int, seed: int) -> Table:
     """Errors of every method over the limit's, and the global minima that it missed."""
     rows = []
     for name, noise, draw in sources:
@@ -161,7 +157,7 @@ def _accuracy_table(
                     "missed %": 100 * missed / count if is_best else None,
                 }
             )
-    return RatioTable("Errors over the Cramer-Rao limit's: median (90th percentile)", rows)
+    return "Errors over the Cramer-Rao limit's: median (90th percentile)", rows
 
 
 def _levels(errors: dict[str, Any]) -> dict[str, FloatArray]:
@@ -264,67 +260,69 @@ def _speed(problem: Problem, points: int, repetitions: int) -> Iterator[Row]:
 # Unknown focal length -----------------------------------------------------------------------------
 
 
-@dataclass
-class UnknownFocal:
-    """Fits with an unknown focal length: accuracy against the Cramer-Rao bound, and outliers."""
+def unknown_focal(
+    given: BenchmarkData, *, problems: int = 1000, robust_problems: int = 40
+) -> Tables:
+    """Fits with an unknown focal length: accuracy against the Cramer-Rao bound, and outliers.
 
-    problems: int = 1000
-    """Random problems per row of accuracy."""
-    robust_problems: int = 40
-    """Random problems per share of outliers."""
+    Parameters
+    ----------
+    problems : int
+        Random problems per row of accuracy.
+    robust_problems : int
+        Random problems per share of outliers.
+    """
+    title = "1 px: median errors over the Cramer-Rao limit's of 9 unknowns"
+    yield title, [_accuracy(given.seed, n, problems) for n in (10, 20, 50, 200)]
+    title = f"{_ROBUST_POINTS} points: none of the wrong kept, and over 90 % of the others"
+    shares = (0.0, 0.3, 0.5, 0.7, 0.8)
+    yield title, [_robust(given.seed, share, robust_problems) for share in shares]
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        title = "1 px: median errors over the Cramer-Rao limit's of 9 unknowns"
-        yield RatioTable(title, [self._accuracy(given.seed, n) for n in (10, 20, 50, 200)])
-        title = f"{_ROBUST_POINTS} points: none of the wrong kept, and over 90 % of the others"
-        shares = (0.0, 0.3, 0.5, 0.7, 0.8)
-        yield RatioTable(title, [self._robust(given.seed, share) for share in shares])
 
-    def _accuracy(self, seed: int, points: int) -> Row:
-        """Median errors over those of an ideal estimator."""
-        rng = np.random.default_rng(seed)
-        problems = [
-            simulate_problem(rng, points=points, noise_px=1.0) for _ in range(self.problems)
-        ]
-        batch = cadalign.fit_batch(
-            [problem.points_3d for problem in problems],
-            [problem.points_2d for problem in problems],
-            _UNKNOWN,
-            focal="estimate",
-            focal_prior=None,
-            workers=-1,
-        )
-        errors = []
-        for b, problem in enumerate(problems):
-            row = dict.fromkeys(_FOCAL_ERRORS, np.inf)
-            if batch.solved[b]:
-                row = alignment_errors(est=batch.alignment(b), gt=problem.alignment)
-                row["focal_error"] = abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1)
-            errors.append(row)
-        ideal = _ideal_errors(problems, rng, sigma=1.0, focal="estimate")
-        limit = {error: float(np.median(ideal[error])) for error in _FOCAL_ERRORS}
-        ratios = {
-            short: float(np.median([row[error] for row in errors])) / limit[error]
-            for error, short in _FOCAL_ERRORS.items()
-        }
-        row = {"points": points, "limit f %": 100 * limit["focal_error"]}
-        return {**row, **ratios, "failed %": section.percent(~batch.solved)}
+def _accuracy(seed: int, points: int, problems: int) -> Row:
+    """Median errors over those of an ideal estimator."""
+    rng = np.random.default_rng(seed)
+    drawn = [simulate_problem(rng, points=points, noise_px=1.0) for _ in range(problems)]
+    batch = cadalign.fit_batch(
+        [problem.points_3d for problem in drawn],
+        [problem.points_2d for problem in drawn],
+        _UNKNOWN,
+        focal="estimate",
+        focal_prior=None,
+        workers=-1,
+    )
+    errors = []
+    for b, problem in enumerate(drawn):
+        row = dict.fromkeys(_FOCAL_ERRORS, np.inf)
+        if batch.solved[b]:
+            row = alignment_errors(est=batch.alignment(b), gt=problem.alignment)
+            row["focal_error"] = abs(batch.focal_length[b] / SIMULATION_CAMERA.fx - 1)
+        errors.append(row)
+    ideal = _ideal_errors(drawn, rng, sigma=1.0, focal="estimate")
+    limit = {error: float(np.median(ideal[error])) for error in _FOCAL_ERRORS}
+    ratios = {
+        short: float(np.median([row[error] for row in errors])) / limit[error]
+        for error, short in _FOCAL_ERRORS.items()
+    }
+    row = {"points": points, "limit f %": 100 * limit["focal_error"]}
+    return {**row, **ratios, "failed %": section.percent(~batch.solved)}
 
-    def _robust(self, seed: int, share: float) -> Row:
-        """Rate at which outliers are told from inliers."""
-        rng = np.random.default_rng(seed)
-        found = 0
-        for _ in range(self.robust_problems):
-            problem = simulate_problem(rng, points=_ROBUST_POINTS, noise_px=1.0)
-            true = problem.points_2d.copy()
-            places = rng.uniform(true.min(axis=0), true.max(axis=0), true.shape)
-            wrong = rng.permutation(_ROBUST_POINTS) < round(share * _ROBUST_POINTS)
-            problem.points_2d[wrong] = places[wrong]
-            moved = np.linalg.norm(problem.points_2d - true, axis=1)
-            given = problem.points_3d, problem.points_2d, _UNKNOWN
-            result = section.attempt(cadalign.fit, *given, focal="estimate", ransac=RansacOptions())
-            if result is not None:
-                # One that landed where it belongs is not wrong.
-                is_kept = result.inliers[wrong & (moved > 15)].any()
-                found += not is_kept and result.inliers[moved == 0].mean() > 0.9
-        return {"wrong %": 100 * share, "found %": 100 * found / self.robust_problems}
+
+def _robust(seed: int, share: float, robust_problems: int) -> Row:
+    """Rate at which outliers are told from inliers."""
+    rng = np.random.default_rng(seed)
+    found = 0
+    for _ in range(robust_problems):
+        problem = simulate_problem(rng, points=_ROBUST_POINTS, noise_px=1.0)
+        true = problem.points_2d.copy()
+        places = rng.uniform(true.min(axis=0), true.max(axis=0), true.shape)
+        wrong = rng.permutation(_ROBUST_POINTS) < round(share * _ROBUST_POINTS)
+        problem.points_2d[wrong] = places[wrong]
+        moved = np.linalg.norm(problem.points_2d - true, axis=1)
+        given = problem.points_3d, problem.points_2d, _UNKNOWN
+        result = section.attempt(cadalign.fit, *given, focal="estimate", ransac=RansacOptions())
+        if result is not None:
+            # One that landed where it belongs is not wrong.
+            is_kept = result.inliers[wrong & (moved > 15)].any()
+            found += not is_kept and result.inliers[moved == 0].mean() > 0.9
+    return {"wrong %": 100 * share, "found %": 100 * found / robust_problems}

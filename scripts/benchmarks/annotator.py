@@ -7,7 +7,8 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ from support.panels import (
 )
 from support.web import axe_script
 
-from benchmarks.section import BenchmarkData, RatioTable, Row, clocked
+from benchmarks.section import BenchmarkData, Row, Tables, clocked
 from cadalign import Camera, Mesh
 from cadalign.annotate.actions import perform
 from cadalign.annotate.evidence import encode_runs
@@ -94,8 +95,14 @@ _LIST = """async () => {
 }"""
 
 
-@dataclass
-class Annotator:
+def annotator(
+    given: BenchmarkData,
+    *,
+    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "clip", "pictures"),
+    clicks: int = 30,
+    photos: int = 200,
+    kills: int = 100,
+) -> Tables:
     """The annotator's page in a real Chromium; it needs the tests' packages and Chromium.
 
     - times: from the mouse event to the painted frame, with 20 pairs, without and with a mask;
@@ -105,108 +112,109 @@ class Annotator:
     - clip: a video of 60 frames, some marked by hand, the others' predictions taken by a key;
     - pictures: models white, black, with doubled faces, thin, transparent, textured, huge and tiny,
       light and dark, on desktop, laptop and phone, as contact sheets.
+
+    Parameters
+    ----------
+    parts : tuple[str, ...]
+        What to measure.
+    clicks : int
+        Clicks that are timed.
+    photos : int
+        Photos in the folder.
+    kills : int
+        Annotators to kill.
     """
+    measures: dict[str, Callable[[BenchmarkData, Browser, Path], Iterator[Row]]] = {
+        "times": partial(_times, clicks),
+        "list": partial(_list, photos),
+        "panels": _panels,
+        "kills": partial(_kills, kills),
+        "clip": _clips,
+        "pictures": _pictures,
+    }
+    with tempfile.TemporaryDirectory() as folder, chromium() as browser:
+        os.environ["XDG_STATE_HOME"] = str(Path(folder) / "state")
+        for part in parts:
+            before = os.getloadavg()[0]
+            rows = list(measures[part](given, browser, _new(Path(folder) / part)))
+            after = os.getloadavg()[0]
+            yield f"annotator, {part} (load {before:.1f}, then {after:.1f})", rows
 
-    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "clip", "pictures")
-    """What to measure."""
-    clicks: int = 30
-    """Clicks that are timed."""
-    photos: int = 200
-    """Photos in the folder."""
-    kills: int = 100
-    """Annotators to kill."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        measures: dict[str, Callable[[BenchmarkData, Browser, Path], Iterator[Row]]] = {
-            "times": self._times,
-            "list": self._list,
-            "panels": _panels,
-            "kills": self._kills,
-            "clip": _clips,
-            "pictures": _pictures,
-        }
-        with tempfile.TemporaryDirectory() as folder, chromium() as browser:
-            os.environ["XDG_STATE_HOME"] = str(Path(folder) / "state")
-            for part in self.parts:
-                before = os.getloadavg()[0]
-                rows = list(measures[part](given, browser, _new(Path(folder) / part)))
-                after = os.getloadavg()[0]
-                yield RatioTable(f"annotator, {part} (load {before:.1f}, then {after:.1f})", rows)
+def _times(clicks: int, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+    """Clicks that complete the twentieth pair, without and with a mask."""
+    case = _case(given, folder)
+    for kind in ("pairs", "mask"):
+        own = case.copied_to(folder / kind)
+        session = own.open()
+        place_twenty(session, own)
+        if kind == "mask":
+            pose = own.instance.cam_from_model
+            mask = cast_geometry(session.model.scene, own.instance.camera, pose).mask
+            perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+        last = session.photos[0].document.pairs[-1]
+        perform(session, 0, {"do": "delete", "pair": last.number})
+        with _page(browser, session, WATCH_PAINT) as page:
+            page.evaluate("window.watchPaint()")
+            milliseconds = _timed_clicks(page, session, last.uv, clicks)
+        median, late = np.percentile(milliseconds, [50, 95]).tolist()
+        yield {"with": kind, "clicks": clicks, "median ms": median, "p95 ms": late}
 
-    def _times(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-        """Clicks that complete the twentieth pair, without and with a mask."""
-        case = _case(given, folder)
-        for kind in ("pairs", "mask"):
-            own = case.copied_to(folder / kind)
-            session = own.open()
-            place_twenty(session, own)
-            if kind == "mask":
-                pose = own.instance.cam_from_model
-                mask = cast_geometry(session.model.scene, own.instance.camera, pose).mask
-                perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
-            last = session.photos[0].document.pairs[-1]
-            perform(session, 0, {"do": "delete", "pair": last.number})
-            with _page(browser, session, WATCH_PAINT) as page:
-                page.evaluate("window.watchPaint()")
-                milliseconds = _timed_clicks(page, session, last.uv, self.clicks)
-            median, late = np.percentile(milliseconds, [50, 95]).tolist()
-            yield {"with": kind, "clicks": self.clicks, "median ms": median, "p95 ms": late}
 
-    def _list(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-        """The list of a folder of photos, and going from one to the next."""
-        case = _case(given, folder)
-        large = Image.fromarray(read_photo(case.photo)).resize((2000, 1500))
-        case.photo.unlink()
-        for number in range(self.photos):
-            large.save(case.folder / f"photo_{number}.jpg", quality=90)
-        opened, _, session = clocked(
-            lambda: case.open(image=case.folder, camera=None, prepared=False)
-        )
-        session.warm_up()
-        for number in range(0, self.photos, 5):
-            for keypoint, (u, v) in case.clicks[:5]:
-                scale = 2000 / case.instance.camera.width
-                place(session, keypoint, [u * scale, v * scale], image=number)
-        listed, pictured, switched = [], [], []
-        with _page(browser, session) as page:
-            wait = Keyboard(page).wait
-            for _ in range(5):
-                listed.append(page.evaluate(_LIST))
-                start = time.perf_counter()
-                wait(THUMBNAILS)
-                pictured.append(1000 * (time.perf_counter() - start))
-                page.keyboard.press("Escape")
-                wait("!annotator.worklist.dialog.isConnected")
-            page.locator(PHOTO).focus()
-            for number in range(1, 21):
-                start = time.perf_counter()
-                page.keyboard.press("PageDown")
-                wait(
-                    f"{SETTLED} && annotator.state.image.number === {number}"
-                    " && annotator.photo.wanted === annotator.photo.picture"
-                )
-                switched.append(1000 * (time.perf_counter() - start))
-        yield {
-            "photos": self.photos,
-            "opened s": opened,
-            "list ms": float(np.median(listed)),
-            "first thumbnails ms": pictured[0],
-            "switch ms": float(np.median(switched)),
-            "switch p95 ms": float(np.percentile(switched, 95)),
-        }
+def _list(photos: int, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+    """The list of a folder of photos, and going from one to the next."""
+    case = _case(given, folder)
+    large = Image.fromarray(read_photo(case.photo)).resize((2000, 1500))
+    case.photo.unlink()
+    for number in range(photos):
+        large.save(case.folder / f"photo_{number}.jpg", quality=90)
+    opened, _, session = clocked(lambda: case.open(image=case.folder, camera=None, prepared=False))
+    session.warm_up()
+    for number in range(0, photos, 5):
+        for keypoint, (u, v) in case.clicks[:5]:
+            scale = 2000 / case.instance.camera.width
+            place(session, keypoint, [u * scale, v * scale], image=number)
+    listed, pictured, switched = [], [], []
+    with _page(browser, session) as page:
+        wait = Keyboard(page).wait
+        for _ in range(5):
+            listed.append(page.evaluate(_LIST))
+            start = time.perf_counter()
+            wait(THUMBNAILS)
+            pictured.append(1000 * (time.perf_counter() - start))
+            page.keyboard.press("Escape")
+            wait("!annotator.worklist.dialog.isConnected")
+        page.locator(PHOTO).focus()
+        for number in range(1, 21):
+            start = time.perf_counter()
+            page.keyboard.press("PageDown")
+            wait(
+                f"{SETTLED} && annotator.state.image.number === {number}"
+                " && annotator.photo.wanted === annotator.photo.picture"
+            )
+            switched.append(1000 * (time.perf_counter() - start))
+    yield {
+        "photos": photos,
+        "opened s": opened,
+        "list ms": float(np.median(listed)),
+        "first thumbnails ms": pictured[0],
+        "switch ms": float(np.median(switched)),
+        "switch p95 ms": float(np.percentile(switched, 95)),
+    }
 
-    def _kills(self, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-        """Annotators killed at random moments."""
-        rounds = list(kill_at_random(_case(given, folder), rounds=self.kills, seed=given.seed))
-        for each in rounds:
-            if each.lost:
-                print("lost", each.action, each.differences)
-        yield {
-            "kills": len(rounds),
-            "during an action": sum(each.was_busy for each in rounds),
-            "answered actions": sum(each.answered for each in rounds),
-            "lost": sum(each.lost for each in rounds),
-        }
+
+def _kills(kills: int, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
+    """Annotators killed at random moments."""
+    rounds = list(kill_at_random(_case(given, folder), rounds=kills, seed=given.seed))
+    for each in rounds:
+        if each.lost:
+            print("lost", each.action, each.differences)
+    yield {
+        "kills": len(rounds),
+        "during an action": sum(each.was_busy for each in rounds),
+        "answered actions": sum(each.answered for each in rounds),
+        "lost": sum(each.lost for each in rounds),
+    }
 
 
 def _case(given: BenchmarkData, folder: Path) -> Case:
@@ -224,11 +232,7 @@ def _new(folder: Path) -> Path:
 
 @contextmanager
 def _page(
-    browser: Browser,
-    session: Session,
-    *scripts: str,
-    screen: str = "laptop",
-    scheme: str = "light",
+    browser: Browser, session: Session, *scripts: str, screen: str = "laptop", scheme: str = "light"
 ) -> Iterator[Page]:
     """The page of a session that is served."""
     width, height = SCREENS[screen]

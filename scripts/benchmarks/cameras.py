@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ import numpy as np
 import cadalign
 from benchmarks import section
 from benchmarks.cars import car_scenes
-from benchmarks.section import BenchmarkData, RatioTable, Row
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.simulation.problems import Problem, simulate_standing_boxes
@@ -31,151 +30,159 @@ _PRIORS = ("none", "usual", "EXIF", "known")
 _SCALE_SIGMA, _TILT_SIGMA = 0.3, np.radians(1.0)
 
 
-@dataclass
-class PhotoLenses:
+def photo_lenses(
+    given: BenchmarkData,
+    *,
+    categories: tuple[str, ...] = ("chair", "airplane", "mug"),
+    objects: int = 40,
+    noise_px: float = 2.0,
+) -> Tables:
     """Unknown focal lengths of photos' lenses: what the prior of usual lenses and EXIF data bring.
 
     Objects of the split val fill their images, through lenses of the distribution of focal lengths
     of `FocalPrior.of_usual_lenses`. Models are the nearest one of the split train, only similar, or
     the learned shape of the category.
+
+    Parameters
+    ----------
+    categories : tuple[str, ...]
+        Categories.
+    objects : int
+        Objects of each category.
+    noise_px : float
+        Standard deviation of the keypoints, in pixels.
     """
-
-    categories: tuple[str, ...] = ("chair", "airplane", "mug")
-    """Categories."""
-    objects: int = 40
-    """Objects of each category."""
-    noise_px: float = 2.0
-    """Standard deviation of the keypoints, in pixels."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        dataset = KeypointNet(given.needed())
-        for category in self.categories:
-            shape = section.learned_shape(dataset, category)
-            mean = shape.components[0].mean[: len(shape.ids)]
-            similar = cadalign.Model(points_3d=mean, ids=shape.ids, shape_sigma=0.05)
-            seen = list(self._seen(dataset, category, shape, given.seed))
-            for title, model in (
-                ("learned shape", shape),
-                ("its mean as a similar model", similar),
-            ):
-                rows = [self._row(model, seen, prior) for prior in _PRIORS]
-                yield RatioTable(f"{category}, {title}", rows)
-
-    def _seen(
-        self, dataset: KeypointNet, category: str, shape: cadalign.ShapeModel, seed: int
-    ) -> Iterator[tuple[Problem, list[int]]]:
-        width, height = _UNKNOWN.width, _UNKNOWN.height
-        for place, one in section.unseen_objects(
-            dataset, category, self.objects, noise_px=self.noise_px
+    dataset = KeypointNet(given.needed())
+    for category in categories:
+        shape = section.learned_shape(dataset, category)
+        mean = shape.components[0].mean[: len(shape.ids)]
+        similar = cadalign.Model(points_3d=mean, ids=shape.ids, shape_sigma=0.05)
+        seen = list(_seen(dataset, category, shape, given.seed, objects, noise_px))
+        for title, model in (
+            ("learned shape", shape),
+            ("its mean as a similar model", similar),
         ):
-            known = np.isin(one.ids, shape.ids)
-            points, ids = one.xyz[one.rows][known], one.ids[known]
-            if len(ids) < _LEAST_KEYPOINTS:
-                continue
-            rng = instance_rng(seed, f"{category}/{place}")
-            length = _SHORTEST_MM + _MEDIAN_MM * float(np.exp(_SHAPE * rng.normal()))
-            focal = width * min(length, _LONGEST_MM) / _FILM_MM
-            camera = cadalign.Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-            distance = 0.5 + focal / (0.6 * height)  # of the middle of an object of diagonal 1
-            pose = look_at(
-                azimuth=rng.uniform(0, 360), elevation=rng.uniform(5, 40), distance=distance
-            )
-            pixels = camera.project(pose.apply(points))
-            pixels += self.noise_px * rng.normal(size=pixels.shape)
-            yield Problem(points, pixels, camera, pose, None), ids.tolist()
-
-    def _row(self, model: Any, seen: Sequence[tuple[Problem, list[int]]], prior: str) -> Row:
-        errors, focals, holds = [], [], []
-        for number, (one, ids) in enumerate(seen):
-            rng = instance_rng(number, "exif")
-            stated = cadalign.FocalPrior(one.camera.fx * float(np.exp(0.05 * rng.normal())), 0.05)
-            options: dict[str, Any] = {
-                "none": {"focal": "estimate", "focal_prior": None},
-                "usual": {"focal": "estimate"},
-                "EXIF": {"focal": "estimate", "focal_prior": stated},
-                "known": {},
-            }[prior]
-            camera = one.camera if prior == "known" else _UNKNOWN
-            view = cadalign.View(camera, one.points_2d, ids=ids, sigma=self.noise_px)
-            result = section.attempt(cadalign.align, model, view, **options)
-            if result is None:
-                errors.append(180.0)
-                continue
-            errors.append(rotation_error(est=result.alignment, gt=one.alignment))
-            focals.append(abs(np.log(result.camera.fx / one.camera.fx)))
-            holds.append(focals[-1] <= section.WITHIN_95 * result.std.focal)
-        is_known = prior == "known"
-        return {
-            "prior": prior,
-            "R deg": section.spread(errors),
-            "within 30 deg %": section.percent(np.array(errors) < _VIEWPOINT_DEG),
-            "focal off %": 0.0 if is_known else 100 * float(np.median(focals)),
-            "off by 3 times %": 100 * int((np.exp(focals) > 3).sum()) / len(seen),
-            "in 95 % interval": 100.0 if is_known else section.percent(holds),
-        }
+            rows = [_row(model, seen, prior, noise_px) for prior in _PRIORS]
+            yield f"{category}, {title}", rows
 
 
-@dataclass
-class Scenes:
+def _seen(
+    dataset: KeypointNet,
+    category: str,
+    shape: cadalign.ShapeModel,
+    seed: int,
+    objects: int,
+    noise_px: float,
+) -> Iterator[tuple[Problem, list[int]]]:
+    width, height = _UNKNOWN.width, _UNKNOWN.height
+    for place, one in section.unseen_objects(dataset, category, objects, noise_px=noise_px):
+        known = np.isin(one.ids, shape.ids)
+        points, ids = one.xyz[one.rows][known], one.ids[known]
+        if len(ids) < _LEAST_KEYPOINTS:
+            continue
+        rng = instance_rng(seed, f"{category}/{place}")
+        length = _SHORTEST_MM + _MEDIAN_MM * float(np.exp(_SHAPE * rng.normal()))
+        focal = width * min(length, _LONGEST_MM) / _FILM_MM
+        camera = cadalign.Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        distance = 0.5 + focal / (0.6 * height)  # of the middle of an object of diagonal 1
+        pose = look_at(azimuth=rng.uniform(0, 360), elevation=rng.uniform(5, 40), distance=distance)
+        pixels = camera.project(pose.apply(points))
+        pixels += noise_px * rng.normal(size=pixels.shape)
+        yield Problem(points, pixels, camera, pose, None), ids.tolist()
+
+
+def _row(model: Any, seen: Sequence[tuple[Problem, list[int]]], prior: str, noise_px: float) -> Row:
+    errors, focals, holds = [], [], []
+    for number, (one, ids) in enumerate(seen):
+        rng = instance_rng(number, "exif")
+        stated = cadalign.FocalPrior(one.camera.fx * float(np.exp(0.05 * rng.normal())), 0.05)
+        options: dict[str, Any] = {
+            "none": {"focal": "estimate", "focal_prior": None},
+            "usual": {"focal": "estimate"},
+            "EXIF": {"focal": "estimate", "focal_prior": stated},
+            "known": {},
+        }[prior]
+        camera = one.camera if prior == "known" else _UNKNOWN
+        view = cadalign.View(camera, one.points_2d, ids=ids, sigma=noise_px)
+        result = section.attempt(cadalign.align, model, view, **options)
+        if result is None:
+            errors.append(180.0)
+            continue
+        errors.append(rotation_error(est=result.alignment, gt=one.alignment))
+        focals.append(abs(np.log(result.camera.fx / one.camera.fx)))
+        holds.append(focals[-1] <= section.WITHIN_95 * result.std.focal)
+    is_known = prior == "known"
+    return {
+        "prior": prior,
+        "R deg": section.spread(errors),
+        "within 30 deg %": section.percent(np.array(errors) < _VIEWPOINT_DEG),
+        "focal off %": 0.0 if is_known else 100 * float(np.median(focals)),
+        "off by 3 times %": 100 * int((np.exp(focals) > 3).sum()) / len(seen),
+        "in 95 % interval": 100.0 if is_known else section.percent(holds),
+    }
+
+
+def scenes(
+    given: BenchmarkData, *, scenes: int = 60, noise_px: float = 1.0, kitti: Path | None = None
+) -> Tables:
     """Objects of one photo, alone and together: boxes of unknown stretch, and cars of KITTI.
 
     The boxes' focal length is unknown. The cars stand where KITTI's labels of a street have them,
     and are the mean car stretched to the labels' sizes; their keypoints are simulated.
+
+    Parameters
+    ----------
+    scenes : int
+        Scenes of boxes for each number of objects.
+    noise_px : float
+        Standard deviation of the boxes' keypoints, in pixels; of the cars it is three times that.
+    kitti : Path | None
+        Folder of KITTI's cars; by default the one in CADALIGN_DATA.
     """
+    rows = [_boxes(given.seed, 1, ("focal",), scenes, noise_px)]
+    for count in (2, 4):
+        for share in (("focal",), ("focal", "gravity")):
+            rows.append(_boxes(given.seed, count, share, scenes, noise_px))
+    yield "boxes of unknown stretch, unknown focal length", rows
+    folder = kitti or (given.keypointnet and given.real("kitti_cars"))
+    if folder is not None and folder.is_dir():
+        rows = car_scenes(folder, 3 * noise_px)
+        yield "cars of KITTI's labels, 2 to 4 in an image", rows
 
-    scenes: int = 60
-    """Scenes of boxes for each number of objects."""
-    noise_px: float = 1.0
-    """Standard deviation of the boxes' keypoints, in pixels; of the cars it is three times that."""
-    kitti: Path | None = None
-    """Folder of KITTI's cars; by default the one in CADALIGN_DATA."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        rows = [self._boxes(given.seed, 1, ("focal",))]
-        for count in (2, 4):
-            for share in (("focal",), ("focal", "gravity")):
-                rows.append(self._boxes(given.seed, count, share))
-        yield RatioTable("boxes of unknown stretch, unknown focal length", rows)
-        folder = self.kitti or (given.keypointnet and given.real("kitti_cars"))
-        if folder is not None and folder.is_dir():
-            rows = car_scenes(folder, 3 * self.noise_px)
-            yield RatioTable("cars of KITTI's labels, 2 to 4 in an image", rows)
-
-    def _boxes(self, seed: int, count: int, share: tuple[str, ...]) -> Row:
-        found = defaultdict(list)
-        for number in range(self.scenes):
-            rng = instance_rng(seed, f"{number}")
-            boxes = simulate_standing_boxes(
-                rng, objects=count, camera=_CAMERA, noise_px=self.noise_px
+def _boxes(seed: int, count: int, share: tuple[str, ...], scenes: int, noise_px: float) -> Row:
+    found = defaultdict(list)
+    for number in range(scenes):
+        rng = instance_rng(seed, f"{number}")
+        boxes = simulate_standing_boxes(rng, objects=count, camera=_CAMERA, noise_px=noise_px)
+        how = {"bounds": boxes.BOUNDS, "stretch_sigma": _SCALE_SIGMA}
+        objects = [
+            cadalign.SceneObject(
+                cadalign.Model(points_3d=each.points_3d, **how),
+                cadalign.View(_UNKNOWN, each.points_2d),
             )
-            how = {"bounds": boxes.BOUNDS, "stretch_sigma": _SCALE_SIGMA}
-            objects = [
-                cadalign.SceneObject(
-                    cadalign.Model(points_3d=each.points_3d, **how),
-                    cadalign.View(_UNKNOWN, each.points_2d),
-                )
-                for each in boxes.problems
-            ]
-            scene = cadalign.align_scene(objects, share=share)
-            off = float(np.log(scene.camera.fx / _CAMERA.fx))
-            found["bound"].append(_focal_bound(boxes.problems, share, self.noise_px))
-            found["focal"].append(off)
-            found["held"].append(abs(off) < section.WITHIN_95 * scene.focal_std)
-            for result, each in zip(scene.results, boxes.problems, strict=True):
-                if isinstance(result, cadalign.Result):
-                    est, gt = result.alignment, each.alignment
-                    found["R"].append(rotation_error(est=est, gt=gt))
-                    found["depth"].append(abs(np.log(est.translation[2] / gt.translation[2])))
-        focal, bound = (float(np.sqrt(np.mean(np.square(found[k])))) for k in ("focal", "bound"))
-        return {
-            "objects": count,
-            "share": ", ".join(share),
-            "focal rms %": 100 * focal,
-            "bound %": 100 * bound,
-            "in 95 % interval": section.percent(found["held"]),
-            "R deg": float(np.median(found["R"])),
-            "depth %": 100 * float(np.median(found["depth"])),
-        }
+            for each in boxes.problems
+        ]
+        scene = cadalign.align_scene(objects, share=share)
+        off = float(np.log(scene.camera.fx / _CAMERA.fx))
+        found["bound"].append(_focal_bound(boxes.problems, share, noise_px))
+        found["focal"].append(off)
+        found["held"].append(abs(off) < section.WITHIN_95 * scene.focal_std)
+        for result, each in zip(scene.results, boxes.problems, strict=True):
+            if isinstance(result, cadalign.Result):
+                est, gt = result.alignment, each.alignment
+                found["R"].append(rotation_error(est=est, gt=gt))
+                found["depth"].append(abs(np.log(est.translation[2] / gt.translation[2])))
+    focal, bound = (float(np.sqrt(np.mean(np.square(found[k])))) for k in ("focal", "bound"))
+    return {
+        "objects": count,
+        "share": ", ".join(share),
+        "focal rms %": 100 * focal,
+        "bound %": 100 * bound,
+        "in 95 % interval": section.percent(found["held"]),
+        "R deg": float(np.median(found["R"])),
+        "depth %": 100 * float(np.median(found["depth"])),
+    }
 
 
 def _focal_bound(problems: Sequence[Problem], share: Sequence[str], noise_px: float) -> float:

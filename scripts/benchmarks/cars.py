@@ -6,14 +6,14 @@ import json
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import cadalign
-from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, percent, spread
+from benchmarks.section import BenchmarkData, Row, Tables, attempt, percent, spread
 from cadalign.arrays import FloatArray
 from cadalign.datasets import ImageKeypoints
 from cadalign.datasets import open as open_data
@@ -59,49 +59,46 @@ def _real_cars(folder: Path) -> Iterator[tuple[Any, cadalign.Camera, cadalign.Bo
 # Keypoints of a network ---------------------------------------------------------------------------
 
 
-@dataclass
-class NoiseOfDetector:
+def noise_of_detector(given: BenchmarkData) -> Tables:
     """Coverage of the yaw of KITTI's cars with an hourglass network's keypoints, by their noise.
 
     "left out" is calibrated without the block of 6 successive cars that it is used for; "without a
     common shift" takes the errors' correlation as a shift of all keypoints, which the translation
     follows.
     """
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        folder = given.real("kitti_cars")
-        model = car_shape(folder)
-        seen, true, placed = [], [], []
-        for found, camera, box, _ in _real_cars(folder):
-            if found.scores is not None:
-                scores = np.where(found.scores >= _LEAST_SCORE, found.scores, 0.0)
-                seen.append(ImageKeypoints(found.points_2d, scores, names=found.names))
-                true.append(car_keypoints(model, box, camera))
-                placed.append((camera, box))
-        blocks = np.arange(len(seen)) // _BLOCK
-        without = []
-        for block in range(blocks[-1] + 1):
-            kept = np.flatnonzero(blocks != block)
-            pairs = [seen[k] for k in kept], [true[k] for k in kept]
-            without.append(cadalign.calibrate_detector(*pairs))
-        noise = cadalign.calibrate_detector(seen, true)
-        ways = {f"{sigma:g} px": [{"sigma": sigma}] * len(seen) for sigma in (1.0, 3.0, 5.0)}
-        ways["calibrated"] = [{"noise": noise}] * len(seen)
-        ways["left out"] = [{"noise": without[block]} for block in blocks]
-        ways["left out, without a common shift"] = [
-            {"noise": _without_shift(without[block])} for block in blocks
+    folder = given.real("kitti_cars")
+    model = car_shape(folder)
+    seen, true, placed = [], [], []
+    for found, camera, box, _ in _real_cars(folder):
+        if found.scores is not None:
+            scores = np.where(found.scores >= _LEAST_SCORE, found.scores, 0.0)
+            seen.append(ImageKeypoints(found.points_2d, scores, names=found.names))
+            true.append(car_keypoints(model, box, camera))
+            placed.append((camera, box))
+    blocks = np.arange(len(seen)) // _BLOCK
+    without = []
+    for block in range(blocks[-1] + 1):
+        kept = np.flatnonzero(blocks != block)
+        pairs = [seen[k] for k in kept], [true[k] for k in kept]
+        without.append(cadalign.calibrate_detector(*pairs))
+    noise = cadalign.calibrate_detector(seen, true)
+    ways = {f"{sigma:g} px": [{"sigma": sigma}] * len(seen) for sigma in (1.0, 3.0, 5.0)}
+    ways["calibrated"] = [{"noise": noise}] * len(seen)
+    ways["left out"] = [{"noise": without[block]} for block in blocks]
+    ways["left out, without a common shift"] = [
+        {"noise": _without_shift(without[block])} for block in blocks
+    ]
+    rows = []
+    for name, fields in ways.items():
+        found = [
+            attempt(_yaw_of_view, model, *each)
+            for each in zip(seen, placed, fields, strict=True)
+            if (each[0].scores > 0).sum() >= _LEAST_KEYPOINTS
         ]
-        rows = []
-        for name, fields in ways.items():
-            found = [
-                attempt(_yaw_of_view, model, *each)
-                for each in zip(seen, placed, fields, strict=True)
-                if (each[0].scores > 0).sum() >= _LEAST_KEYPOINTS
-            ]
-            errors, held = np.array([each for each in found if each is not None]).T
-            row = {"noise": name, "cars": len(errors), "yaw, deg": spread(errors)}
-            rows.append(row | {"95 % regions hold, %": percent(held)})
-        yield RatioTable("Yaw of cars", rows)
+        errors, held = np.array([each for each in found if each is not None]).T
+        row = {"noise": name, "cars": len(errors), "yaw, deg": spread(errors)}
+        rows.append(row | {"95 % regions hold, %": percent(held)})
+    yield "Yaw of cars", rows
 
 
 def _without_shift(noise: cadalign.DetectorNoise) -> cadalign.DetectorNoise:
@@ -136,35 +133,32 @@ def _yaw_of_view(
     return error, bool(np.radians(error) < result.radius(0.95) * std)
 
 
-@dataclass
-class RealDetections:
+def real_detections(given: BenchmarkData) -> Tables:
     """Runs over real keypoints of networks: share aligned, errors of yaw and depth.
 
     Cars are all frames of KITTI with at least 6 keypoints that score 0.1, aligned with a mean car
     or with a learned shape; web photos are those of PASCAL3D+, whose poses and focal lengths are
     not known. Errors are medians, of yaw with the 90th percentile in parentheses.
     """
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        folder, web = given.real("kitti_cars"), given.real("pascal3d") / "observations"
-        cars = list(_observed_cars(folder))
-        with tempfile.TemporaryDirectory() as temporary:
-            learned: dict[str, Any] = {"shape": Path(temporary, "car.shape"), "sigma": _SIGMA}
-            car_shape(folder).save(learned["shape"])
-            robust, cauchy, similar = {"robust": True}, {"loss": "cauchy"}, {"similar": True}
-            ways: dict[str, dict[str, Any]] = {
-                "plain": {},
-                "--robust": robust,
-                "--loss cauchy": cauchy,
-                "--similar": similar,
-                "--similar --robust": similar | robust,
-                "--similar --loss cauchy": similar | cauchy,
-                "--shape --sigma 3": learned,
-                "--shape --sigma 3 --robust": learned | robust,
-                "--shape --sigma 3 --loss cauchy": learned | cauchy,
-            }
-            rows = [_detections_row(name, cars, web, options) for name, options in ways.items()]
-        yield RatioTable(f"{len(cars)} cars, and web photos", rows)
+    folder, web = given.real("kitti_cars"), given.real("pascal3d") / "observations"
+    cars = list(_observed_cars(folder))
+    with tempfile.TemporaryDirectory() as temporary:
+        learned: dict[str, Any] = {"shape": Path(temporary, "car.shape"), "sigma": _SIGMA}
+        car_shape(folder).save(learned["shape"])
+        robust, cauchy, similar = {"robust": True}, {"loss": "cauchy"}, {"similar": True}
+        ways: dict[str, dict[str, Any]] = {
+            "plain": {},
+            "--robust": robust,
+            "--loss cauchy": cauchy,
+            "--similar": similar,
+            "--similar --robust": similar | robust,
+            "--similar --loss cauchy": similar | cauchy,
+            "--shape --sigma 3": learned,
+            "--shape --sigma 3 --robust": learned | robust,
+            "--shape --sigma 3 --loss cauchy": learned | cauchy,
+        }
+        rows = [_detections_row(name, cars, web, options) for name, options in ways.items()]
+    yield f"{len(cars)} cars, and web photos", rows
 
 
 _Car = tuple[cadalign.Observation, cadalign.Box, FloatArray]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import cv2
 import numpy as np
 
 from benchmarks.photo import PhotoClicks, bop_cases
-from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, clocked, spread, summary
+from benchmarks.section import BenchmarkData, Row, Tables, attempt, clocked, spread, summary
 from cadalign import Camera, Model, View, align
 from cadalign.annotate.candidates import MaskCandidates, best_click
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
@@ -35,169 +34,175 @@ _RAPID_LINES, _RAPID_REACH = 100, 20  # search lines, and their length to either
 Estimator = Callable[[PhotoClicks], Alignment | None]
 
 
-@dataclass
-class Clicks:
+def clicks(given: BenchmarkData, *, draws: int = 3, most: int = 12, within: float = 3.0) -> Tables:
     """Clicks needed until the rotation is within a limit and stays there, scripted.
 
     On the photos of HANDAL and LINEMOD, a rigid model; clicks with an error of 4 px in a photo 640
     px wide are added one by one. By the clicks alone, with the photo, and with the mask that
     GrabCut makes of a box around the object, which is aligned without a click as well. The mean
     takes one more than the most where these are not enough.
+
+    Parameters
+    ----------
+    draws : int
+        Draws of the clicks on every photo.
+    most : int
+        Most clicks that are tried.
+    within : float
+        Limit of the rotation's error [degrees].
     """
-
-    draws: int = 3
-    """Draws of the clicks on every photo."""
-    most: int = 12
-    """Most clicks that are tried."""
-    within: float = 3.0
-    """Limit of the rotation's error [degrees]."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        methods: dict[str, tuple[Estimator, int]] = {
-            "keypoints": (_by_clicks, _FEWEST),
-            "with the photo": (_by_photo, _FEWEST),
-            "with box and mask": (_by_box, 0),
+    methods: dict[str, tuple[Estimator, int]] = {
+        "keypoints": (_by_clicks, _FEWEST),
+        "with the photo": (_by_photo, _FEWEST),
+        "with box and mask": (_by_box, 0),
+    }
+    needed: dict[str, list[int]] = defaultdict(list)
+    for number, case in enumerate(bop_cases(given)):
+        for draw in range(draws):
+            rng = np.random.default_rng([given.seed, 4, number, draw])
+            clicks = case.clicked(rng, stretched=False, count=most)
+            for name, (method, least) in methods.items():
+                needed[f"{case.group}, {name}"].append(_needed(clicks, method, least, most, within))
+    rows = [
+        {
+            "photos": name,
+            "median": float(np.median(counts)),
+            "mean": float(np.mean(counts)),
+            "enough": float(np.mean(np.array(counts) <= most)),
+            "count": len(counts),
         }
-        needed: dict[str, list[int]] = defaultdict(list)
-        for number, case in enumerate(bop_cases(given)):
-            for draw in range(self.draws):
-                rng = np.random.default_rng([given.seed, 4, number, draw])
-                clicks = case.clicked(rng, stretched=False, count=self.most)
-                for name, (method, least) in methods.items():
-                    needed[f"{case.group}, {name}"].append(self._needed(clicks, method, least))
-        rows = [
-            {
-                "photos": name,
-                "median": float(np.median(counts)),
-                "mean": float(np.mean(counts)),
-                "enough": float(np.mean(np.array(counts) <= self.most)),
-                "count": len(counts),
-            }
-            for name, counts in needed.items()
-        ]
-        yield RatioTable(f"clicks until the rotation stays within {self.within:g} deg", rows)
-
-    def _needed(self, clicks: PhotoClicks, method: Estimator, least: int) -> int:
-        """The least number from which on all estimates are within the limit."""
-        enough = self.most + 1
-        for count in (*range(self.most, _FEWEST - 1, -1), 0):
-            est = attempt(method, clicks.first(count)) if count >= least else None
-            if est is None or rotation_error(est=est, gt=clicks.true_for(est)) >= self.within:
-                break
-            enough = count
-        return enough
+        for name, counts in needed.items()
+    ]
+    yield f"clicks until the rotation stays within {within:g} deg", rows
 
 
-@dataclass
-class OutlineMethods:
+def _needed(clicks: PhotoClicks, method: Estimator, least: int, most: int, within: float) -> int:
+    """The least number from which on all estimates are within the limit."""
+    enough = most + 1
+    for count in (*range(most, _FEWEST - 1, -1), 0):
+        est = attempt(method, clicks.first(count)) if count >= least else None
+        if est is None or rotation_error(est=est, gt=clicks.true_for(est)) >= within:
+            break
+        enough = count
+    return enough
+
+
+def outline_methods(given: BenchmarkData, *, draws: int = 5) -> Tables:
     """Six rough clicks refined by the photo, by GrabCut's mask, and by OpenCV's edge trackers.
 
     GrabCut starts from a band about the outline that the clicks predict; its mask is evidence
     beside the clicks. The trackers (`cv2.rapid`, of OpenCV's contributed modules, left out where
     they are not installed) start from the clicks' estimate. Rigid models, photos of HANDAL and
     LINEMOD.
+
+    Parameters
+    ----------
+    draws : int
+        Draws of the clicks on every photo.
     """
-
-    draws: int = 5
-    """Draws of the clicks on every photo."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        methods: dict[str, Callable[[PhotoClicks], Alignment]] = {
-            "clicks": _by_clicks,
-            "the photo": _by_photo,
-            "GrabCut's mask": _by_grabcut,
-        }
-        if hasattr(cv2, "rapid"):
-            for name in ("Rapid", "OLS", "GOS"):
-                methods[name] = partial(_by_tracker, name)
-        found: dict[str, list[Row]] = defaultdict(list)
-        for number, case in enumerate(bop_cases(given)):
-            for draw in range(self.draws):
-                rng = np.random.default_rng([given.seed, 3, number, draw])
-                clicks = case.clicked(rng, stretched=False)
-                first = rotation_error(est=_by_clicks(clicks), gt=clicks.truth)
-                for name, method in methods.items():
-                    wall, _, est = clocked(partial(method, clicks))
-                    error = rotation_error(est=est, gt=clicks.truth)
-                    row = {"R": error, "better": error < first, "seconds": wall}
-                    found[f"{case.group}, {name}"].append(row)
-        rows = [{"photos": name, **summary(each)} for name, each in found.items()]
-        yield RatioTable("rough clicks refined, rigid models: medians", rows)
+    methods: dict[str, Callable[[PhotoClicks], Alignment]] = {
+        "clicks": _by_clicks,
+        "the photo": _by_photo,
+        "GrabCut's mask": _by_grabcut,
+    }
+    if hasattr(cv2, "rapid"):
+        for name in ("Rapid", "OLS", "GOS"):
+            methods[name] = partial(_by_tracker, name)
+    found: dict[str, list[Row]] = defaultdict(list)
+    for number, case in enumerate(bop_cases(given)):
+        for draw in range(draws):
+            rng = np.random.default_rng([given.seed, 3, number, draw])
+            clicks = case.clicked(rng, stretched=False)
+            first = rotation_error(est=_by_clicks(clicks), gt=clicks.truth)
+            for name, method in methods.items():
+                wall, _, est = clocked(partial(method, clicks))
+                error = rotation_error(est=est, gt=clicks.truth)
+                row = {"R": error, "better": error < first, "seconds": wall}
+                found[f"{case.group}, {name}"].append(row)
+    rows = [{"photos": name, **summary(each)} for name, each in found.items()]
+    yield "rough clicks refined, rigid models: medians", rows
 
 
-@dataclass
-class ProposalClicks:
+def proposal_clicks(
+    given: BenchmarkData,
+    *,
+    models: int = 4,
+    views: int = 2,
+    shape_sigma: float = 0.06,
+    categories: tuple[str, ...] = ("bottle", "car", "chair", "vessel"),
+) -> Tables:
     """Clicks that tell apart what a mask allows of a model that is only similar.
 
     Photos of sample models, stretched by 0.74 to 1.35, exact masks, and the next model of the
     category with the keypoints that both have. The clicks, off by 2 px, are those that the
     annotator asks for, on visible keypoints, until one alignment is left. Right is a rotation
     within 30 degrees, up to the object's symmetry.
+
+    Parameters
+    ----------
+    models : int
+        Models of each category.
+    views : int
+        Views of every model.
+    shape_sigma : float
+        Standard deviation of a keypoint on the object about the model's [model units].
+    categories : tuple[str, ...]
+        Categories of the sample.
     """
+    found: dict[str, list[Row]] = defaultdict(list)
+    with tempfile.TemporaryDirectory() as folder:
+        sample = write_sample_dataset(Path(folder) / "sample", per_category=models)
+        for category in categories:
+            alike = [each for each in KeypointNet(sample) if each.category == category]
+            for number, own in enumerate(alike):
+                other = alike[(number + 1) % len(alike)]
+                for view in range(views):
+                    rng = np.random.default_rng([given.seed, 5, number, view])
+                    found[category].append(_clicked(own, other, rng, shape_sigma))
+    every = [row for rows in found.values() for row in rows]
+    table = [_told(name, rows) for name, rows in {**found, "all": every}.items()]
+    yield "clicks among what a mask allows of a similar model", table
 
-    models: int = 4
-    """Models of each category."""
-    views: int = 2
-    """Views of every model."""
-    shape_sigma: float = 0.06
-    """Standard deviation of a keypoint on the object about the model's [model units]."""
-    categories: tuple[str, ...] = ("bottle", "car", "chair", "vessel")
-    """Categories of the sample."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        found: dict[str, list[Row]] = defaultdict(list)
-        with tempfile.TemporaryDirectory() as folder:
-            sample = write_sample_dataset(Path(folder) / "sample", per_category=self.models)
-            for category in self.categories:
-                models = [each for each in KeypointNet(sample) if each.category == category]
-                for number, own in enumerate(models):
-                    other = models[(number + 1) % len(models)]
-                    for view in range(self.views):
-                        rng = np.random.default_rng([given.seed, 5, number, view])
-                        found[category].append(self._clicked(own, other, rng))
-        every = [row for rows in found.values() for row in rows]
-        table = [_told(name, rows) for name, rows in {**found, "all": every}.items()]
-        yield RatioTable("clicks among what a mask allows of a similar model", table)
-
-    def _clicked(self, own: AnnotatedModel, other: AnnotatedModel, rng: np.random.Generator) -> Row:
-        """Click until one alignment is left."""
-        scene, scale = Scene(own.load_mesh()), np.exp([0.0, *rng.uniform(-0.3, 0.3, 2)])
-        how = {"rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
-        view = sample_view(scene, own.keypoints.xyz, _CAMERA, min_visible=4, **how)
-        gt = view.cam_from_model
-        pixels = _CAMERA.project(gt.apply(own.keypoints.xyz))
-        places = dict(zip(own.keypoints.ids.tolist(), pixels, strict=True))
-        visible = set(own.keypoints.ids[view.visible].tolist())
-        ids, points = other.keypoints.ids.tolist(), other.keypoints.xyz
-        model = Model(
-            points_3d=points, ids=ids, mesh=other.load_mesh(), shape_sigma=self.shape_sigma
-        )
-        mask = cast_geometry(scene, _CAMERA, gt).mask
-        wall, _, result = clocked(lambda: align(model, View(_CAMERA, mask=mask)))
-        candidates = MaskCandidates.of(model, _CAMERA, result)
-        predicted = candidates.predicted(ids, points)
-        chances = candidates.probabilities((), np.empty((0, 3)), np.empty((0, 2)))
-        first, clicked = int(np.count_nonzero(chances)), list[int]()
-        while np.count_nonzero(chances) > 1:
-            free = np.array([label in visible and label not in clicked for label in ids])
-            row = best_click(chances, *predicted, np.tile(free, (len(chances), 1)))
-            if row is None:
-                break
-            clicked.append(ids[row])
-            seen = np.array([places[label] for label in clicked])
-            seen += rng.normal(0, _CLICK_PX, seen.shape)
-            chances = candidates.probabilities(clicked, np.empty((len(clicked), 3)), seen)
-        right = np.array([_is_right(each.alignment, gt, own) for each in candidates.every])
-        return {
-            "first": bool(right[0]),
-            "among": bool(right.any()),
-            "candidates": first,
-            "clicks": len(clicked),
-            "settled": bool(np.count_nonzero(chances) == 1),
-            "refused": bool(not chances.any()),
-            "right": bool(right[chances > 0].any() and np.count_nonzero(chances) == 1),
-            "seconds": wall,
-        }
+def _clicked(
+    own: AnnotatedModel, other: AnnotatedModel, rng: np.random.Generator, shape_sigma: float
+) -> Row:
+    """Click until one alignment is left."""
+    scene, scale = Scene(own.load_mesh()), np.exp([0.0, *rng.uniform(-0.3, 0.3, 2)])
+    how = {"rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
+    view = sample_view(scene, own.keypoints.xyz, _CAMERA, min_visible=4, **how)
+    gt = view.cam_from_model
+    pixels = _CAMERA.project(gt.apply(own.keypoints.xyz))
+    places = dict(zip(own.keypoints.ids.tolist(), pixels, strict=True))
+    visible = set(own.keypoints.ids[view.visible].tolist())
+    ids, points = other.keypoints.ids.tolist(), other.keypoints.xyz
+    model = Model(points_3d=points, ids=ids, mesh=other.load_mesh(), shape_sigma=shape_sigma)
+    mask = cast_geometry(scene, _CAMERA, gt).mask
+    wall, _, result = clocked(lambda: align(model, View(_CAMERA, mask=mask)))
+    candidates = MaskCandidates.of(model, _CAMERA, result)
+    predicted = candidates.predicted(ids, points)
+    chances = candidates.probabilities((), np.empty((0, 3)), np.empty((0, 2)))
+    first, clicked = int(np.count_nonzero(chances)), list[int]()
+    while np.count_nonzero(chances) > 1:
+        free = np.array([label in visible and label not in clicked for label in ids])
+        row = best_click(chances, *predicted, np.tile(free, (len(chances), 1)))
+        if row is None:
+            break
+        clicked.append(ids[row])
+        seen = np.array([places[label] for label in clicked])
+        seen += rng.normal(0, _CLICK_PX, seen.shape)
+        chances = candidates.probabilities(clicked, np.empty((len(clicked), 3)), seen)
+    right = np.array([_is_right(each.alignment, gt, own) for each in candidates.every])
+    return {
+        "first": bool(right[0]),
+        "among": bool(right.any()),
+        "candidates": first,
+        "clicks": len(clicked),
+        "settled": bool(np.count_nonzero(chances) == 1),
+        "refused": bool(not chances.any()),
+        "right": bool(right[chances > 0].any() and np.count_nonzero(chances) == 1),
+        "seconds": wall,
+    }
 
 
 def _is_right(est: Alignment, gt: Alignment, model: AnnotatedModel) -> bool:

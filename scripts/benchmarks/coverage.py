@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -12,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 import cadalign
-from benchmarks.section import BenchmarkData, RatioTable, Row, attempt, fitted, percent
+from benchmarks.section import BenchmarkData, Row, Tables, attempt, fitted, percent
 from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics.errors import alignment_errors
@@ -34,106 +33,114 @@ _REGIONS = ("R", "t", "lengths")
 Draw = Callable[[np.random.Generator], Problem]
 
 
-@dataclass
-class Coverage:
+def coverage(
+    given: BenchmarkData, *, problems: int = 1000, noise_px: float = 1.0, region_problems: int = 150
+) -> Tables:
     """Coverage of stated uncertainties, and how often large errors come without a warning.
 
     Problems are the simulation's (f = 150 px). An error is large from 15 deg or 25 % of a scale,
     and silent without warning and alternative.
+
+    Parameters
+    ----------
+    problems : int
+        Random problems per row.
+    noise_px : float
+        Standard deviation of the noise [px], which sigma states.
+    region_problems : int
+        Random objects in a unit cube per row of the regions.
     """
+    yield "Truths within nominal 68, 95 %", _regions(given.seed, noise_px, region_problems)
+    yield "Similar models, more and more keypoints", _similar(given.seed, region_problems)
+    yield "Errors within the 95 % ellipsoid", _coverage(given.seed, problems, noise_px)
+    title = "Large errors without a warning, and misfits found"
+    yield title, _warnings(given.seed, problems, noise_px)
 
-    problems: int = 1000
-    """Random problems per row."""
-    noise_px: float = 1.0
-    """Standard deviation of the noise [px], which sigma states."""
-    region_problems: int = 150
-    """Random objects in a unit cube per row of the regions."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        yield RatioTable("Truths within nominal 68, 95 %", list(self._regions(given.seed)))
-        yield RatioTable("Similar models, more and more keypoints", list(self._similar(given.seed)))
-        yield RatioTable("Errors within the 95 % ellipsoid", list(self._coverage(given.seed)))
-        title = "Large errors without a warning, and misfits found"
-        yield RatioTable(title, list(self._warnings(given.seed)))
+def _regions(seed: int, noise_px: float, region_problems: int) -> Iterator[Row]:
+    """Regions of rotation, translation and lengths, by what is estimated from how much."""
+    for kind in _KINDS:
+        for points in _REGION_SIZES:
+            reached = []
+            for number in range(region_problems):
+                rng = np.random.default_rng([seed, points, number])
+                found = attempt(_estimated, rng, kind, points, noise_px)
+                if found is not None:
+                    reached.append(_regions_reached(*found))
+            row: Row = {"estimate": kind, "keypoints": points, "results": len(reached)}
+            if reached:  # not all were refused
+                for name, levels in zip(_REGIONS, np.transpose(reached), strict=True):
+                    shares = (percent(levels <= share) for share in (0.68, 0.95))
+                    row[name] = ", ".join(f"{share:.0f}" for share in shares)
+            yield row
 
-    def _regions(self, seed: int) -> Iterator[Row]:
-        """Regions of rotation, translation and lengths, by what is estimated from how much."""
-        for kind in _KINDS:
-            for points in _REGION_SIZES:
-                reached = []
-                for number in range(self.region_problems):
+
+def _similar(seed: int, region_problems: int) -> Iterator[Row]:
+    """Bias of the distance, in stated standard deviations, rotations and translations."""
+    for stretch in ("free", "none"):
+        for shape_sigma in _SHAPE_SIGMAS:
+            for points in _SIMILAR_SIZES:
+                found = []
+                for number in range(region_problems):
                     rng = np.random.default_rng([seed, points, number])
-                    found = attempt(_estimated, rng, kind, points, self.noise_px)
-                    if found is not None:
-                        reached.append(_regions_reached(*found))
-                row: Row = {"estimate": kind, "keypoints": points, "results": len(reached)}
-                if reached:  # not all were refused
-                    for name, levels in zip(_REGIONS, np.transpose(reached), strict=True):
-                        shares = (percent(levels <= share) for share in (0.68, 0.95))
-                        row[name] = ", ".join(f"{share:.0f}" for share in shares)
-                yield row
+                    similar = attempt(_similar_estimate, rng, shape_sigma, stretch, points)
+                    if similar is not None:
+                        found.append(similar)
+                bias, stated, turn, level = np.array(found).T
+                within = ", ".join(f"{percent(level <= p):.0f}" for p in (0.68, 0.95))
+                yield {
+                    "stretch": stretch,
+                    "shape_sigma": shape_sigma,
+                    "keypoints": points,
+                    "log distance": float(bias.mean()),
+                    "stated": float(np.sqrt((stated**2).mean())),
+                    "R deg": float(np.median(turn)),
+                    "t within 68, 95 %": within,
+                }
 
-    def _similar(self, seed: int) -> Iterator[Row]:
-        """Bias of the distance, in stated standard deviations, rotations and translations."""
-        for stretch in ("free", "none"):
-            for shape_sigma in _SHAPE_SIGMAS:
-                for points in _SIMILAR_SIZES:
-                    found = []
-                    for number in range(self.region_problems):
-                        rng = np.random.default_rng([seed, points, number])
-                        similar = attempt(_similar_estimate, rng, shape_sigma, stretch, points)
-                        if similar is not None:
-                            found.append(similar)
-                    bias, stated, turn, level = np.array(found).T
-                    within = ", ".join(f"{percent(level <= p):.0f}" for p in (0.68, 0.95))
-                    yield {
-                        "stretch": stretch,
-                        "shape_sigma": shape_sigma,
-                        "keypoints": points,
-                        "log distance": float(bias.mean()),
-                        "stated": float(np.sqrt((stated**2).mean())),
-                        "R deg": float(np.median(turn)),
-                        "t within 68, 95 %": within,
-                    }
 
-    def _coverage(self, seed: int) -> Iterator[Row]:
-        for sigma, loss in ((self.noise_px, "linear"), (None, "linear"), (None, "cauchy")):
-            for points in _CALIBRATED_SIZES[1:]:
-                draw = partial(simulate_problem, points=points, noise_px=self.noise_px)
-                held = [
-                    [
-                        _holds(result, problem.alignment, result.fisher_covariance),
-                        _holds(result, problem.alignment, result.covariance),
-                        not result.alternatives,
-                    ]
-                    for problem, result in self._fits(seed, draw, sigma=sigma, loss=loss)
+def _coverage(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
+    for sigma, loss in ((noise_px, "linear"), (None, "linear"), (None, "cauchy")):
+        for points in _CALIBRATED_SIZES[1:]:
+            draw = partial(simulate_problem, points=points, noise_px=noise_px)
+            held = [
+                [
+                    _holds(result, problem.alignment, result.fisher_covariance),
+                    _holds(result, problem.alignment, result.covariance),
+                    not result.alternatives,
                 ]
-                names = ("inverse Fisher %", "stated %", "no alternative %")
-                row = {"sigma": str(sigma), "loss": loss, "keypoints": points}
-                yield row | dict(zip(names, map(percent, np.transpose(held)), strict=True))
+                for problem, result in _fits(seed, draw, sigma=sigma, loss=loss, problems=problems)
+            ]
+            names = ("inverse Fisher %", "stated %", "no alternative %")
+            row = {"sigma": str(sigma), "loss": loss, "keypoints": points}
+            yield row | dict(zip(names, map(percent, np.transpose(held)), strict=True))
 
-    def _warnings(self, seed: int) -> Iterator[Row]:
-        for name, draw, options in _warned_cases(self.noise_px):
-            fits = list(self._fits(seed, draw, **options))
-            large = [result for problem, result in fits if _is_large(result, problem.alignment)]
-            silent = sum(not result.warnings and not result.alternatives for result in large)
-            misfits = sum(result.misfit is not None for _, result in fits)
-            yield {
-                "data": name,
-                "fits": len(fits),
-                "large errors": len(large),
-                "silent": silent,
-                "silent %": 100 * silent / max(len(large), 1),
-                "misfits %": 100 * misfits / max(len(fits), 1),
-            }
 
-    def _fits(self, seed: int, draw: Draw, **options: Any) -> Iterator[tuple[Problem, Result]]:
-        """Problems with their fits; those that are refused are left out."""
-        for number in range(self.problems):
-            problem = draw(np.random.default_rng([seed, number]))
-            result = fitted(problem, **options)
-            if result is not None:
-                yield problem, result
+def _warnings(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
+    for name, draw, options in _warned_cases(noise_px):
+        fits = list(_fits(seed, draw, **options, problems=problems))
+        large = [result for problem, result in fits if _is_large(result, problem.alignment)]
+        silent = sum(not result.warnings and not result.alternatives for result in large)
+        misfits = sum(result.misfit is not None for _, result in fits)
+        yield {
+            "data": name,
+            "fits": len(fits),
+            "large errors": len(large),
+            "silent": silent,
+            "silent %": 100 * silent / max(len(large), 1),
+            "misfits %": 100 * misfits / max(len(fits), 1),
+        }
+
+
+def _fits(
+    seed: int, draw: Draw, *, problems: int, **options: Any
+) -> Iterator[tuple[Problem, Result]]:
+    """Problems with their fits; those that are refused are left out."""
+    for number in range(problems):
+        problem = draw(np.random.default_rng([seed, number]))
+        result = fitted(problem, **options)
+        if result is not None:
+            yield problem, result
 
 
 def _estimated(

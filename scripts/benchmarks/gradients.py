@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmarks.section import (
-    BenchmarkData,
-    NotGivenError,
-    RatioTable,
-    Row,
-    figure,
-    medians_in_turns,
-)
+from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables, figure, medians_in_turns
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
@@ -41,59 +34,65 @@ def _drawn(rng: np.random.Generator, problems: int, points: int) -> tuple[list[P
     return drawn, *map(tensor, parts)
 
 
-@dataclass
-class TorchLayer:
+def torch_layer(
+    given: BenchmarkData,
+    *,
+    problems: int = 1000,
+    points: int = 10,
+    repeats: int = 7,
+    iterations: int = 5,
+) -> Tables:
     """Forward and backward pass of a batch of fits, beside Gauss-Newton unrolled in PyTorch.
 
     The unrolled one starts from the fit itself, perturbed: it searches nothing. Where PyPose is
     installed, its EPnP of the models, stretched as they truly are, stands beside them.
+
+    Parameters
+    ----------
+    problems : int
+        Problems of a batch.
+    points : int
+        Keypoints of each.
+    repeats : int
+        Passes whose median counts.
+    iterations : int
+        Steps of the unrolled Gauss-Newton.
     """
+    torch = _torch()
+    from cadalign.torch import fit
 
-    problems: int = 1000
-    """Problems of a batch."""
-    points: int = 10
-    """Keypoints of each."""
-    repeats: int = 7
-    """Passes whose median counts."""
-    iterations: int = 5
-    """Steps of the unrolled Gauss-Newton."""
+    torch.set_num_threads(2)
+    rng = np.random.default_rng(given.seed)
+    drawn, places, pixels = _drawn(rng, problems, points)
+    camera = drawn[0].camera
+    start = fit(places, pixels, camera, workers=2)
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        torch = _torch()
-        from cadalign.torch import fit
+    def layer(seen: Any) -> Any:
+        found = fit(places, seen, camera, workers=2)
+        return found.rotation.sum() + found.translation.sum() + found.scale.sum()
 
-        torch.set_num_threads(2)
-        rng = np.random.default_rng(given.seed)
-        drawn, points, pixels = _drawn(rng, self.problems, self.points)
-        camera = drawn[0].camera
-        start = fit(points, pixels, camera, workers=2)
+    def unrolled(seen: Any) -> Any:
+        return _gauss_newton(places, seen, camera, start, iterations).sum()
 
-        def layer(seen: Any) -> Any:
-            found = fit(points, seen, camera, workers=2)
-            return found.rotation.sum() + found.translation.sum() + found.scale.sum()
+    ways = {"layer": layer, "unrolled": unrolled}
+    rigid = _pypose_solver(camera)
+    if rigid is not None:
+        scales = torch.tensor(np.array([each.alignment.scale for each in drawn]))
+        ways["PyPose"] = lambda seen: rigid(places * scales[:, None], seen).tensor().sum()
 
-        def unrolled(seen: Any) -> Any:
-            return _gauss_newton(points, seen, camera, start, self.iterations).sum()
+    def seconds_of(way: Callable[[Any], Any]) -> float:
+        seen = pixels.clone().requires_grad_()
+        begun = time.perf_counter()
+        way(seen).backward()
+        return time.perf_counter() - begun
 
-        ways = {"layer": layer, "unrolled": unrolled}
-        rigid = _pypose_solver(camera)
-        if rigid is not None:
-            scales = torch.tensor(np.array([each.alignment.scale for each in drawn]))
-            ways["PyPose"] = lambda seen: rigid(points * scales[:, None], seen).tensor().sum()
-
-        def seconds_of(way: Callable[[Any], Any]) -> float:
-            seen = pixels.clone().requires_grad_()
-            begun = time.perf_counter()
-            way(seen).backward()
-            return time.perf_counter() - begun
-
-        timed = {name: partial(seconds_of, way) for name, way in ways.items()}
-        found = medians_in_turns(timed, self.repeats)
-        name = f"{self.problems} fits of {self.points} points with gradients"
-        ratio = found["layer"] / found["unrolled"]
-        row = figure(name, 1e3 * found["layer"], "ms", ratio, "unrolled Gauss-Newton")
-        others = {f"{each}, ms": 1e3 * found[each] for each in ways if each != "layer"}
-        yield RatioTable("PyTorch", [row | others])
+    timed = {name: partial(seconds_of, way) for name, way in ways.items()}
+    found = medians_in_turns(timed, repeats)
+    name = f"{problems} fits of {points} points with gradients"
+    ratio = found["layer"] / found["unrolled"]
+    row = figure(name, 1e3 * found["layer"], "ms", ratio, "unrolled Gauss-Newton")
+    others = {f"{each}, ms": 1e3 * found[each] for each in ways if each != "layer"}
+    yield "PyTorch", [row | others]
 
 
 def _pypose_solver(camera: Camera) -> Any:
@@ -136,85 +135,85 @@ def _gauss_newton(points: Any, pixels: Any, camera: Camera, start: Any, iteratio
     return unknowns
 
 
-@dataclass
-class GradientErrors:
+def gradient_errors(
+    given: BenchmarkData, *, problems: int = 1000, points: int = 12, step: float = 1e-4
+) -> Tables:
     """Gradients beside finite differences, of well-determined problems of every kind.
 
     The gradient of a random combination of pose, stretch and focal length, along random steps of
     all pixels, relative to the root mean square of such products. Well-determined are problems
     whose rotation is known to 10 degrees; of learned shapes, all with a solution.
+
+    Parameters
+    ----------
+    problems : int
+        Problems of each kind.
+    points : int
+        Keypoints of each.
+    step : float
+        Step of the differences [px].
     """
+    torch = _torch()
+    from cadalign.torch import align, fit
 
-    problems: int = 1000
-    """Problems of each kind."""
-    points: int = 12
-    """Keypoints of each."""
-    step: float = 1e-4
-    """Step of the differences [px]."""
+    rng = np.random.default_rng(given.seed)
+    drawn, places, pixels = _drawn(rng, problems, points)
+    camera = drawn[0].camera
+    kinds: dict[str, dict[str, Any]] = {
+        "stretch": {},
+        "no stretch": {"stretch": "none"},
+        "prior on the stretch": {"stretch_sigma": 0.2},
+        "huber": {"loss": "huber"},
+        "cauchy": {"loss": "cauchy"},
+        "unknown focal length": {"focal": "estimate"},
+    }
+    rows = [
+        _row(name, partial(fit, places, camera=camera, **options), pixels, rng, step)
+        for name, options in kinds.items()
+    ]
+    mean = rng.uniform(-1, 1, (points, 3))
+    modes = 0.1 * rng.standard_normal((3, points, 3))
+    shape = ShapeModel.from_basis(mean, modes, np.ones(3), residual_sigma=0.01)
+    weights = rng.standard_normal((problems, 3, 1, 1))
+    objects = mean + (weights * modes).sum(axis=1)
+    poses = [replace(each.alignment, scale=np.ones(3)) for each in drawn]
+    pairs = zip(poses, objects, strict=True)
+    seen = np.array([camera.project(pose.apply(own)) for pose, own in pairs])
+    noisy = torch.tensor(seen + rng.standard_normal(seen.shape))
+    for name, loss in (("learned shape", "linear"), ("learned shape, cauchy", "cauchy")):
+        rows.append(_row(name, partial(align, shape, camera=camera, loss=loss), noisy, rng, step))
+    yield "Gradients beside finite differences, relative errors", rows
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        torch = _torch()
-        from cadalign.torch import align, fit
 
-        rng = np.random.default_rng(given.seed)
-        drawn, points, pixels = _drawn(rng, self.problems, self.points)
-        camera = drawn[0].camera
-        kinds: dict[str, dict[str, Any]] = {
-            "stretch": {},
-            "no stretch": {"stretch": "none"},
-            "prior on the stretch": {"stretch_sigma": 0.2},
-            "huber": {"loss": "huber"},
-            "cauchy": {"loss": "cauchy"},
-            "unknown focal length": {"focal": "estimate"},
-        }
-        rows = [
-            self._row(name, partial(fit, points, camera=camera, **options), pixels, rng)
-            for name, options in kinds.items()
-        ]
-        mean = rng.uniform(-1, 1, (self.points, 3))
-        modes = 0.1 * rng.standard_normal((3, self.points, 3))
-        shape = ShapeModel.from_basis(mean, modes, np.ones(3), residual_sigma=0.01)
-        weights = rng.standard_normal((self.problems, 3, 1, 1))
-        objects = mean + (weights * modes).sum(axis=1)
-        poses = [replace(each.alignment, scale=np.ones(3)) for each in drawn]
-        pairs = zip(poses, objects, strict=True)
-        seen = np.array([camera.project(pose.apply(own)) for pose, own in pairs])
-        noisy = torch.tensor(seen + rng.standard_normal(seen.shape))
-        for name, loss in (("learned shape", "linear"), ("learned shape, cauchy", "cauchy")):
-            rows.append(
-                self._row(name, partial(align, shape, camera=camera, loss=loss), noisy, rng)
-            )
-        yield RatioTable("Gradients beside finite differences, relative errors", rows)
+def _row(
+    name: str, layer: Callable[..., Any], pixels: Any, rng: np.random.Generator, step: float
+) -> Row:
+    import torch
 
-    def _row(
-        self, name: str, layer: Callable[..., Any], pixels: Any, rng: np.random.Generator
-    ) -> Row:
-        import torch
+    def parts(seen: Any) -> tuple[Any, Any]:
+        found = layer(points_2d=seen)
+        focal = [] if found.focal is None else [found.focal[:, None] / 100.0]
+        flat = found.rotation.flatten(1), found.translation, found.scale, *focal
+        return torch.cat(flat, dim=1), found
 
-        def parts(seen: Any) -> tuple[Any, Any]:
-            found = layer(points_2d=seen)
-            focal = [] if found.focal is None else [found.focal[:, None] / 100.0]
-            flat = found.rotation.flatten(1), found.translation, found.scale, *focal
-            return torch.cat(flat, dim=1), found
-
-        seen = pixels.clone().requires_grad_()
-        values, found = parts(seen)
-        weights = torch.tensor(rng.standard_normal(tuple(values.shape)))
-        (values * weights).sum().backward()
-        steps = torch.tensor(rng.standard_normal(tuple(pixels.shape)))
-        after, before = (parts(pixels + sign * self.step * steps) for sign in (1.0, -1.0))
-        expected = ((after[0] - before[0]) * weights).sum(dim=1) / (2.0 * self.step)
-        slopes = (seen.grad * steps).sum(dim=(1, 2))
-        known = found.valid & after[1].valid & before[1].valid
-        if found.covariance is not None:
-            turn = found.covariance.diagonal(dim1=1, dim2=2)[:, :3].sum(dim=1).sqrt()
-            known &= turn < np.radians(_WELL_KNOWN_DEG)
-        size = seen.grad.flatten(1).norm(dim=1)
-        errors = ((slopes - expected).abs() / size)[known].detach().numpy()
-        return {
-            "kind": name,
-            "problems": int(known.sum()),
-            "median": float(np.median(errors)),
-            "99 %": float(np.quantile(errors, 0.99)),
-            "worst": float(errors.max()),
-        }
+    seen = pixels.clone().requires_grad_()
+    values, found = parts(seen)
+    weights = torch.tensor(rng.standard_normal(tuple(values.shape)))
+    (values * weights).sum().backward()
+    steps = torch.tensor(rng.standard_normal(tuple(pixels.shape)))
+    after, before = (parts(pixels + sign * step * steps) for sign in (1.0, -1.0))
+    expected = ((after[0] - before[0]) * weights).sum(dim=1) / (2.0 * step)
+    slopes = (seen.grad * steps).sum(dim=(1, 2))
+    known = found.valid & after[1].valid & before[1].valid
+    if found.covariance is not None:
+        turn = found.covariance.diagonal(dim1=1, dim2=2)[:, :3].sum(dim=1).sqrt()
+        known &= turn < np.radians(_WELL_KNOWN_DEG)
+    size = seen.grad.flatten(1).norm(dim=1)
+    errors = ((slopes - expected).abs() / size)[known].detach().numpy()
+    return {
+        "kind": name,
+        "problems": int(known.sum()),
+        "median": float(np.median(errors)),
+        "99 %": float(np.quantile(errors, 0.99)),
+        "worst": float(errors.max()),
+    }

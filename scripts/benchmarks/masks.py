@@ -16,8 +16,8 @@ from scipy.stats import chi2
 from benchmarks.section import (
     LIMIT_DRAWS,
     BenchmarkData,
-    RatioTable,
     Row,
+    Tables,
     attempt,
     clocked,
     percent,
@@ -44,118 +44,131 @@ _FILLS = ((0.75, 0.95), (0.5, 0.75), (0.25, 0.5), (0.12, 0.25))  # of the image,
 _FREE = [0, 1, 2, 3, 4, 5, 7, 8]  # of a covariance, where x is known
 
 
-@dataclass
-class Masks:
+def masks(
+    given: BenchmarkData,
+    *,
+    views: int = 2,
+    kinds: tuple[str, ...] = (*DAMAGES, "border"),
+    neighbours: int = 40,
+    optima: int = 0,
+) -> Tables:
     """Medians with masks and without, and of the bound of Cramer and Rao for both together.
 
     Views of models with meshes, stretched by 0.5 to 2, their visible keypoints with noise of 1 px,
     and masks of 640 x 480 pixels. The bound has the noise and correlation that the contour has at
     the true alignment. The sample dataset, and KeypointNet's models beside ShapeNet's meshes.
+
+    Parameters
+    ----------
+    views : int
+        Views of every model.
+    kinds : tuple[str, ...]
+        Kinds of masks.
+    neighbours : int
+        Masks of neighbouring objects.
+    optima : int
+        Problems at every distance, whose ends of the refinement are compared with the truth.
     """
-
-    views: int = 2
-    """Views of every model."""
-    kinds: tuple[str, ...] = (*DAMAGES, "border")
-    """Kinds of masks."""
-    neighbours: int = 40
-    """Masks of neighbouring objects."""
-    optima: int = 0
-    """Problems at every distance, whose ends of the refinement are compared with the truth."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        cases = _cases_of(given, self.views)
-        rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
-        yield RatioTable(f"masks, {len(cases)} views: medians", rows)
-        if self.neighbours:
-            yield RatioTable("masks of neighbouring objects", [self._neighbours(cases, given.seed)])
-        if self.optima:
-            models = _models_of(given)
-            ends = [_ends_of(models, fill, self.optima, given.seed) for fill in _FILLS]
-            yield RatioTable("exact masks, seen from anywhere", ends)
-
-    def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
-        """Medians over all views for one kind of mask."""
-        alone, joint, bounds, bottles, further = [], [], [], [], []
-        for case, mask, rng in _damaged(cases, kind, seed):
-            without = attempt(align, case.model, case.view(None))
-            view = case.view(mask)
-            wall, _, result = clocked(partial(attempt, align, case.model, view))
-            if without is None or result is None:
-                print(kind, case.annotated.model_id, "is refused")
-                continue
-            alone.append(case.errors(without.alignment))
-            joint.append(case.errors(result.alignment))
-            bounds += case.ideal_errors(contour_bound(case.model, view, case.truth), rng)
-            (residuals,) = result.mask_residuals
-            further.append((residuals.sigma, not residuals.is_used, wall))
-            bottles.append(case.annotated.category.endswith("bottle"))
-        row: Row = {"mask": kind}
-        for suffix, errors in {"keypoints": alone, "mask": joint, "bound": bounds}.items():
-            for name, median in zip(_ERRORS, np.median(errors, axis=0).tolist(), strict=True):
-                row[f"{name} {suffix}"] = median
-        of_bottles = np.array(joint)[bottles, 2]
-        sigmas, left_out, walls = np.transpose(further)
-        return row | {
-            "R ratio": row["R mask"] / row["R keypoints"],
-            "IoU bottles": float(np.median(of_bottles)) if len(of_bottles) else None,
-            "sigma": float(np.nanmedian(sigmas)),
-            "left out": int(left_out.sum()),
-            "seconds": float(np.median(walls)),
-        }
-
-    def _neighbours(self, cases: list[_Case], seed: int) -> Row:
-        """Rate at which a neighbouring object's mask is named, and its effect on the estimate."""
-        named, ratios = [], []
-        for number in range(self.neighbours):
-            rng = np.random.default_rng([seed, 2, number])
-            case, other = cases[number % len(cases)], cases[int(rng.integers(len(cases)))]
-            mask = _beside(other.mask, case.mask, rng)
-            if mask is None:
-                continue
-            alone = case.errors(align(case.model, case.view(None)).alignment)
-            result = align(case.model, case.view(mask))
-            named.append(any("views[0].mask" in text for text in result.warnings))
-            ratios.append(case.errors(result.alignment)[0] / alone[0])
-        return {
-            "named": float(np.mean(named)),
-            "R ratio": float(np.median(ratios)),
-            "largest R ratio": float(np.max(ratios)),
-            "count": len(named),
-        }
+    cases = _cases_of(given, views)
+    rows = [_measure(cases, kind, given.seed) for kind in kinds]
+    yield f"masks, {len(cases)} views: medians", rows
+    if neighbours:
+        yield "masks of neighbouring objects", [_neighbours(cases, given.seed, neighbours)]
+    if optima:
+        models = _models_of(given)
+        ends = [_ends_of(models, fill, optima, given.seed) for fill in _FILLS]
+        yield "exact masks, seen from anywhere", ends
 
 
-@dataclass
-class MaskAlone:
+def _measure(cases: list[_Case], kind: str, seed: int) -> Row:
+    """Medians over all views for one kind of mask."""
+    alone, joint, bounds, bottles, further = [], [], [], [], []
+    for case, mask, rng in _damaged(cases, kind, seed):
+        without = attempt(align, case.model, case.view(None))
+        view = case.view(mask)
+        wall, _, result = clocked(partial(attempt, align, case.model, view))
+        if without is None or result is None:
+            print(kind, case.annotated.model_id, "is refused")
+            continue
+        alone.append(case.errors(without.alignment))
+        joint.append(case.errors(result.alignment))
+        bounds += case.ideal_errors(contour_bound(case.model, view, case.truth), rng)
+        (residuals,) = result.mask_residuals
+        further.append((residuals.sigma, not residuals.is_used, wall))
+        bottles.append(case.annotated.category.endswith("bottle"))
+    row: Row = {"mask": kind}
+    for suffix, errors in {"keypoints": alone, "mask": joint, "bound": bounds}.items():
+        for name, median in zip(_ERRORS, np.median(errors, axis=0).tolist(), strict=True):
+            row[f"{name} {suffix}"] = median
+    of_bottles = np.array(joint)[bottles, 2]
+    sigmas, left_out, walls = np.transpose(further)
+    return row | {
+        "R ratio": row["R mask"] / row["R keypoints"],
+        "IoU bottles": float(np.median(of_bottles)) if len(of_bottles) else None,
+        "sigma": float(np.nanmedian(sigmas)),
+        "left out": int(left_out.sum()),
+        "seconds": float(np.median(walls)),
+    }
+
+
+def _neighbours(cases: list[_Case], seed: int, neighbours: int) -> Row:
+    """Rate at which a neighbouring object's mask is named, and its effect on the estimate."""
+    named, ratios = [], []
+    for number in range(neighbours):
+        rng = np.random.default_rng([seed, 2, number])
+        case, other = cases[number % len(cases)], cases[int(rng.integers(len(cases)))]
+        mask = _beside(other.mask, case.mask, rng)
+        if mask is None:
+            continue
+        alone = case.errors(align(case.model, case.view(None)).alignment)
+        result = align(case.model, case.view(mask))
+        named.append(any("views[0].mask" in text for text in result.warnings))
+        ratios.append(case.errors(result.alignment)[0] / alone[0])
+    return {
+        "named": float(np.mean(named)),
+        "R ratio": float(np.median(ratios)),
+        "largest R ratio": float(np.max(ratios)),
+        "count": len(named),
+    }
+
+
+def mask_alone(
+    given: BenchmarkData,
+    *,
+    views: int = 3,
+    kinds: tuple[str, ...] = ("exact", "dilated", "smoothed", "hidden", "border"),
+) -> Tables:
     """The own model, of unknown stretch, from a mask without keypoints.
 
     Right is an estimate within 10 degrees and 15 % of stretch, up to the model's symmetry; of a
     model that is round about an axis, up to its size as well.
+
+    Parameters
+    ----------
+    views : int
+        Views of every model.
+    kinds : tuple[str, ...]
+        Kinds of masks.
     """
+    cases = _cases_of(given, views)
+    rows = [_alone(cases, kind, given.seed) for kind in kinds]
+    yield f"a mask alone, {len(cases)} views", rows
 
-    views: int = 3
-    """Views of every model."""
-    kinds: tuple[str, ...] = ("exact", "dilated", "smoothed", "hidden", "border")
-    """Kinds of masks."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        cases = _cases_of(given, self.views)
-        rows = [self._measure(cases, kind, given.seed) for kind in self.kinds]
-        yield RatioTable(f"a mask alone, {len(cases)} views", rows)
-
-    def _measure(self, cases: list[_Case], kind: str, seed: int) -> Row:
-        found = []
-        for case, mask, _ in _damaged(cases, kind, seed):
-            model = Model(mesh=case.scene.mesh, symmetry=case.annotated.symmetry)
-            view = View(case.camera, mask=mask)
-            wall, _, result = clocked(partial(attempt, align, model, view))
-            if result is None:
-                print(kind, case.annotated.model_id, "is refused")
-                found.append({"first": False, "among five": False, "seconds": np.nan})
-                continue
-            poses = [result.alignment, *(each.alignment for each in result.alternatives[:4])]
-            right = [case.is_right(pose) for pose in poses]
-            found.append({"first": right[0], "among five": any(right), "seconds": wall})
-        return {"mask": kind, **summary(found)}
+def _alone(cases: list[_Case], kind: str, seed: int) -> Row:
+    found = []
+    for case, mask, _ in _damaged(cases, kind, seed):
+        model = Model(mesh=case.scene.mesh, symmetry=case.annotated.symmetry)
+        view = View(case.camera, mask=mask)
+        wall, _, result = clocked(partial(attempt, align, model, view))
+        if result is None:
+            print(kind, case.annotated.model_id, "is refused")
+            found.append({"first": False, "among five": False, "seconds": np.nan})
+            continue
+        poses = [result.alignment, *(each.alignment for each in result.alternatives[:4])]
+        right = [case.is_right(pose) for pose in poses]
+        found.append({"first": right[0], "among five": any(right), "seconds": wall})
+    return {"mask": kind, **summary(found)}
 
 
 @dataclass(frozen=True)

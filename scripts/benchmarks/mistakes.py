@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.section import BenchmarkData, RatioTable, Row, percent
+from benchmarks.section import BenchmarkData, Row, Tables, percent
 from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
@@ -55,40 +53,45 @@ class SeenModel(NamedTuple):
         return self._replace(points_2d=pixels)
 
 
-@dataclass
-class Mistakes:
+def mistakes(
+    given: BenchmarkData,
+    *,
+    problems: int = 300,
+    similar: int = 100,
+    categories: tuple[str, ...] = ("chair", "bottle", "airplane", "mug", "bathtub", "guitar"),
+    shape_sigma: float = 0.02,
+) -> Tables:
     """Shares of mistakes that stay unnoticed, and of right keypoints that raise an alarm [%].
 
     Keypoints of KeypointNet's models, stretched, with 1 px of noise. Unnoticed is an estimate
     without a warning but for uncertainties, and with a rotation that is more than 10 degrees off.
+
+    Parameters
+    ----------
+    problems : int
+        Problems of every category and mistake.
+    similar : int
+        The same of models that are only similar, which take longer.
+    categories : tuple[str, ...]
+        Categories of KeypointNet.
+    shape_sigma : float
+        Displacement of the keypoints of similar models, in diagonals.
     """
+    own = [_row(given, each, problems) for each in categories]
+    yield f"mistakes, {problems} problems each: %", own
+    if similar:
+        sigma = shape_sigma
+        rows = [_row(given, each, similar, sigma) for each in categories]
+        title = f"of similar models, shape_sigma {sigma:g}, {similar} each: %"
+        yield title, rows
 
-    problems: int = 300
-    """Problems of every category and mistake."""
-    similar: int = 100
-    """The same of models that are only similar, which take longer."""
-    categories: tuple[str, ...] = ("chair", "bottle", "airplane", "mug", "bathtub", "guitar")
-    """Categories of KeypointNet."""
-    shape_sigma: float = 0.02
-    """Displacement of the keypoints of similar models, in diagonals."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        own = [self._row(given, each, self.problems) for each in self.categories]
-        yield RatioTable(f"mistakes, {self.problems} problems each: %", own)
-        if self.similar:
-            sigma = self.shape_sigma
-            similar = [self._row(given, each, self.similar, sigma) for each in self.categories]
-            title = f"of similar models, shape_sigma {sigma:g}, {self.similar} each: %"
-            yield RatioTable(title, similar)
-
-    def _row(
-        self, given: BenchmarkData, category: str, problems: int, shape_sigma: float = 0.0
-    ) -> Row:
-        path = given.needed() / "annotations" / f"{category}.json"
-        models = json.loads(path.read_text(encoding="utf-8"))
-        points = [np.array([each["xyz"] for each in model["keypoints"]]) for model in models]
-        points = [each for each in points if len(each) >= _FEWEST]
-        return {"category": category, **_shares(points, given.seed, problems, shape_sigma)}
+def _row(given: BenchmarkData, category: str, problems: int, shape_sigma: float = 0.0) -> Row:
+    path = given.needed() / "annotations" / f"{category}.json"
+    models = json.loads(path.read_text(encoding="utf-8"))
+    points = [np.array([each["xyz"] for each in model["keypoints"]]) for model in models]
+    points = [each for each in points if len(each) >= _FEWEST]
+    return {"category": category, **_shares(points, given.seed, problems, shape_sigma)}
 
 
 def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: float) -> Row:

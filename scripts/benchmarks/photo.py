@@ -17,8 +17,8 @@ from scipy.stats import chi2
 
 from benchmarks.section import (
     BenchmarkData,
-    RatioTable,
     Row,
+    Tables,
     attempt,
     clocked,
     processor_seconds,
@@ -46,69 +46,67 @@ _WORSE_DEG = 1.0
 _INNER = 0.95  # probability of the regions whose coverage is counted
 
 
-@dataclass
-class Photos:
+def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> Tables:
     """Rough clicks alone, and with the photo.
 
     Six clicks with an error of 4 px in a photo 640 px wide. Composites are models of ShapeNet and
     of the sample dataset, rendered before real photos with varied light, blur and noise, a quarter
     of them partly hidden; their truth is exact. Real photos are those of HANDAL, LINEMOD and
     Linemod-Occluded, whose stated truth is off by some pixels in places.
+
+    Parameters
+    ----------
+    composites : int
+        Number of composites.
+    draws : int
+        Draws of the clicks on every real photo.
     """
-
-    composites: int = 200
-    """Number of composites."""
-    draws: int = 10
-    """Draws of the clicks on every real photo."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        cases = [(case, 1) for case in _composites(given, self.composites)]
-        cases += [(case, self.draws) for case in bop_cases(given)]
-        cases += [(case, max(self.draws // 5, 1)) for case in _occluded_cases(given)]
-        for stretched in (False, True):
-            rows: dict[str, list[Row]] = defaultdict(list)
-            for number, (case, draws) in enumerate(cases):
-                for draw in range(draws):
-                    rng = np.random.default_rng([given.seed, 3, number, draw])
-                    clicks = case.clicked(rng, stretched=stretched)
-                    rows[f"{case.group} {case.kind}"].append(_compared(clicks))
-            title = "an unknown stretch" if stretched else "a rigid model"
-            table = [{"photos": name, **summary(found)} for name, found in rows.items()]
-            yield RatioTable(f"photos beside rough clicks, {title}: medians", table)
+    cases = [(case, 1) for case in _composites(given, composites)]
+    cases += [(case, draws) for case in bop_cases(given)]
+    cases += [(case, max(draws // 5, 1)) for case in _occluded_cases(given)]
+    for stretched in (False, True):
+        rows: dict[str, list[Row]] = defaultdict(list)
+        for number, (case, times) in enumerate(cases):
+            for draw in range(times):
+                rng = np.random.default_rng([given.seed, 3, number, draw])
+                clicks = case.clicked(rng, stretched=stretched)
+                rows[f"{case.group} {case.kind}"].append(_compared(clicks))
+        title = "an unknown stretch" if stretched else "a rigid model"
+        table = [{"photos": name, **summary(found)} for name, found in rows.items()]
+        yield f"photos beside rough clicks, {title}: medians", table
 
 
-@dataclass
-class PhotoTimes:
+def photo_times(given: BenchmarkData, *, composites: int = 12, frames: int = 40) -> Tables:
     """Time [s of a processor] that a photo takes beyond the keypoints, and a track by photos alone.
 
     Composites of 2 megapixels with six rough clicks; and a clip of 640 x 480 px in which an object
     turns by 2 degrees and moves by 1 % of its distance from frame to frame, each frame aligned from
     the pose of the last by its photo alone.
+
+    Parameters
+    ----------
+    composites : int
+        Composites of 2 megapixels.
+    frames : int
+        Frames of each clip; there is one of each category.
     """
-
-    composites: int = 12
-    """Composites of 2 megapixels."""
-    frames: int = 40
-    """Frames of each clip; there is one of each category."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        rows: dict[str, list[Row]] = defaultdict(list)
-        for number, case in enumerate(_composites(given, self.composites, _LARGE)):
-            for stretched in (False, True):
-                rng = np.random.default_rng([given.seed, 7, number])
-                clicks = case.clicked(rng, stretched=stretched)
-                first = processor_seconds(clicks.aligned)
-                row, second = _compared(clicks), -first
-                second += processor_seconds(partial(clicks.aligned, image=case.pixels))
-                kept = {name: row[name] for name in ("R clicks", "R photo", "seconds")}
-                rows["stretched" if stretched else "rigid"].append(kept | {"processor": second})
-        table = []
-        for name, found in rows.items():
-            late = float(np.percentile([row["processor"] for row in found], 90))
-            table.append({"model": name, **summary(found), "processor, 90 %": late})
-        yield RatioTable("photos of 2 megapixels beside six clicks: medians", table)
-        clips = list(_clip_rows(given, self.frames)) if self.frames else []
-        yield RatioTable("a track by photos of 640 x 480 px", clips)
+    rows: dict[str, list[Row]] = defaultdict(list)
+    for number, case in enumerate(_composites(given, composites, _LARGE)):
+        for stretched in (False, True):
+            rng = np.random.default_rng([given.seed, 7, number])
+            clicks = case.clicked(rng, stretched=stretched)
+            first = processor_seconds(clicks.aligned)
+            row, second = _compared(clicks), -first
+            second += processor_seconds(partial(clicks.aligned, image=case.pixels))
+            kept = {name: row[name] for name in ("R clicks", "R photo", "seconds")}
+            rows["stretched" if stretched else "rigid"].append(kept | {"processor": second})
+    table = []
+    for name, found in rows.items():
+        late = float(np.percentile([row["processor"] for row in found], 90))
+        table.append({"model": name, **summary(found), "processor, 90 %": late})
+    yield "photos of 2 megapixels beside six clicks: medians", table
+    clips = list(_clip_rows(given, frames)) if frames else []
+    yield "a track by photos of 640 x 480 px", clips
 
 
 def _compared(clicks: PhotoClicks) -> Row:

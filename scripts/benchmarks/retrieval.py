@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import chain, islice
 from pathlib import Path
@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from benchmarks import section
-from benchmarks.section import BenchmarkData, RatioTable, Row
+from benchmarks.section import BenchmarkData, Row, Table, Tables
 from cadalign import Box, Camera, Library, Observation, ShapeModel
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -35,90 +35,95 @@ _MASK_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _SAMPLE_CATEGORIES = 4
 
 
-@dataclass
-class Retrieval:
+def retrieval(
+    given: BenchmarkData,
+    *,
+    queries: int = 20,
+    sizes: tuple[int, ...] = (50_000,),
+    run_queries: int = 1000,
+) -> Tables:
     """Time of a query and memory, for real models and growing synthetic libraries.
 
     The synthetic models are the real ones with their keypoints moved by 3 % of the extent, models
     of all categories are compared. Times are the least of three calls with as many threads as there
     are cores, after warm-up. Ratios are those of processor time to `reference_seconds`.
+
+    Parameters
+    ----------
+    queries : int
+        Timed queries per size of the library and noise.
+    sizes : tuple[int, ...]
+        Models of the libraries that are filled up with synthetic ones; a curve: 1000 10000 50000
+        200000.
+    run_queries : int
+        Queries of a run of `cadalign retrieve` by two processes, for each of these sizes.
     """
+    real = list(Library.from_dataset(KeypointNet(given.needed())))
+    mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
+    for size in (len(real), *sizes):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "library")
+            _jittered(mixed, size).save(path)
+            yield _measure(path, mixed[:size], queries)
+            if size in sizes:
+                yield "Queries as a run", [_run(path, mixed[:size], run_queries)]
 
-    queries: int = 20
-    """Timed queries per size of the library and noise."""
-    sizes: tuple[int, ...] = (50_000,)
-    """Models of the libraries that are filled up with synthetic ones; a curve: 1000 10000 50000
-    200000."""
-    run_queries: int = 1000
-    """Queries of a run of `cadalign retrieve` by two processes, for each of these sizes."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        real = list(Library.from_dataset(KeypointNet(given.needed())))
-        mixed = [real[k] for k in np.random.default_rng(0).permutation(len(real)).tolist()]
-        for size in (len(real), *self.sizes):
-            with tempfile.TemporaryDirectory() as folder:
-                path = Path(folder, "library")
-                _jittered(mixed, size).save(path)
-                yield self._measure(path, mixed[:size])
-                if size in self.sizes:
-                    yield RatioTable("Queries as a run", [self._run(path, mixed[:size])])
+def _measure(path: Path, models: Sequence[LibraryModel], queries: int) -> Table:
+    """Opening, and queries of three levels of noise."""
+    reference = section.reference_seconds()
+    wall, busy, library = section.clocked(partial(Library.open, path))
+    size = f"{len(library):,}"
+    rows = [section.figure(f"opening {size} models", 1e3 * wall, "ms", busy / reference)]
+    shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
+    warm_up = next(_observed(shown, 1.0, seed=1), None)
+    if warm_up is None:
+        raise SystemExit("no model shows enough keypoints")
+    _retrieve(library, warm_up[1], 1.0)
+    for noise_px in (1.0, 3.0, 5.0):
+        rows += _queries(library, shown, noise_px, queries)
+    return f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows
 
-    def _measure(self, path: Path, models: Sequence[LibraryModel]) -> RatioTable:
-        """Opening, and queries of three levels of noise."""
-        reference = section.reference_seconds()
-        wall, busy, library = section.clocked(partial(Library.open, path))
-        size = f"{len(library):,}"
-        rows = [section.figure(f"opening {size} models", 1e3 * wall, "ms", busy / reference)]
-        shown = [model for model in models if len(model.xyz) >= _KEYPOINTS]
-        warm_up = next(_observed(shown, 1.0, seed=1), None)
-        if warm_up is None:
-            raise SystemExit("no model shows enough keypoints")
-        _retrieve(library, warm_up[1], 1.0)
-        for noise_px in (1.0, 3.0, 5.0):
-            rows += self._queries(library, shown, noise_px)
-        return RatioTable(f"{size} models, {path.stat().st_size / 1e6:.1f} MB", rows)
 
-    def _run(self, path: Path, models: Sequence[LibraryModel]) -> Row:
-        """Queries a second of a whole run, start and table included."""
-        seeds = range(1 + self.run_queries)  # each model may show enough keypoints once only
-        found = chain.from_iterable(_observed(models, 1.0, seed=seed) for seed in seeds)
-        file = path.with_name("queries.jsonl")
-        with file.open("wb") as queries:
-            for _, seen in islice(found, self.run_queries):
-                points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.ids)
-                query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
-                queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
-        command = ["retrieve", str(file), f"--library={path}", f"--out={path.with_name('run')}"]
-        reference = section.reference_seconds()
-        used = section.used_by_command([*command, "--no-picture", "--workers=2"])
+def _run(path: Path, models: Sequence[LibraryModel], run_queries: int) -> Row:
+    """Queries a second of a whole run, start and table included."""
+    seeds = range(1 + run_queries)  # each model may show enough keypoints once only
+    found = chain.from_iterable(_observed(models, 1.0, seed=seed) for seed in seeds)
+    file = path.with_name("queries.jsonl")
+    with file.open("wb") as queries:
+        for _, seen in islice(found, run_queries):
+            points, ids = np.zeros((len(seen.points_2d), 3)), np.asarray(seen.ids)
+            query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
+            queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
+    command = ["retrieve", str(file), f"--library={path}", f"--out={path.with_name('run')}"]
+    reference = section.reference_seconds()
+    used = section.used_by_command([*command, "--no-picture", "--workers=2"])
+    reference = min(reference, section.reference_seconds())
+    name = f"run of {run_queries:,} queries, two processes"
+    row = section.figure(name, run_queries / used.wall, "1/s", used.processor / reference)
+    return row | {"MB": used.megabytes}
+
+
+def _queries(
+    library: Library, models: Sequence[LibraryModel], noise_px: float, queries: int
+) -> list[Row]:
+    """Median and longest time of queries for some of the models."""
+    wall, busy, found = [], [], 0
+    reference = section.reference_seconds()
+    for model, seen in islice(_observed(models, noise_px, seed=0), queries):
+        call = partial(_retrieve, library, seen, noise_px)
+        walls, busies, matches = zip(*(section.clocked(call) for _ in range(_CALLS)), strict=True)
+        wall.append(1e3 * min(walls))
+        busy.append(1e3 * min(busies))
         reference = min(reference, section.reference_seconds())
-        name = f"run of {self.run_queries:,} queries, two processes"
-        row = section.figure(name, self.run_queries / used.wall, "1/s", used.processor / reference)
-        return row | {"MB": used.megabytes}
-
-    def _queries(
-        self, library: Library, models: Sequence[LibraryModel], noise_px: float
-    ) -> list[Row]:
-        """Median and longest time of queries for some of the models."""
-        wall, busy, found = [], [], 0
-        reference = section.reference_seconds()
-        for model, seen in islice(_observed(models, noise_px, seed=0), self.queries):
-            call = partial(_retrieve, library, seen, noise_px)
-            walls, busies, matches = zip(
-                *(section.clocked(call) for _ in range(_CALLS)), strict=True
-            )
-            wall.append(1e3 * min(walls))
-            busy.append(1e3 * min(busies))
-            reference = min(reference, section.reference_seconds())
-            first = matches[0][0]
-            found += (first.category, first.model_id) == model.key
-        name = f"query among {len(library):,}, {noise_px:g} px"
-        own = {"found first": f"{found} of {len(wall)}"}
-        return [
-            section.figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference))
-            | own
-            for which, take in (("median", np.median), ("longest", max))
-        ]
+        first = matches[0][0]
+        found += (first.category, first.model_id) == model.key
+    name = f"query among {len(library):,}, {noise_px:g} px"
+    own = {"found first": f"{found} of {len(wall)}"}
+    return [
+        section.figure(f"{name}, {which}", take(wall), "ms", take(busy) / (1e3 * reference)) | own
+        for which, take in (("median", np.median), ("longest", max))
+    ]
 
 
 def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
@@ -149,58 +154,58 @@ def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
     return library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
 
 
-@dataclass
-class MaskRetrieval:
+def mask_retrieval(
+    given: BenchmarkData, *, sizes: tuple[int, ...] = (100, 1000), queries: int = 30
+) -> Tables:
     """Retrieval by an exact mask alone: recall and time, among growing libraries.
 
     The models are ShapeNet's and those of the sample generator. Queries are models of the library,
     stretched along y and z by 0.5 to 2, in random views of 640 x 480 px. Outlines are compared with
     the mask's, which is the cheap stage, and the best few models aligned. The first
     query makes the outlines, which the library keeps, and does not count in the other columns.
+
+    Parameters
+    ----------
+    sizes : tuple[int, ...]
+        Models of the libraries.
+    queries : int
+        Queries per library.
     """
+    with tempfile.TemporaryDirectory() as folder:
+        count = -(-max(sizes) // _SAMPLE_CATEGORIES)
+        sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=count))
+        models = [model for model in sample if model.mesh_path is not None]
+        if given.keypointnet is not None:
+            real = (m for m in KeypointNet(given.keypointnet) if m.mesh_path is not None)
+            models = [*(m for m in real if m.mesh_path.suffix == ".obj"), *models]
+        order = np.random.default_rng(given.seed).permutation(len(models)).tolist()
+        for size in sizes:
+            chosen = [models[k] for k in order[:size]]
+            yield f"by a mask alone, {size:,} models", [_queried(chosen, given, queries)]
 
-    sizes: tuple[int, ...] = (100, 1000)
-    """Models of the libraries."""
-    queries: int = 30
-    """Queries per library."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        with tempfile.TemporaryDirectory() as folder:
-            count = -(-max(self.sizes) // _SAMPLE_CATEGORIES)
-            sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=count))
-            models = [model for model in sample if model.mesh_path is not None]
-            if given.keypointnet is not None:
-                real = (m for m in KeypointNet(given.keypointnet) if m.mesh_path is not None)
-                models = [*(m for m in real if m.mesh_path.suffix == ".obj"), *models]
-            order = np.random.default_rng(given.seed).permutation(len(models)).tolist()
-            for size in self.sizes:
-                chosen = [models[k] for k in order[:size]]
-                yield RatioTable(
-                    f"by a mask alone, {size:,} models", [self._queried(chosen, given)]
-                )
-
-    def _queried(self, models: Sequence[AnnotatedModel], given: BenchmarkData) -> Row:
-        library = Library.from_models([LibraryModel.of_annotated(model) for model in models])
-        found: list[Row] = []
-        first = np.nan
-        for number in range(self.queries + 1):
-            rng = np.random.default_rng([given.seed, 6, number])
-            model = models[int(rng.integers(len(models)))]
-            mask = _stretched_mask(model, rng)
-            query = partial(library.retrieve, mask=mask, camera=_MASK_CAMERA, top=MOST_ALIGNED)
-            wall, _, matches = section.clocked(query)
-            if number == 0:
-                first = wall
-                continue
-            keys = [(match.category, match.model_id) for match in matches]
-            own = (model.category, model.model_id)
-            row: Row = {"first": keys[0] == own, "aligned": own in keys}
-            found.append(row | {"category": keys[0][0] == own[0], "seconds": wall})
-        names = ("first", "aligned", "category")
-        shares = {name: float(np.mean([row[name] for row in found])) for name in names}
-        seconds = section.spread([row["seconds"] for row in found])
-        times = {"first query s": first, "seconds": seconds}
-        return {"models": len(models), "queries": len(found), **shares, **times}
+def _queried(models: Sequence[AnnotatedModel], given: BenchmarkData, queries: int) -> Row:
+    library = Library.from_models([LibraryModel.of_annotated(model) for model in models])
+    found: list[Row] = []
+    first = np.nan
+    for number in range(queries + 1):
+        rng = np.random.default_rng([given.seed, 6, number])
+        model = models[int(rng.integers(len(models)))]
+        mask = _stretched_mask(model, rng)
+        query = partial(library.retrieve, mask=mask, camera=_MASK_CAMERA, top=MOST_ALIGNED)
+        wall, _, matches = section.clocked(query)
+        if number == 0:
+            first = wall
+            continue
+        keys = [(match.category, match.model_id) for match in matches]
+        own = (model.category, model.model_id)
+        row: Row = {"first": keys[0] == own, "aligned": own in keys}
+        found.append(row | {"category": keys[0][0] == own[0], "seconds": wall})
+    names = ("first", "aligned", "category")
+    shares = {name: float(np.mean([row[name] for row in found])) for name in names}
+    seconds = section.spread([row["seconds"] for row in found])
+    times = {"first query s": first, "seconds": seconds}
+    return {"models": len(models), "queries": len(found), **shares, **times}
 
 
 def _stretched_mask(model: AnnotatedModel, rng: np.random.Generator) -> np.ndarray:
@@ -212,71 +217,83 @@ def _stretched_mask(model: AnnotatedModel, rng: np.random.Generator) -> np.ndarr
     return np.asarray(cast_geometry(scene, _MASK_CAMERA, view.cam_from_model).mask)
 
 
-@dataclass
-class UnseenRetrieval:
+def unseen_retrieval(
+    given: BenchmarkData,
+    *,
+    categories: tuple[str, ...] = ("chair", "airplane", "bottle", "mug", "guitar"),
+    objects: int = 40,
+    keypoints: tuple[int, ...] = (0, 7),
+    noise_px: float = 2.0,
+) -> Tables:
     """Retrieval of objects that are not in the library: box IoU up to scale of the first match.
 
     Objects are those of the split val; shape models are learned from the split train. The library
     holds all models but the object's own and those that are the same after a stretch. Each row is a
     ranking: by the fit of each model, exact or with an uncertainty of its shape, and by the
     estimated shape; models are stretched, or not. Boxes are those of the keypoints.
+
+    Parameters
+    ----------
+    categories : tuple[str, ...]
+        Categories; each is a library of its own.
+    objects : int
+        Objects of each category.
+    keypoints : tuple[int, ...]
+        Numbers of given keypoints; 0 for all.
+    noise_px : float
+        Standard deviation of the keypoints, in pixels.
     """
+    dataset = KeypointNet(given.needed())
+    for category in categories:
+        shape = section.learned_shape(dataset, category)
+        for count in keypoints:
+            rows = list(_rankings(dataset, category, count, shape, objects, noise_px))
+            yield f"{category}, {count or 'all'} keypoints", rows
 
-    categories: tuple[str, ...] = ("chair", "airplane", "bottle", "mug", "guitar")
-    """Categories; each is a library of its own."""
-    objects: int = 40
-    """Objects of each category."""
-    keypoints: tuple[int, ...] = (0, 7)
-    """Numbers of given keypoints; 0 for all."""
-    noise_px: float = 2.0
-    """Standard deviation of the keypoints, in pixels."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        dataset = KeypointNet(given.needed())
-        for category in self.categories:
-            shape = section.learned_shape(dataset, category)
-            for count in self.keypoints:
-                rows = list(self._rankings(dataset, category, count, shape))
-                yield RatioTable(f"{category}, {count or 'all'} keypoints", rows)
-
-    def _rankings(
-        self, dataset: KeypointNet, category: str, count: int, shape: ShapeModel
-    ) -> Iterator[Row]:
-        """IoU and milliseconds of the queries, by ranking."""
-        models = dataset.subset(categories=[category])[category]
-        library = Library.from_models(
-            [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
+def _rankings(
+    dataset: KeypointNet,
+    category: str,
+    count: int,
+    shape: ShapeModel,
+    objects: int,
+    noise_px: float,
+) -> Iterator[Row]:
+    """IoU and milliseconds of the queries, by ranking."""
+    models = dataset.subset(categories=[category])[category]
+    library = Library.from_models(
+        [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
+    )
+    found: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    how = {"keypoints": count or None, "noise_px": noise_px}
+    for _, seen in section.unseen_objects(dataset, category, objects, **how):
+        known = np.isin(seen.ids, shape.ids)
+        gt = Box.from_model(seen.task.hull.bounds, seen.gt)
+        if known.sum() < _LEAST_SHARED or gt.volume < _FLAT:
+            continue
+        call = partial(
+            library.retrieve,
+            seen.points_2d[known],
+            seen.ids[known],
+            KEYPOINT_CAMERA,
+            top=1,
+            category=category,
+            sigma=noise_px,
+            exclude=_alike(library, (category, seen.task.model_id)),
+            workers=1,
         )
-        found: dict[str, list[tuple[float, float]]] = defaultdict(list)
-        how = {"keypoints": count or None, "noise_px": self.noise_px}
-        for _, seen in section.unseen_objects(dataset, category, self.objects, **how):
-            known = np.isin(seen.ids, shape.ids)
-            gt = Box.from_model(seen.task.hull.bounds, seen.gt)
-            if known.sum() < _LEAST_SHARED or gt.volume < _FLAT:
-                continue
-            call = partial(
-                library.retrieve,
-                seen.points_2d[known],
-                seen.ids[known],
-                KEYPOINT_CAMERA,
-                top=1,
-                category=category,
-                sigma=self.noise_px,
-                exclude=_alike(library, (category, seen.task.model_id)),
-                workers=1,
-            )
-            for name, options in _ranking_options(shape).items():
-                wall, _, matches = section.clocked(partial(section.attempt, call, **options))
-                found[name].append((_first_iou(matches, gt), 1e3 * wall))
-        for name, values in found.items():
-            ious, milliseconds = np.transpose(values)
-            yield {
-                "ranking": name,
-                "objects": len(values),
-                "median IoU": float(np.median(ious)),
-                "mean IoU": float(np.mean(ious)),
-                "ms": float(np.median(milliseconds)),
-            }
+        for name, options in _ranking_options(shape).items():
+            wall, _, matches = section.clocked(partial(section.attempt, call, **options))
+            found[name].append((_first_iou(matches, gt), 1e3 * wall))
+    for name, values in found.items():
+        ious, milliseconds = np.transpose(values)
+        yield {
+            "ranking": name,
+            "objects": len(values),
+            "median IoU": float(np.median(ious)),
+            "mean IoU": float(np.mean(ious)),
+            "ms": float(np.median(milliseconds)),
+        }
 
 
 def _ranking_options(shape: ShapeModel) -> dict[str, dict[str, Any]]:

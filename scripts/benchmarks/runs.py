@@ -9,7 +9,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from common import COMMAND
 from scipy.spatial.transform import Rotation
 
 from benchmarks import section
-from benchmarks.section import BenchmarkData, RatioTable, Row, Used
+from benchmarks.section import BenchmarkData, Row, Tables, Used
 from cadalign import Camera, RansacOptions
 from cadalign.batch.experiment import LARGEST_CHUNK
 from cadalign.datasets import Bundler, Colmap, Correspondences, KeypointNet, write_sample_dataset
@@ -80,57 +79,57 @@ def _dask_over_processes(name: str, call: list[str]) -> Row:
 # Evaluation ---------------------------------------------------------------------------------------
 
 
-@dataclass
-class Evaluation:
+def evaluation(given: BenchmarkData, *, count: int = 2000) -> Tables:
     """Instances a second by one core, and of whole runs on two.
 
     Whole runs are commands with two worker processes, or with two workers of a Dask cluster; rates
     are those of what a longer run does more than a shorter one: neither start nor figures are in
     them. Ratios are processor time over `reference_seconds`; Dask's is its time over that of
     processes.
+
+    Parameters
+    ----------
+    count : int
+        Instances on annotations alone.
     """
+    root = given.needed()
+    rows = [_on_annotations(root, method, count) for method in ("aepnp", "optimal")]
+    yield "Evaluation in one process", rows
+    with tempfile.TemporaryDirectory() as folder:
+        samples = write_sample_dataset(Path(folder) / "samples", per_category=12)
+        on_hulls = _evaluate(root, "--visibility=hull")
+        rows = [
+            *_whole_runs("run on annotations", [*on_hulls, "--methods=aepnp"], root, (4, 16)),
+            *_whole_runs(
+                "run with overlays",
+                _evaluate(samples, "--methods=optimal", "--render=overlay"),
+                samples,
+                (1, 4),
+            ),
+            _dask_over_processes(
+                "run by Dask over one by processes", [*on_hulls, "--views-per-model=3"]
+            ),
+        ]
+    yield "Whole runs", rows
 
-    count: int = 2000
-    """Instances on annotations alone."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        root = given.needed()
-        rows = [self._on_annotations(root, method) for method in ("aepnp", "optimal")]
-        yield RatioTable("Evaluation in one process", rows)
-        with tempfile.TemporaryDirectory() as folder:
-            samples = write_sample_dataset(Path(folder) / "samples", per_category=12)
-            on_hulls = _evaluate(root, "--visibility=hull")
-            rows = [
-                *_whole_runs("run on annotations", [*on_hulls, "--methods=aepnp"], root, (4, 16)),
-                *_whole_runs(
-                    "run with overlays",
-                    _evaluate(samples, "--methods=optimal", "--render=overlay"),
-                    samples,
-                    (1, 4),
-                ),
-                _dask_over_processes(
-                    "run by Dask over one by processes", [*on_hulls, "--views-per-model=3"]
-                ),
-            ]
-        yield RatioTable("Whole runs", rows)
+def _on_annotations(root: Path, method: str, count: int) -> Row:
+    """Rate of instances whose meshes are not looked at."""
+    options = KeypointNetOptions(root, visibility="hull", methods=(method,))
+    tasks = KeypointTasks(KeypointNet(root), options)
+    experiment = keypointnet_benchmark(options)
+    experiment.warm_up()
+    number = min(count, len(tasks))
 
-    def _on_annotations(self, root: Path, method: str) -> Row:
-        """Rate of instances whose meshes are not looked at."""
-        options = KeypointNetOptions(root, visibility="hull", methods=(method,))
-        tasks = KeypointTasks(KeypointNet(root), options)
-        experiment = keypointnet_benchmark(options)
-        experiment.warm_up()
-        count = min(self.count, len(tasks))
+    def evaluate_all() -> None:
+        for start in range(0, number, _CHUNK):
+            experiment.evaluate(tasks[start : min(start + _CHUNK, number)])
 
-        def evaluate_all() -> None:
-            for start in range(0, count, _CHUNK):
-                experiment.evaluate(tasks[start : min(start + _CHUNK, count)])
-
-        reference = section.reference_seconds()
-        busy = section.processor_seconds(evaluate_all)
-        reference = min(reference, section.reference_seconds())
-        name = f"evaluation on annotations, {method}"
-        return section.figure(name, count / busy, "1/s", 1e3 * busy / count / reference)
+    reference = section.reference_seconds()
+    busy = section.processor_seconds(evaluate_all)
+    reference = min(reference, section.reference_seconds())
+    name = f"evaluation on annotations, {method}"
+    return section.figure(name, number / busy, "1/s", 1e3 * busy / number / reference)
 
 
 def _evaluate(root: Path, *options: str) -> list[str]:
@@ -148,65 +147,72 @@ def _whole_runs(name: str, call: list[str], root: Path, views: tuple[int, int]) 
 # Observations ------------------------------------------------------------------------------------
 
 
-@dataclass
-class Fits:
+def fits(
+    given: BenchmarkData,
+    *,
+    sizes: tuple[int, int] = (25_000, 100_000),
+    methods: tuple[str, ...] = ("aepnp", "optimal"),
+    dask: bool = True,
+    kills: int = 5,
+) -> Tables:
     """Observations a second of whole runs by two processes, and memory.
 
     Rates and ratios are those of the section evaluation. A run that is killed again and again, and
     one that loses a Dask worker, must give the bytes of one that nothing happens to.
+
+    Parameters
+    ----------
+    sizes : tuple[int, int]
+        Observations of the shorter and of the longer run.
+    methods : tuple[str, ...]
+        Methods of the fits.
+    dask : bool
+        Compare two Dask workers with two processes on the shorter run.
+    kills : int
+        Times that the longer run is killed.
     """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        short, long = (_write_observations(folder, n, given.seed) for n in sizes)
+        for method in methods:
+            name = f"fits by {method}"
+            runs = (_fit(file, method) for file in (short, long))
+            count = sizes[1] - sizes[0]
+            rows = _rate_and_memory(name, f"{name}, memory", count, *runs)
+            yield f"Fits of {_POINTS} keypoints", rows
+        if dask:
+            name = "fits by Dask over those by processes"
+            row = _dask_over_processes(name, _fit(short, "aepnp"))
+            yield "Fits on a cluster", [row]
+        if kills:
+            yield "Interrupted", _interrupted(long, sizes, dask, kills)
 
-    sizes: tuple[int, int] = (25_000, 100_000)
-    """Observations of the shorter and of the longer run."""
-    methods: tuple[str, ...] = ("aepnp", "optimal")
-    """Methods of the fits."""
-    dask: bool = True
-    """Compare two Dask workers with two processes on the shorter run."""
-    kills: int = 5
-    """Times that the longer run is killed."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            short, long = (_write_observations(folder, n, given.seed) for n in self.sizes)
-            for method in self.methods:
-                name = f"fits by {method}"
-                runs = (_fit(file, method) for file in (short, long))
-                count = self.sizes[1] - self.sizes[0]
-                rows = _rate_and_memory(name, f"{name}, memory", count, *runs)
-                yield RatioTable(f"Fits of {_POINTS} keypoints", list(rows))
-            if self.dask:
-                name = "fits by Dask over those by processes"
-                row = _dask_over_processes(name, _fit(short, "aepnp"))
-                yield RatioTable("Fits on a cluster", [row])
-            if self.kills:
-                yield RatioTable("Interrupted", list(self._interrupted(long)))
+def _interrupted(file: Path, sizes: tuple[int, int], dask: bool, kills: int) -> Iterator[Row]:
+    """Compare the tables of interrupted runs with those of one that was left alone."""
+    chunks = sizes[1] // LARGEST_CHUNK
 
-    def _interrupted(self, file: Path) -> Iterator[Row]:
-        """Compare the tables of interrupted runs with those of one that was left alone."""
-        chunks = self.sizes[1] // LARGEST_CHUNK
+    def start(folder: RunFolder, workers: str = "--workers=2") -> subprocess.Popen[bytes]:
+        call = [*COMMAND, *_fit(file, "aepnp"), f"--out={folder.path}", workers]
+        return subprocess.Popen(call)
 
-        def start(folder: RunFolder, workers: str = "--workers=2") -> subprocess.Popen[bytes]:
-            call = [*COMMAND, *_fit(file, "aepnp"), f"--out={folder.path}", workers]
-            return subprocess.Popen(call)
-
-        calm, killed, lost = (RunFolder(file.with_name(n)) for n in ("calm", "killed", "lost"))
-        if start(calm).wait():
-            raise SystemExit("the run that is left alone failed")
-        for kill in range(self.kills):
-            process = start(killed)
-            _wait_for(killed, chunks * (kill + 1) // (self.kills + 1), process)
-            process.kill()
+    calm, killed, lost = (RunFolder(file.with_name(n)) for n in ("calm", "killed", "lost"))
+    if start(calm).wait():
+        raise SystemExit("the run that is left alone failed")
+    for kill in range(kills):
+        process = start(killed)
+        _wait_for(killed, chunks * (kill + 1) // (kills + 1), process)
+        process.kill()
+        process.wait()
+    start(killed).wait()
+    yield _same_bytes(f"killed {kills} times", calm, killed)
+    if dask:
+        with _dask_cluster() as cluster:
+            process = start(lost, f"--dask={cluster.scheduler_address}")
+            _wait_for(lost, chunks // 2, process)
+            os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
             process.wait()
-        start(killed).wait()
-        yield _same_bytes(f"killed {self.kills} times", calm, killed)
-        if self.dask:
-            with _dask_cluster() as cluster:
-                process = start(lost, f"--dask={cluster.scheduler_address}")
-                _wait_for(lost, chunks // 2, process)
-                os.kill(next(iter(cluster.workers.values())).pid, signal.SIGKILL)
-                process.wait()
-            yield _same_bytes("a Dask worker killed", calm, lost)
+        yield _same_bytes("a Dask worker killed", calm, lost)
 
 
 def _fit(file: Path, method: str) -> list[str]:
@@ -251,51 +257,54 @@ def _write_observations(folder: Path, count: int, seed: int) -> Path:
 # Robust search ------------------------------------------------------------------------------------
 
 
-@dataclass
-class Ransac:
+def ransac(
+    given: BenchmarkData,
+    *,
+    draws: int = 20,
+    outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9),
+) -> Tables:
     """The robust search on real correspondences: success, and time over PoseLib's and OpenCV's.
 
     Images are those of `cadalign evaluate correspondences`: scales are drawn anew for every image
     and draw, and a share of the points is moved to anywhere. PoseLib and OpenCV get the true
     scales: they solve the easier problem without stretch.
+
+    Parameters
+    ----------
+    draws : int
+        Draws of scales and outliers for each image.
+    outliers : tuple[float, ...]
+        Shares of outliers among the image points.
     """
+    colmap, bundler = given.needed("colmap"), given.needed("bundler")
+    models = {"COLMAP": list(Colmap(colmap)), "Bundler": list(Bundler(bundler))}
+    rows = [
+        _row(name, images, share, draws) for name, images in models.items() for share in outliers
+    ]
+    yield "Robust search", rows
 
-    draws: int = 20
-    """Draws of scales and outliers for each image."""
-    outliers: tuple[float, ...] = (0.0, 0.2, 0.5, 0.8, 0.9)
-    """Shares of outliers among the image points."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        colmap, bundler = given.needed("colmap"), given.needed("bundler")
-        models = {"COLMAP": list(Colmap(colmap)), "Bundler": list(Bundler(bundler))}
-        rows = [
-            self._row(name, images, share)
-            for name, images in models.items()
-            for share in self.outliers
-        ]
-        yield RatioTable("Robust search", rows)
-
-    def _row(self, name: str, images: list[Correspondences], share: float) -> Row:
-        rng = np.random.default_rng(1)
-        iterations = 200_000 if share > 0.85 else 10_000
-        succeeded, ours, poselibs, opencvs = [], [], [], []
-        for draw in range(self.draws):
-            options = RansacOptions(**_SEARCH, max_iterations=iterations, seed=draw)
-            for image in images:
-                truth = spoil(image, share, rng=rng)
-                wall, _, result = section.clocked(partial(section.fitted, truth, ransac=options))
-                ours.append(wall)
-                is_found = result is not None and errors_of(result.alignment, truth)["success"]
-                succeeded.append(is_found)
-                poselibs.append(section.seconds(_poselib(image, truth.points_2d, iterations)))
-                if draw < _OPENCV_DRAWS:
-                    opencvs.append(section.seconds(_opencv(image, truth.points_2d)))
-        own, other, opencv = (float(np.median(each)) for each in (ours, poselibs, opencvs))
-        name = f"robust, {name}, {share:.0%} outliers"
-        return section.figure(name, 1e3 * own, "ms", own / other, "PoseLib") | {
-            "success": f"{np.mean(succeeded):.1%}",
-            "over cv2 RANSAC EPNP": own / opencv,
-        }
+def _row(name: str, images: list[Correspondences], share: float, draws: int) -> Row:
+    rng = np.random.default_rng(1)
+    iterations = 200_000 if share > 0.85 else 10_000
+    succeeded, ours, poselibs, opencvs = [], [], [], []
+    for draw in range(draws):
+        options = RansacOptions(**_SEARCH, max_iterations=iterations, seed=draw)
+        for image in images:
+            truth = spoil(image, share, rng=rng)
+            wall, _, result = section.clocked(partial(section.fitted, truth, ransac=options))
+            ours.append(wall)
+            is_found = result is not None and errors_of(result.alignment, truth)["success"]
+            succeeded.append(is_found)
+            poselibs.append(section.seconds(_poselib(image, truth.points_2d, iterations)))
+            if draw < _OPENCV_DRAWS:
+                opencvs.append(section.seconds(_opencv(image, truth.points_2d)))
+    own, other, opencv = (float(np.median(each)) for each in (ours, poselibs, opencvs))
+    name = f"robust, {name}, {share:.0%} outliers"
+    return section.figure(name, 1e3 * own, "ms", own / other, "PoseLib") | {
+        "success": f"{np.mean(succeeded):.1%}",
+        "over cv2 RANSAC EPNP": own / opencv,
+    }
 
 
 def _undistorted(image: Correspondences, points_2d: np.ndarray) -> np.ndarray:

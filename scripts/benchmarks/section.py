@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, getrusage
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+import tyro
 from common import COMMAND
 
 import cadalign
@@ -36,7 +37,7 @@ class NotGivenError(Exception):
 
 @dataclass(kw_only=True)
 class BenchmarkData:
-    """Data and seed of all sections; CADALIGN_DATA names the folder of the data."""
+    """Data, seed and choice of the sections; CADALIGN_DATA names the folder of the data."""
 
     keypointnet: Path | None = _DATA and _DATA / "keypointnet"
     """Folder in KeypointNet's layout, with splits; some sections need it, others use it."""
@@ -48,6 +49,12 @@ class BenchmarkData:
     """Seed of random problems."""
     out: Path = Path("bench")
     """Folder for what is measured: <section>.json, and pictures of the annotator."""
+    sections: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Sections to run; by default all that need no asking for."""
+    stored: Path = Path(__file__).parents[1] / "benchmark_ratios.json"
+    """Ratios to compare with."""
+    store: bool = False
+    """Store the measured ratios."""
 
     def needed(self, name: str = "keypointnet") -> Path:
         """A folder that a section cannot do without; NotGivenError where there is none."""
@@ -61,19 +68,10 @@ class BenchmarkData:
         return self.needed().parent / "real" / name
 
 
-@dataclass(frozen=True)
-class RatioTable:
-    """A title, and rows by column; a cell may be a median with a 90th percentile."""
-
-    title: str
-    rows: list[Row]
-
-
-class Section(Protocol):
-    """A section: a dataclass of options that measures."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        """Measure, one table after the other."""
+Table = tuple[str, Iterable[Row]]
+"""A title, and rows by column; a cell may be a median with a 90th percentile."""
+Tables = Iterator[Table]
+"""What a section yields: it is a function of the data, whose keywords are its options."""
 
 
 def figure(name: str, value: float, unit: str, ratio: float, to: str = "") -> Row:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import BenchmarkData, RatioTable, Row
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
@@ -44,134 +43,169 @@ class _Seen(NamedTuple):
 # Times --------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Align:
+def align(
+    given: BenchmarkData,
+    *,
+    categories: tuple[str, ...] = ("chair", "airplane", "mug"),
+    objects: int = 40,
+    keypoints: int = 14,
+    noise_px: float = 2.0,
+    repeats: int = 5,
+    workers: int = 2,
+) -> Tables:
     """Time of `align` with learned shapes: one view, two views, and a batch.
 
     Objects are those of the split val, seen with noisy keypoints; shape models are learned from the
     split train. Times of single objects are those of the processor, warm and on one thread.
+
+    Parameters
+    ----------
+    categories : tuple[str, ...]
+        Categories.
+    objects : int
+        Objects of each category.
+    keypoints : int
+        Most keypoints of an object.
+    noise_px : float
+        Standard deviation of the keypoints, in pixels.
+    repeats : int
+        Times that the batch holds every object.
+    workers : int
+        Threads of the batch.
     """
-
-    categories: tuple[str, ...] = ("chair", "airplane", "mug")
-    """Categories."""
-    objects: int = 40
-    """Objects of each category."""
-    keypoints: int = 14
-    """Most keypoints of an object."""
-    noise_px: float = 2.0
-    """Standard deviation of the keypoints, in pixels."""
-    repeats: int = 5
-    """Times that the batch holds every object."""
-    workers: int = 2
-    """Threads of the batch."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        dataset = KeypointNet(given.needed())
-        rows = [self._row(dataset, category) for category in self.categories]
-        yield RatioTable("align with a learned shape", rows)
-
-    def _row(self, dataset: KeypointNet, category: str) -> Row:
-        shape = section.learned_shape(dataset, category)
-        pairs = list(self._pairs(dataset, category, shape))
-        singles = [views[:1] for views in pairs]
-        for views in singles[:2] + pairs[:2]:  # compile
-            cadalign.align(shape, views)
-        one, two = (
-            [
-                1e3 * section.processor_seconds(lambda v=views: cadalign.align(shape, v))
-                for views in objects
-            ]
-            for objects in (singles, pairs)
+    dataset = KeypointNet(given.needed())
+    rows = [
+        _times_of(
+            dataset,
+            category,
+            objects,
+            keypoints,
+            noise_px,
+            repeats,
+            workers,
         )
-        batch = singles * self.repeats
-        rate = len(batch) / section.seconds(
-            lambda: cadalign.align_batch(shape, batch, workers=self.workers)
-        )
-        return {
-            "category": category,
-            "components": len(shape.components),
-            "one view ms": section.spread(one),
-            "two views ms": float(np.median(two)),
-            "batch 1/s": rate,
-        }
+        for category in categories
+    ]
+    yield "align with a learned shape", rows
 
-    def _pairs(
-        self, dataset: KeypointNet, category: str, shape: cadalign.ShapeModel
-    ) -> Iterator[list[cadalign.View]]:
-        """Two views of every object."""
-        how = {"keypoints": self.keypoints, "noise_px": self.noise_px}
-        for place, seen in section.unseen_objects(dataset, category, self.objects, **how):
-            known = np.isin(seen.ids, shape.ids)
-            points, ids = seen.xyz[seen.rows][known], seen.ids[known]
-            turned = cadalign.Alignment(
-                _SECOND_VIEW @ seen.gt.rotation, seen.gt.translation, seen.gt.scale
-            )
-            noise = np.random.default_rng(place).normal(0, self.noise_px, points[:, :2].shape)
-            second = KEYPOINT_CAMERA.project(turned.apply(points)) + noise
-            pixels = seen.points_2d[known], second
-            yield [
-                cadalign.View(KEYPOINT_CAMERA, each, ids=ids, sigma=self.noise_px)
-                for each in pixels
-            ]
+
+def _times_of(
+    dataset: KeypointNet,
+    category: str,
+    objects: int,
+    keypoints: int,
+    noise_px: float,
+    repeats: int,
+    workers: int,
+) -> Row:
+    shape = section.learned_shape(dataset, category)
+    pairs = list(_pairs(dataset, category, shape, objects, keypoints, noise_px))
+    singles = [views[:1] for views in pairs]
+    for views in singles[:2] + pairs[:2]:  # compile
+        cadalign.align(shape, views)
+    one, two = (
+        [
+            1e3 * section.processor_seconds(lambda v=views: cadalign.align(shape, v))
+            for views in some
+        ]
+        for some in (singles, pairs)
+    )
+    batch = singles * repeats
+    rate = len(batch) / section.seconds(lambda: cadalign.align_batch(shape, batch, workers=workers))
+    return {
+        "category": category,
+        "components": len(shape.components),
+        "one view ms": section.spread(one),
+        "two views ms": float(np.median(two)),
+        "batch 1/s": rate,
+    }
+
+
+def _pairs(
+    dataset: KeypointNet,
+    category: str,
+    shape: cadalign.ShapeModel,
+    objects: int,
+    keypoints: int,
+    noise_px: float,
+) -> Iterator[list[cadalign.View]]:
+    """Two views of every object."""
+    how = {"keypoints": keypoints, "noise_px": noise_px}
+    for place, seen in section.unseen_objects(dataset, category, objects, **how):
+        known = np.isin(seen.ids, shape.ids)
+        points, ids = seen.xyz[seen.rows][known], seen.ids[known]
+        turned = cadalign.Alignment(
+            _SECOND_VIEW @ seen.gt.rotation, seen.gt.translation, seen.gt.scale
+        )
+        noise = np.random.default_rng(place).normal(0, noise_px, points[:, :2].shape)
+        second = KEYPOINT_CAMERA.project(turned.apply(points)) + noise
+        pixels = seen.points_2d[known], second
+        yield [cadalign.View(KEYPOINT_CAMERA, each, ids=ids, sigma=noise_px) for each in pixels]
 
 
 # Unknown focal length -----------------------------------------------------------------------------
 
 
-@dataclass
-class FocalShapes:
+def focal_shapes(
+    given: BenchmarkData,
+    *,
+    categories: tuple[str, ...] = ("airplane", "bathtub", "bottle", "chair", "mug"),
+    objects: int = 60,
+    noise_px: float = 2.0,
+) -> Tables:
     """Unknown focal lengths beside learned shapes: the Cramer-Rao limit, and unseen objects.
 
     The first table's objects are drawn from a shape model, the second's are those of KeypointNet's
     split val, with models learned from its split train, in near views.
+
+    Parameters
+    ----------
+    categories : tuple[str, ...]
+        Categories of the unseen objects.
+    objects : int
+        Objects per category, and drawn objects per number of modes five times as many.
+    noise_px : float
+        Standard deviation of the unseen objects' keypoints, in pixels.
     """
+    title = f"{_POINTS} keypoints, 1 px: median errors over the limit's of 7 + K unknowns"
+    rng = np.random.default_rng
+    yield title, [_drawn(rng(given.seed), k, 5 * objects) for k in (1, 3, 5)]
+    if given.keypointnet is None:
+        return
+    dataset, rows, deviations = KeypointNet(given.keypointnet), [], []
+    for category in categories:
+        row, found = _unseen(dataset, category, given.seed, objects, noise_px)
+        rows.append(row)
+        deviations += found
+    rows.append(dict.fromkeys(rows[0]) | {"category": "all", "f in 95 %": _held(deviations)})
+    yield f"unseen objects in near views, {noise_px:g} px", rows
 
-    categories: tuple[str, ...] = ("airplane", "bathtub", "bottle", "chair", "mug")
-    """Categories of the unseen objects."""
-    objects: int = 60
-    """Objects per category, and drawn objects per number of modes five times as many."""
-    noise_px: float = 2.0
-    """Standard deviation of the unseen objects' keypoints, in pixels."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        title = f"{_POINTS} keypoints, 1 px: median errors over the limit's of 7 + K unknowns"
-        rng = np.random.default_rng
-        yield RatioTable(title, [_drawn(rng(given.seed), k, 5 * self.objects) for k in (1, 3, 5)])
-        if given.keypointnet is None:
-            return
-        dataset, rows, deviations = KeypointNet(given.keypointnet), [], []
-        for category in self.categories:
-            row, found = self._unseen(dataset, category, given.seed)
-            rows.append(row)
-            deviations += found
-        rows.append(dict.fromkeys(rows[0]) | {"category": "all", "f in 95 %": _held(deviations)})
-        yield RatioTable(f"unseen objects in near views, {self.noise_px:g} px", rows)
-
-    def _unseen(self, dataset: KeypointNet, category: str, seed: int) -> tuple[Row, list[float]]:
-        """Errors with the focal length known and unknown; the latter's in sigmas."""
-        shape = section.learned_shape(dataset, category)
-        objects = dataset.subset(categories=[category], split="val")
-        rows, deviations = [], []
-        for key in sorted(objects.ids(category))[: self.objects]:
-            keypoints, rng = objects[key].keypoints, instance_rng(seed, *key)
-            seen = _see_near(keypoints.xyz, keypoints.ids.tolist(), self.noise_px, rng)
-            known, found = (
-                _near(shape, seen, self.noise_px, focal) for focal in ("known", "estimate")
-            )
-            if known is not None and found is not None and found.std is not None:
-                rows.append([*_unseen_errors(known, seen), *_unseen_errors(found, seen)])
-                deviations.append(float(np.log(found.camera.fx / _NEAR.fx) / found.std.focal))
-        known_deg, known_iou, deg, iou = np.median(rows, axis=0).tolist()
-        return {
-            "category": category,
-            "objects": len(rows),
-            "R known": known_deg,
-            "R unknown deg": deg,
-            "ratio of R": deg / known_deg,
-            "extents' IoU known": known_iou,
-            "unknown": iou,
-            "f in 95 %": _held(deviations),
-        }, deviations
+def _unseen(
+    dataset: KeypointNet, category: str, seed: int, objects: int, noise_px: float
+) -> tuple[Row, list[float]]:
+    """Errors with the focal length known and unknown; the latter's in sigmas."""
+    shape = section.learned_shape(dataset, category)
+    held_out = dataset.subset(categories=[category], split="val")
+    rows, deviations = [], []
+    for key in sorted(held_out.ids(category))[:objects]:
+        keypoints, rng = held_out[key].keypoints, instance_rng(seed, *key)
+        seen = _see_near(keypoints.xyz, keypoints.ids.tolist(), noise_px, rng)
+        known, found = (_near(shape, seen, noise_px, focal) for focal in ("known", "estimate"))
+        if known is not None and found is not None and found.std is not None:
+            rows.append([*_unseen_errors(known, seen), *_unseen_errors(found, seen)])
+            deviations.append(float(np.log(found.camera.fx / _NEAR.fx) / found.std.focal))
+    known_deg, known_iou, deg, iou = np.median(rows, axis=0).tolist()
+    return {
+        "category": category,
+        "objects": len(rows),
+        "R known": known_deg,
+        "R unknown deg": deg,
+        "ratio of R": deg / known_deg,
+        "extents' IoU known": known_iou,
+        "unknown": iou,
+        "f in 95 %": _held(deviations),
+    }, deviations
 
 
 def _see_near(
@@ -261,57 +295,73 @@ def _held(deviations: Sequence[float]) -> float:
 # Similar models -----------------------------------------------------------------------------------
 
 
-@dataclass
-class Similar:
+def similar(
+    given: BenchmarkData,
+    *,
+    sigmas: tuple[float, ...] = (np.inf, 0.5, 0.3, 0.2, 0.1),
+    objects: int = 150,
+    noise_px: float = 2.0,
+) -> Tables:
     """Fits with a model that is only similar: which prior on the stretch helps.
 
     Models of KeypointNet are seen with all keypoints and aligned with another model of their
     category, drawn at random: `fit` with the noise estimated from the residuals, as `cadalign fit
     --similar`. Median rotation errors [deg], with the IoU of the keypoints' boxes at equal depths.
+
+    Parameters
+    ----------
+    sigmas : tuple[float, ...]
+        Standard deviations of the logarithm of the stretch; inf for no prior.
+    objects : int
+        Objects of each category.
+    noise_px : float
+        Noise of the keypoints [px].
     """
+    dataset = KeypointNet(given.needed())
+    rows = [
+        _by_prior(category, dataset[category], sigmas, objects, noise_px)
+        for category in dataset.categories
+    ]
+    yield "Median rotation error in degrees (box IoU), by prior", rows
 
-    sigmas: tuple[float, ...] = (np.inf, 0.5, 0.3, 0.2, 0.1)
-    """Standard deviations of the logarithm of the stretch; inf for no prior."""
-    objects: int = 150
-    """Objects of each category."""
-    noise_px: float = 2.0
-    """Noise of the keypoints [px]."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        dataset = KeypointNet(given.needed())
-        rows = [self._row(category, dataset[category]) for category in dataset.categories]
-        yield RatioTable("Median rotation error in degrees (box IoU), by prior", rows)
+def _by_prior(
+    category: str,
+    models: Sequence[AnnotatedModel],
+    sigmas: tuple[float, ...],
+    objects: int,
+    noise_px: float,
+) -> Row:
+    usable = [each for each in models if len(each.keypoints.xyz) >= _LEAST_KEYPOINTS]
+    pairs = []
+    for each in usable[:: max(1, len(usable) // objects)]:
+        model, seen = _pair(each, [other for other in usable if other is not each], noise_px)
+        if len(model) >= _LEAST_KEYPOINTS:
+            pairs.append((model, seen))
+    row: Row = {"category": category, "objects": len(pairs)}
+    for sigma in sigmas:
+        errors = [_similar_errors(*each, sigma) for each in pairs]
+        name = "none" if np.isinf(sigma) else f"{sigma:g}"
+        row[name] = tuple(np.nanmedian(errors, axis=0).tolist())
+    return row
 
-    def _row(self, category: str, models: Sequence[AnnotatedModel]) -> Row:
-        usable = [each for each in models if len(each.keypoints.xyz) >= _LEAST_KEYPOINTS]
-        pairs = []
-        for each in usable[:: max(1, len(usable) // self.objects)]:
-            model, seen = self._pair(each, [other for other in usable if other is not each])
-            if len(model) >= _LEAST_KEYPOINTS:
-                pairs.append((model, seen))
-        row: Row = {"category": category, "objects": len(pairs)}
-        for sigma in self.sigmas:
-            errors = [_similar_errors(*each, sigma) for each in pairs]
-            name = "none" if np.isinf(sigma) else f"{sigma:g}"
-            row[name] = tuple(np.nanmedian(errors, axis=0).tolist())
-        return row
 
-    def _pair(
-        self, seen: AnnotatedModel, others: Sequence[AnnotatedModel]
-    ) -> tuple[FloatArray, _Seen]:
-        """The keypoints of a random other model, and a random view of an object's own ones."""
-        rng = instance_rng(0, seen.category, seen.model_id, "similar")
-        other = others[int(rng.integers(len(others)))].keypoints
-        own = dict(zip(seen.keypoints.ids.tolist(), seen.keypoints.xyz, strict=True))
-        kept = [row for row, name in enumerate(other.ids.tolist()) if name in own]
-        ids = tuple(other.ids[kept].tolist())
-        points = np.array([own[name] for name in ids]).reshape(-1, 3)
-        pose = look_at(
-            azimuth=rng.uniform(0, 360), elevation=rng.uniform(0, 60), distance=rng.uniform(1.5, 3)
-        )
-        pixels = KEYPOINT_CAMERA.project(pose.apply(points))
-        pixels += self.noise_px * rng.standard_normal(pixels.shape)
-        return other.xyz[kept], _Seen(points, pixels, ids, KEYPOINT_CAMERA, pose)
+def _pair(
+    seen: AnnotatedModel, others: Sequence[AnnotatedModel], noise_px: float
+) -> tuple[FloatArray, _Seen]:
+    """The keypoints of a random other model, and a random view of an object's own ones."""
+    rng = instance_rng(0, seen.category, seen.model_id, "similar")
+    other = others[int(rng.integers(len(others)))].keypoints
+    own = dict(zip(seen.keypoints.ids.tolist(), seen.keypoints.xyz, strict=True))
+    kept = [row for row, name in enumerate(other.ids.tolist()) if name in own]
+    ids = tuple(other.ids[kept].tolist())
+    points = np.array([own[name] for name in ids]).reshape(-1, 3)
+    pose = look_at(
+        azimuth=rng.uniform(0, 360), elevation=rng.uniform(0, 60), distance=rng.uniform(1.5, 3)
+    )
+    pixels = KEYPOINT_CAMERA.project(pose.apply(points))
+    pixels += noise_px * rng.standard_normal(pixels.shape)
+    return other.xyz[kept], _Seen(points, pixels, ids, KEYPOINT_CAMERA, pose)
 
 
 def _similar_errors(model: FloatArray, seen: _Seen, sigma: float) -> tuple[float, float]:

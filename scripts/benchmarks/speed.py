@@ -6,7 +6,6 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from common import COMMAND
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import BenchmarkData, RatioTable, Row
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera
 from cadalign.datasets import sample_models
 from cadalign.errors import RenderError
@@ -71,99 +70,94 @@ _LIMITS = {
 }
 
 
-@dataclass
-class Cold:
+def cold(given: BenchmarkData) -> Tables:
     """Time of the first calls after installation, when nothing is compiled yet.
 
     Each call runs in a new process with an empty folder of compiled code. The ratio is that to a
     first call of a function of ten lines compiled by Numba, measured right before.
     """
+    with tempfile.TemporaryDirectory() as folder:
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        with tempfile.TemporaryDirectory() as folder:
+        def called(code: str, place: str) -> tuple[float, float]:
+            environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder, place))}
+            return section.seconds_of_process([sys.executable, "-c", code], environment=environment)
 
-            def called(code: str, place: str) -> tuple[float, float]:
-                environment = {**os.environ, "NUMBA_CACHE_DIR": str(Path(folder, place))}
-                return section.seconds_of_process(
-                    [sys.executable, "-c", code], environment=environment
-                )
-
-            _, reference = called(_SMALL_FUNCTION, "small")
-            rows = []
-            for name, code in _FIRST_CALLS.items():
-                wall, processor = called(code, "all" if "doctor" in name else "fit")
-                rows.append(
-                    section.figure(name, wall, "s", processor / reference, "a first small call")
-                )
-        yield RatioTable("First calls", rows)
-
-
-@dataclass
-class Calls:
-    """Cost of calls beside their solving: the warm command line, and small fits in Python."""
-
-    runs: int = 7
-    """Runs of each command."""
-    calls: int = 2000
-    """Calls of each fit."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        with tempfile.TemporaryDirectory() as folder:
-            yield RatioTable("Commands, processor time", list(self._commands(Path(folder))))
-        yield RatioTable("Fits", list(self._fits()))
-
-    def _commands(self, folder: Path) -> Iterator[Row]:
-        seen = str(_observation(folder))
-        libraries = "import numpy, numba"
-        for name, given in {
-            "cadalign --help": ["--help"],
-            "cadalign fit": ["fit", seen],
-            "cadalign fit --json --no-picture": ["fit", seen, "--json", "--no-picture"],
-            "cadalign demo": ["demo", "--out", str(folder / "demo"), "--workers", "0"],
-        }.items():
-            command = [*COMMAND, *given]
-            section.seconds_of_process(command)  # compiles what is not yet on disk
-            medians = section.medians_in_turns(
-                {
-                    "own": lambda command=command: section.seconds_of_process(command)[1],
-                    "other": lambda: section.seconds_of_process([sys.executable, "-c", libraries])[
-                        1
-                    ],
-                },
-                1 if name == "cadalign demo" else self.runs,
+        _, reference = called(_SMALL_FUNCTION, "small")
+        rows = []
+        for name, code in _FIRST_CALLS.items():
+            wall, processor = called(code, "all" if "doctor" in name else "fit")
+            rows.append(
+                section.figure(name, wall, "s", processor / reference, "a first small call")
             )
-            yield section.figure(
-                name, medians["own"], "s", medians["own"] / medians["other"], libraries
-            )
+    yield "First calls", rows
 
-    def _fits(self) -> Iterator[Row]:
-        ten, seven = (
-            simulate_problem(np.random.default_rng(0), points=points, noise_px=1.0)
-            for points in (10, 7)
+
+def calls(given: BenchmarkData, *, runs: int = 7, calls: int = 2000) -> Tables:
+    """Cost of calls beside their solving: the warm command line, and small fits in Python.
+
+    Parameters
+    ----------
+    runs : int
+        Runs of each command.
+    calls : int
+        Calls of each fit.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        yield "Commands, processor time", _commands(Path(folder), runs)
+    yield "Fits", _fits(calls)
+
+
+def _commands(folder: Path, runs: int) -> Iterator[Row]:
+    seen = str(_observation(folder))
+    libraries = "import numpy, numba"
+    for name, given in {
+        "cadalign --help": ["--help"],
+        "cadalign fit": ["fit", seen],
+        "cadalign fit --json --no-picture": ["fit", seen, "--json", "--no-picture"],
+        "cadalign demo": ["demo", "--out", str(folder / "demo"), "--workers", "0"],
+    }.items():
+        command = [*COMMAND, *given]
+        section.seconds_of_process(command)  # compiles what is not yet on disk
+        medians = section.medians_in_turns(
+            {
+                "own": lambda command=command: section.seconds_of_process(command)[1],
+                "other": lambda: section.seconds_of_process([sys.executable, "-c", libraries])[1],
+            },
+            1 if name == "cadalign demo" else runs,
         )
-        x, uv, camera = ten.points_3d, ten.points_2d, ten.camera
-        rays, offsets = camera.normalize(uv), np.array([0, 10])
-        for name, ours, theirs, to in (
-            (
-                "fit(method='aepnp'), 10 points",
-                lambda: cadalign.fit(x, uv, camera, method="aepnp"),
-                lambda: aepnp_batch(x, rays, offsets),
-                "its kernel",
-            ),
-            (
-                "fit, 7 points",
-                lambda: cadalign.fit(seven.points_3d, seven.points_2d, seven.camera),
-                lambda: cv2.solvePnP(x, uv, camera.matrix, None),
-                "OpenCV's ITERATIVE, 10 points",
-            ),
-        ):
-            both = {
-                "own": partial(section.seconds, ours),
-                "other": partial(section.seconds, theirs),
-            }
-            medians = section.medians_in_turns(both, self.calls)
-            ratio = medians["own"] / medians["other"]
-            yield section.figure(name, 1e6 * medians["own"], "us", ratio, to)
+        yield section.figure(
+            name, medians["own"], "s", medians["own"] / medians["other"], libraries
+        )
+
+
+def _fits(calls: int) -> Iterator[Row]:
+    ten, seven = (
+        simulate_problem(np.random.default_rng(0), points=points, noise_px=1.0)
+        for points in (10, 7)
+    )
+    x, uv, camera = ten.points_3d, ten.points_2d, ten.camera
+    rays, offsets = camera.normalize(uv), np.array([0, 10])
+    for name, ours, theirs, to in (
+        (
+            "fit(method='aepnp'), 10 points",
+            lambda: cadalign.fit(x, uv, camera, method="aepnp"),
+            lambda: aepnp_batch(x, rays, offsets),
+            "its kernel",
+        ),
+        (
+            "fit, 7 points",
+            lambda: cadalign.fit(seven.points_3d, seven.points_2d, seven.camera),
+            lambda: cv2.solvePnP(x, uv, camera.matrix, None),
+            "OpenCV's ITERATIVE, 10 points",
+        ),
+    ):
+        both = {
+            "own": partial(section.seconds, ours),
+            "other": partial(section.seconds, theirs),
+        }
+        medians = section.medians_in_turns(both, calls)
+        ratio = medians["own"] / medians["other"]
+        yield section.figure(name, 1e6 * medians["own"], "us", ratio, to)
 
 
 def _observation(folder: Path) -> Path:
@@ -181,51 +175,46 @@ def _observation(folder: Path) -> Path:
     return folder / "seen.json"
 
 
-@dataclass
-class Rendering:
+def rendering(given: BenchmarkData, *, repetitions: int = 15) -> Tables:
     """Milliseconds a frame of the renderers, and of what is done once per mesh.
 
     640 x 480 px on 20,480 triangles. Medians, and the smallest beside them, since other programs
     may share the machine.
+
+    Parameters
+    ----------
+    repetitions : int
+        Timed frames per figure; the median counts.
     """
-
-    repetitions: int = 15
-    """Timed frames per figure; the median counts."""
-
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        camera = Camera.from_fov(640, 480, fov_x=50.0)
-        scene = Scene(ball(5))
-        rotation = look_at(azimuth=35, elevation=20, distance=3).rotation
-        pose = frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
-        vertices = scene.mesh.vertices
-        keypoints = vertices[np.random.default_rng(0).choice(len(vertices), 20)]
-        shown = scene, camera, pose
-        plain = RaycastRenderer(studio=Studio(occlusion=0))
-        tasks: dict[str, Callable[[], object]] = {
-            "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
-            "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
-            "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
-            "raycast: geometry": lambda: cast_geometry(*shown),
-            "raycast: colour": partial(RaycastRenderer().render, *shown),
-            "raycast: colour, no ambient occlusion": partial(plain.render, *shown),
-        }
-        for name in ("open3d", "pyrender"):
-            try:
-                tasks[f"{name}: colour"] = partial(make_renderer(name).render, *shown)
-            except RenderError as error:
-                print(error, file=sys.stderr)
-                continue
-            if name == "open3d":
-                tasks["open3d: geometry"] = lambda: cast_geometry(
-                    *shown, caster=scene.open3d_caster
-                )
-        rows = []
-        for name, task in tasks.items():
-            task()  # prepares what is prepared once
-            times = [1e3 * section.seconds(task) for _ in range(self.repetitions)]
-            median, limit = float(np.median(times)), _LIMITS.get(name)
-            rows.append({"task": name, "median ms": median, "smallest": min(times), "limit": limit})
-        share = 100 * float(cast_geometry(*shown).mask.mean())
-        yield RatioTable(
-            f"20,480 triangles on {share:.0f} % of the image, {os.cpu_count()} cores", rows
-        )
+    camera = Camera.from_fov(640, 480, fov_x=50.0)
+    scene = Scene(ball(5))
+    rotation = look_at(azimuth=35, elevation=20, distance=3).rotation
+    pose = frame_object(scene.bounds, camera, rotation=rotation, fill=0.9)
+    vertices = scene.mesh.vertices
+    keypoints = vertices[np.random.default_rng(0).choice(len(vertices), 20)]
+    shown = scene, camera, pose
+    plain = RaycastRenderer(studio=Studio(occlusion=0))
+    tasks: dict[str, Callable[[], object]] = {
+        "once per mesh: ray hierarchy": lambda: Scene(scene.mesh).caster,
+        "once per mesh: smooth normals": lambda: Scene(scene.mesh).corner_normals,
+        "visibility of 20 keypoints": lambda: visible_keypoints(scene, keypoints, camera, pose),
+        "raycast: geometry": lambda: cast_geometry(*shown),
+        "raycast: colour": partial(RaycastRenderer().render, *shown),
+        "raycast: colour, no ambient occlusion": partial(plain.render, *shown),
+    }
+    for name in ("open3d", "pyrender"):
+        try:
+            tasks[f"{name}: colour"] = partial(make_renderer(name).render, *shown)
+        except RenderError as error:
+            print(error, file=sys.stderr)
+            continue
+        if name == "open3d":
+            tasks["open3d: geometry"] = lambda: cast_geometry(*shown, caster=scene.open3d_caster)
+    rows = []
+    for name, task in tasks.items():
+        task()  # prepares what is prepared once
+        times = [1e3 * section.seconds(task) for _ in range(repetitions)]
+        median, limit = float(np.median(times)), _LIMITS.get(name)
+        rows.append({"task": name, "median ms": median, "smallest": min(times), "limit": limit})
+    share = 100 * float(cast_geometry(*shown).mask.mean())
+    yield f"20,480 triangles on {share:.0f} % of the image, {os.cpu_count()} cores", rows

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from benchmarks import section
 from benchmarks.cars import car_tracks
-from benchmarks.section import BenchmarkData, RatioTable, Row
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Motion, RansacOptions, Result, ShapeModel, Tracker, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
@@ -22,90 +22,99 @@ _RADIUS_95 = 7.815  # squared, of three degrees of freedom
 _KEYPOINTS = 10
 
 
-@dataclass
-class Tracks:
+def tracks(
+    given: BenchmarkData,
+    *,
+    categories: tuple[str, ...] = ("chair", "car", "mug"),
+    objects: int = 12,
+    frames: int = 40,
+    lengths: tuple[int, ...] = (100, 300, 1000, 3000),
+) -> Tables:
     """Accuracy and times of tracks of learned shapes, simulated and real.
 
     Errors are over the bound, the inverse information of all evidence and priors, of which errors
     are drawn: the joint bound for views of unknown motion, that with the motion for smooth tracks.
+
+    Parameters
+    ----------
+    categories : tuple[str, ...]
+        Categories; those without held-out models in the data are left out.
+    objects : int
+        Objects of each category.
+    frames : int
+        Frames of a simulated video.
+    lengths : tuple[int, ...]
+        Frames of the timed videos.
     """
+    dataset, rows = KeypointNet(given.needed()), []
+    for name in categories:
+        if name in dataset.categories:
+            shape = ShapeModel.from_dataset(dataset, name, meshes=False)
+            # Objects are drawn from it: nothing calibrates it for those that it did not learn.
+            plain = {"inflation": 1.0, "degrees_of_freedom": None, "few_keypoints": None}
+            rows += _accuracy(name, replace(shape, **plain), given.seed, objects, frames)
+    yield "objects drawn from the learned shape, unknown motion, then smooth", rows
+    yield "10 % of frames flipped, 20 % of keypoints anywhere", [_mistakes(objects)]
+    yield "KITTI's tracks, every frame", car_tracks(given.real("kitti_cars"))
+    yield "times of smooth tracks, 10 keypoints", _times(lengths)
+    yield "online", [_online()]
 
-    categories: tuple[str, ...] = ("chair", "car", "mug")
-    """Categories; those without held-out models in the data are left out."""
-    objects: int = 12
-    """Objects of each category."""
-    frames: int = 40
-    """Frames of a simulated video."""
-    lengths: tuple[int, ...] = (100, 300, 1000, 3000)
-    """Frames of the timed videos."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        dataset, rows = KeypointNet(given.needed()), []
-        for name in self.categories:
-            if name in dataset.categories:
-                shape = ShapeModel.from_dataset(dataset, name, meshes=False)
-                # Objects are drawn from it: nothing calibrates it for those that it did not learn.
-                plain = {"inflation": 1.0, "degrees_of_freedom": None, "few_keypoints": None}
-                rows += self._accuracy(name, replace(shape, **plain), given.seed)
-        yield RatioTable("objects drawn from the learned shape, unknown motion, then smooth", rows)
-        yield RatioTable("10 % of frames flipped, 20 % of keypoints anywhere", [self._mistakes()])
-        yield RatioTable("KITTI's tracks, every frame", list(car_tracks(given.real("kitti_cars"))))
-        yield RatioTable("times of smooth tracks, 10 keypoints", list(self._times()))
-        yield RatioTable("online", [_online()])
+def _accuracy(name: str, shape: ShapeModel, seed: int, objects: int, frames: int) -> Iterator[Row]:
+    ways: dict[str, Motion | None] = {"joint": None, "smooth": Motion()}
+    found: dict[str, list[FloatArray]] = {way: [] for way in ways}
+    for number in range(objects):
+        rng = np.random.default_rng([seed, number])
+        video = _video(rng, shape, frames=frames)
+        for way, motion in ways.items():
+            result = align(shape, video.views, motion=motion)
+            found[way].append(_compared(result, video, rng))
+    for way, tables in found.items():
+        errors, limits, covered, points = np.concatenate(tables).T
+        yield {
+            "category": name,
+            "way": way,
+            "R, deg": section.spread(errors),
+            "over bound": float(np.median(errors) / np.median(limits)),
+            "rms over bound": float(np.sqrt((errors**2).mean() / (limits**2).mean())),
+            "95 % holds R, %": section.percent(covered),
+            "points, %": section.percent(points),
+        }
 
-    def _accuracy(self, name: str, shape: ShapeModel, seed: int) -> Iterator[Row]:
-        ways: dict[str, Motion | None] = {"joint": None, "smooth": Motion()}
-        found: dict[str, list[FloatArray]] = {way: [] for way in ways}
-        for number in range(self.objects):
-            rng = np.random.default_rng([seed, number])
-            video = _video(rng, shape, frames=self.frames)
-            for way, motion in ways.items():
-                result = align(shape, video.views, motion=motion)
-                found[way].append(_compared(result, video, rng))
-        for way, tables in found.items():
-            errors, limits, covered, points = np.concatenate(tables).T
-            yield {
-                "category": name,
-                "way": way,
-                "R, deg": section.spread(errors),
-                "over bound": float(np.median(errors) / np.median(limits)),
-                "rms over bound": float(np.sqrt((errors**2).mean() / (limits**2).mean())),
-                "95 % holds R, %": section.percent(covered),
-                "points, %": section.percent(points),
-            }
 
-    def _mistakes(self) -> Row:
-        shape, rows = _synthetic_category(), []
-        for number in range(self.objects):
-            rng = np.random.default_rng(number)
-            video = _video(rng, shape, frames=60)
-            wrong = with_mistakes(video, rng, flipped=0.1, outliers=0.2)
-            clean = align(shape, video.views, motion="smooth")
-            robust = align(shape, wrong.views, motion="smooth", ransac=RansacOptions())
-            rows.append([np.median(_errors(each, video)) for each in (clean, robust)])
-        clean_deg, robust_deg = np.median(rows, axis=0).tolist()
-        names = ("clean, deg", "with mistakes, deg", "over clean")
-        return dict(zip(names, (clean_deg, robust_deg, robust_deg / clean_deg), strict=True))
+def _mistakes(objects: int) -> Row:
+    shape, rows = _synthetic_category(), []
+    for number in range(objects):
+        rng = np.random.default_rng(number)
+        video = _video(rng, shape, frames=60)
+        wrong = with_mistakes(video, rng, flipped=0.1, outliers=0.2)
+        clean = align(shape, video.views, motion="smooth")
+        robust = align(shape, wrong.views, motion="smooth", ransac=RansacOptions())
+        rows.append([np.median(_errors(each, video)) for each in (clean, robust)])
+    clean_deg, robust_deg = np.median(rows, axis=0).tolist()
+    names = ("clean, deg", "with mistakes, deg", "over clean")
+    return dict(zip(names, (clean_deg, robust_deg, robust_deg / clean_deg), strict=True))
 
-    def _times(self) -> Iterator[Row]:
-        shape, rng = _synthetic_category(), np.random.default_rng(0)
-        points = _drawn(shape, rng)
-        align(shape, simulate_track(rng, points, shape.ids, frames=5).views, motion="smooth")
-        for frames in self.lengths:
-            views = simulate_track(rng, points, shape.ids, frames=frames, visible=1.0).views
-            _, joint, _ = section.clocked(lambda v=views: align(shape, v))
-            reference = section.reference_seconds()
-            wall, busy, result = section.clocked(lambda v=views: align(shape, v, motion="smooth"))
-            tracemalloc.start()
-            align(shape, views, motion="smooth")
-            _, peak = tracemalloc.get_traced_memory()
-            tracemalloc.stop()
-            yield section.figure(f"track of {frames} frames", wall, "s", busy / reference) | {
-                "processor, s": busy,
-                "without motion, processor s": joint,
-                "jitter, deg": rotation_jitter_deg(result.trajectory.poses),
-                "memory, MB": peak / 1e6,
-            }
+
+def _times(lengths: tuple[int, ...]) -> Iterator[Row]:
+    shape, rng = _synthetic_category(), np.random.default_rng(0)
+    points = _drawn(shape, rng)
+    align(shape, simulate_track(rng, points, shape.ids, frames=5).views, motion="smooth")
+    for frames in lengths:
+        views = simulate_track(rng, points, shape.ids, frames=frames, visible=1.0).views
+        _, joint, _ = section.clocked(lambda v=views: align(shape, v))
+        reference = section.reference_seconds()
+        wall, busy, result = section.clocked(lambda v=views: align(shape, v, motion="smooth"))
+        tracemalloc.start()
+        align(shape, views, motion="smooth")
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        yield section.figure(f"track of {frames} frames", wall, "s", busy / reference) | {
+            "processor, s": busy,
+            "without motion, processor s": joint,
+            "jitter, deg": rotation_jitter_deg(result.trajectory.poses),
+            "memory, MB": peak / 1e6,
+        }
 
 
 def _synthetic_category() -> ShapeModel:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import BenchmarkData, RatioTable, Row, percent
+from benchmarks.section import BenchmarkData, Row, Tables, percent
 from cadalign import Alignment, Model, Result, ShapeModel, View
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
@@ -54,8 +54,14 @@ class _Case(NamedTuple):
     gt: Alignment
 
 
-@dataclass
-class Warned:
+def warned(
+    given: BenchmarkData,
+    *,
+    objects: int = 40,
+    noise_px: float = 2.0,
+    categories: tuple[str, ...] = (),
+    wrong: bool = True,
+) -> Tables:
     """Warnings on right data by kind, and how many of them are of large errors; on wrong data.
 
     Objects of KeypointNet's split val with all keypoints, up to so many of each category. Right
@@ -64,82 +70,94 @@ class Warned:
     `stretch_sigma`); the shape that was learned from the split train. Whether warnings tell good
     estimates from bad ones is seen in rotations off by more than 10 deg or beyond the stated 99 %
     region, among those warned of and among the others.
+
+    Parameters
+    ----------
+    objects : int
+        Objects of each category.
+    noise_px : float
+        Standard deviation of the keypoints [px].
+    categories : tuple[str, ...]
+        Categories; all by default.
+    wrong : bool
+        Measure wrong data, too.
     """
+    rows = list(
+        warned_cases(
+            KeypointNet(given.needed()),
+            objects=objects,
+            noise_px=noise_px,
+            categories=categories,
+            wrong=wrong,
+        )
+    )
+    right = [row for row in rows if row["data"] == "right"]
+    others = [row for row in rows if row["data"] != "right"]
+    yield "Warned of on right data [%]", _by(right, ("model", "category"), _shares)
+    if others:
+        yield "Wrong data named [%]", _by(others, ("data", "model"), _named)
 
-    objects: int = 40
-    """Objects of each category."""
-    noise_px: float = 2.0
-    """Standard deviation of the keypoints [px]."""
-    categories: tuple[str, ...] = ()
-    """Categories; all by default."""
-    wrong: bool = True
-    """Measure wrong data, too."""
 
-    def run(self, given: BenchmarkData) -> Iterator[RatioTable]:
-        rows = list(self.cases(KeypointNet(given.needed())))
-        right = [row for row in rows if row["data"] == "right"]
-        wrong = [row for row in rows if row["data"] != "right"]
-        yield RatioTable("Warned of on right data [%]", _by(right, ("model", "category"), _shares))
-        if wrong:
-            yield RatioTable("Wrong data named [%]", _by(wrong, ("data", "model"), _named))
+def warned_cases(
+    dataset: KeypointNet, *, objects: int, noise_px: float, categories: tuple[str, ...], wrong: bool
+) -> Iterator[Row]:
+    """Every case with its warnings and errors."""
+    chosen = categories or tuple(dataset.categories)
+    shapes = {name: section.learned_shape(dataset, name) for name in chosen}
+    for number, category in enumerate(chosen):
+        differ = models_differ(dataset, category)
+        foreign = shapes[chosen[number - 1]]
+        options = {"noise_px": noise_px, "max_models": objects}
+        for place, seen in section.unseen_objects(dataset, category, objects, **options):
+            rng = instance_rng(0, category, str(place), "warned")
+            for name, case in _right(dataset, seen, shapes[category], differ, rng, noise_px):
+                labels = {"category": category, "model": name}
+                yield labels | {"data": "right"} | _outcome(case, noise_px)
+                for how, bad in list(_wrong(case, foreign, rng)) * wrong:
+                    yield labels | {"data": how} | _outcome(bad, noise_px)
 
-    def cases(self, dataset: KeypointNet) -> Iterator[Row]:
-        """Every case with its warnings and errors."""
-        categories = self.categories or tuple(dataset.categories)
-        shapes = {name: section.learned_shape(dataset, name) for name in categories}
-        for number, category in enumerate(categories):
-            differ = models_differ(dataset, category)
-            foreign = shapes[categories[number - 1]]
-            options = {"noise_px": self.noise_px, "max_models": self.objects}
-            for place, seen in section.unseen_objects(dataset, category, self.objects, **options):
-                rng = instance_rng(0, category, str(place), "warned")
-                for name, case in self._right(dataset, seen, shapes[category], differ, rng):
-                    labels = {"category": category, "model": name}
-                    yield labels | {"data": "right"} | _outcome(case, self.noise_px)
-                    for how, wrong in list(_wrong(case, foreign, rng)) * self.wrong:
-                        yield labels | {"data": how} | _outcome(wrong, self.noise_px)
 
-    def _right(
-        self,
-        dataset: KeypointNet,
-        seen: UnseenObject,
-        shape: ShapeModel,
-        differ: _Differ,
-        rng: np.random.Generator,
-    ) -> Iterator[tuple[str, _Case]]:
-        """The object with each kind of right model."""
-        points, ids = seen.xyz[seen.rows], seen.ids.tolist()
-        if len(points) < _LEAST_KEYPOINTS:
-            return
-        stretch = np.exp(np.append(0.0, rng.normal(0, _STRETCH_SIGMA, 2)))
-        own = Model(points_3d=points / stretch, ids=ids)
-        yield "own", _Case(own, ids, points, seen.points_2d, seen.gt)
-        how: dict[str, Any] = {"shape_sigma": differ.shape, "stretch_sigma": differ.stretch}
-        stretch = np.exp(np.append(0.0, rng.normal(0, differ.stretch, 2)))
-        object_points = (points + rng.normal(0, differ.shape, points.shape)) * stretch
-        gt, noise = seen.gt, rng.normal(0, self.noise_px, seen.points_2d.shape)
-        while not KEYPOINT_CAMERA.contains(
-            KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
-        ).all():
-            gt = replace(gt, translation=gt.translation + _FARTHER)
-        pixels = KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
-        drawn = Model(points_3d=points, ids=ids, **how)
-        yield "similar, drawn", _Case(drawn, ids, object_points, pixels, gt)
-        others = _training_models(dataset, seen.task.category)
-        for number in rng.permutation(len(others)).tolist():
-            of_other, xyz = others[number]
-            shared = np.isin(ids, of_other)
-            if shared.sum() >= min(6, len(ids)):
-                other = Model(points_3d=xyz, ids=of_other, **how)
-                kept = [name for name in ids if name in of_other]
-                yield (
-                    "similar, other",
-                    _Case(other, kept, points[shared], seen.points_2d[shared], seen.gt),
-                )
-                break
-        known = np.isin(ids, shape.ids)
-        kept = [name for name in ids if name in shape.ids]
-        yield "learned", _Case(shape, kept, points[known], seen.points_2d[known], seen.gt)
+def _right(
+    dataset: KeypointNet,
+    seen: UnseenObject,
+    shape: ShapeModel,
+    differ: _Differ,
+    rng: np.random.Generator,
+    noise_px: float,
+) -> Iterator[tuple[str, _Case]]:
+    """The object with each kind of right model."""
+    points, ids = seen.xyz[seen.rows], seen.ids.tolist()
+    if len(points) < _LEAST_KEYPOINTS:
+        return
+    stretch = np.exp(np.append(0.0, rng.normal(0, _STRETCH_SIGMA, 2)))
+    own = Model(points_3d=points / stretch, ids=ids)
+    yield "own", _Case(own, ids, points, seen.points_2d, seen.gt)
+    how: dict[str, Any] = {"shape_sigma": differ.shape, "stretch_sigma": differ.stretch}
+    stretch = np.exp(np.append(0.0, rng.normal(0, differ.stretch, 2)))
+    object_points = (points + rng.normal(0, differ.shape, points.shape)) * stretch
+    gt, noise = seen.gt, rng.normal(0, noise_px, seen.points_2d.shape)
+    while not KEYPOINT_CAMERA.contains(
+        KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
+    ).all():
+        gt = replace(gt, translation=gt.translation + _FARTHER)
+    pixels = KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
+    drawn = Model(points_3d=points, ids=ids, **how)
+    yield "similar, drawn", _Case(drawn, ids, object_points, pixels, gt)
+    others = _training_models(dataset, seen.task.category)
+    for number in rng.permutation(len(others)).tolist():
+        of_other, xyz = others[number]
+        shared = np.isin(ids, of_other)
+        if shared.sum() >= min(6, len(ids)):
+            other = Model(points_3d=xyz, ids=of_other, **how)
+            kept = [name for name in ids if name in of_other]
+            yield (
+                "similar, other",
+                _Case(other, kept, points[shared], seen.points_2d[shared], seen.gt),
+            )
+            break
+    known = np.isin(ids, shape.ids)
+    kept = [name for name in ids if name in shape.ids]
+    yield "learned", _Case(shape, kept, points[known], seen.points_2d[known], seen.gt)
 
 
 # Data ---------------------------------------------------------------------------------------------

@@ -104,10 +104,11 @@ def test_fit_names_another_pose_that_its_deviations_do_not_reach() -> None:
 def measured(real_data: Path, monkeypatch: pytest.MonkeyPatch) -> Measured:
     """Cases of the benchmark, by its options."""
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "scripts")
-    section = importlib.import_module("benchmarks.warned").Warned
+    section = importlib.import_module("benchmarks.warned")
+    usual = {"objects": 40, "noise_px": 2.0, "categories": (), "wrong": True}
 
     def rows(**options: Any) -> list[dict[str, Any]]:
-        cases = section(**options).cases(KeypointNet(real_data / "keypointnet"))
+        cases = section.warned_cases(KeypointNet(real_data / "keypointnet"), **usual | options)
         return [row for row in cases if not row["refused"]]
 
     return rows

@@ -153,7 +153,7 @@ def stream_fits(
     experiment = ManyEstimates(options_of(options))
     pool = workers_of(workers, dask)
     size = 1 if not workers and dask is None else _STREAMED
-    for _, rows in pool.evaluate(experiment, _chunks(observations, size)):
+    for _, rows in pool(experiment, _chunks(observations, size)):
         for row, record in zip(rows.rows, rows.records, strict=True):
             if row["status"] == OK:
                 yield row["row"], Result.from_json(record["result"])
@@ -251,7 +251,7 @@ def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[Ob
         ]
         if not tasks:
             return
-        yield Chunk(index, tasks)
+        yield index, tasks
 
 
 def _tally(folder: RunFolder) -> Tally:

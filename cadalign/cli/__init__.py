@@ -13,7 +13,7 @@ from importlib import import_module
 from inspect import cleandoc
 from operator import or_
 from types import ModuleType, NoneType
-from typing import Annotated, Any, NamedTuple, get_args
+from typing import Annotated, Any, get_args
 
 import tyro
 from tyro.constructors import (
@@ -99,61 +99,37 @@ def _paragraph(text: str | Callable[[], str | None] | None) -> Callable[[], str 
     return joined
 
 
-class _Command(NamedTuple):
-    """Module and class of a command, and the first sentence of its description."""
-
-    module: str
-    name: str
-    summary: str
-
-    def load(self) -> Any:
-        """The command's class; its module is imported when the command is called."""
-        command = getattr(import_module(f"cadalign.cli.{self.module}"), self.name)
-        declared = getattr(command, "with_declared_fields", None)
-        return command if declared is None else declared()
-
-
-COMMANDS = {
-    "demo": _Command(
-        "evaluate",
-        "Demo",
+COMMANDS = {  # the class of each in its module, and the first sentence of its description
+    "demo": (
+        "evaluate.Demo",
         "Align stretched models to pictures of the originals and show the result.",
     ),
-    "fit": _Command(
-        "fit", "Fit", "Align a model to what an observation file holds, and draw the result."
-    ),
-    "observe": _Command(
-        "observe", "Observe", "Pair the keypoints of a detector in a photo with a model's."
-    ),
-    "track": _Command("track", "TrackCommand", "Track objects of a learned shape through a video."),
-    "annotate": _Command(
-        "annotate",
-        "Annotate",
+    "fit": ("fit.Fit", "Align a model to what an observation file holds, and draw the result."),
+    "observe": ("observe.Observe", "Pair the keypoints of a detector in a photo with a model's."),
+    "track": ("track.TrackCommand", "Track objects of a learned shape through a video."),
+    "annotate": (
+        "annotate.Annotate",
         "Mark keypoints on photos and a model in the browser, and see the alignment as you go.",
     ),
-    "retrieve": _Command(
-        "retrieve",
-        "Retrieve",
+    "retrieve": (
+        "retrieve.Retrieve",
         "Find the models of a library that explain an image's keypoints best.",
     ),
-    "library": _Command("library", "LibraryCommand", "Build and inspect libraries of CAD models."),
-    "shape": _Command("shape", "ShapeCommand", "Learn and inspect the shapes of categories."),
-    "evaluate": _Command("evaluate", "Evaluate", "Evaluate methods on a dataset."),
-    "simulate": _Command(
-        "evaluate",
-        "Simulate",
+    "library": ("library.LibraryCommand", "Build and inspect libraries of CAD models."),
+    "shape": ("shape.ShapeCommand", "Learn and inspect the shapes of categories."),
+    "evaluate": ("evaluate.Evaluate", "Evaluate methods on a dataset."),
+    "simulate": (
+        "evaluate.Simulate",
         "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
     ),
-    "report": _Command("report", "ReportCommand", "Show the result of one or more runs."),
-    "export": _Command("export", "Export", "Write a fit for another tool."),
-    "render": _Command(
-        "render",
-        "Render",
+    "report": ("report.ReportCommand", "Show the result of one or more runs."),
+    "export": ("export.Export", "Write a fit for another tool."),
+    "render": (
+        "render.Render",
         "Draw a model: a still, a contact sheet of several views, or a turntable.",
     ),
-    "doctor": _Command(
-        "doctor",
-        "Doctor",
+    "doctor": (
+        "doctor.Doctor",
         "Check the renderers and their speed, and show how to enable missing ones.",
     ),
 }
@@ -200,25 +176,32 @@ def _present(word: str) -> str:
     return f"{present}{equals}{value}"
 
 
+def class_of(name: str) -> Any:
+    """The class of a command; its module is imported when the command is called."""
+    module, _, kind = COMMANDS[name][0].partition(".")
+    command = getattr(import_module(f"cadalign.cli.{module}"), kind)
+    declared = getattr(command, "with_declared_fields", None)
+    return command if declared is None else declared()
+
+
 def _parse(arguments: list[str]) -> Any:
     """The called command with its options; any other line is answered by help or an error."""
     config = (tyro.conf.OmitSubcommandPrefixes,)
     name, *rest = arguments or [""]
     if name in COMMANDS:
         with _defaults_taken_as_typed():
-            command, prog = COMMANDS[name].load(), f"cadalign {name}"
-            text = cleandoc(str(command.__doc__))
+            command = class_of(name)
             return tyro.cli(
                 command,
-                prog=prog,
-                description=text,
+                prog=f"cadalign {name}",
+                description=cleandoc(str(command.__doc__)),
                 args=rest,
                 config=config,
                 registry=plain_help(),
             )
     stubs = [
-        Annotated[_Listed, tyro.conf.subcommand(name, description=each.summary)]
-        for name, each in COMMANDS.items()
+        Annotated[_Listed, tyro.conf.subcommand(name, description=summary)]
+        for name, (_, summary) in COMMANDS.items()
     ]
     listed: Any = reduce(or_, stubs)
     return tyro.cli(

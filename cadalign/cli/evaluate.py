@@ -52,39 +52,25 @@ class RunCommand(JsonOption, RunOptions):
         write_run_report(run.folder)
         return code
 
-    def load_plugins(self) -> tuple[str, ...]:
-        """Names of methods that the command line brings along; see `MethodsCommand`."""
-        return ()
-
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run, showing its progress; gives its specification and its tables."""
+        from cadalign.evaluation.api import prepared
+        from cadalign.evaluation.methods.registry import load_plugin
         from cadalign.evaluation.runs.folder import RunFolder
-        from cadalign.evaluation.runs.run import execute, workers_of
+        from cadalign.evaluation.runs.run import execute
 
         kind = self.options_type
-        spec = spec_named(kind.experiment)
         with named_as_flags(self):
-            names = self.load_plugins()
+            found = (load_plugin(text) for text in getattr(self, "plugin", ()))
+            names = tuple(name for name in found if name is not None)
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
             options = options.with_methods(names) if names else options
-            count = options.default_workers if self.workers is None else self.workers
-            workers = workers_of(count, self.dask, threads=options.threads)
-            out = self.out or Path("runs") / options.run_name
-            plan = spec.plan(options, RunFolder(out))
+            folder = RunFolder(self.out or Path("runs") / options.run_name)
+            plan, pool = prepared(options, folder, workers=self.workers, dask=self.dask)
         with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:
-            execute(plan, RunFolder(out), workers=workers, on_progress=on_progress)
-        return spec, spec.open(out)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MethodsCommand(PluginOption, RunCommand):
-    """Command of an experiment that runs functions of one's own as well."""
-
-    def load_plugins(self) -> tuple[str, ...]:
-        """Register the plugins' functions; returns their names."""
-        from cadalign.evaluation.methods.registry import load_plugin
-
-        return tuple(name for text in self.plugin if (name := load_plugin(text)) is not None)
+            execute(plan, folder, workers=pool, on_progress=on_progress)
+        spec = spec_named(kind.experiment)
+        return spec, spec.open(folder.path)
 
 
 def command_of(
@@ -96,16 +82,17 @@ def command_of(
 ) -> Any:
     """The command of an experiment: its options, those of every run, and those of its ``base``.
 
-    ``about`` is its help, by default that of the options; ``defaults`` are options that it gives
-    and that cannot be typed.
+    Experiments that run functions take plugins. ``about`` is its help, by default that of the
+    options; ``defaults`` are options that it gives and that cannot be typed.
     """
+    plugins = (PluginOption,) if issubclass(options, FunctionOptions) else ()
     given = [
         (name, Annotated[str, tyro.conf.Suppress], field(default=value))
         for name, value in defaults.items()
     ]
     namespace = {"options_type": options, "__doc__": about or options.__doc__}
     return make_dataclass(
-        options.__name__, given, bases=(base, options), namespace=namespace, frozen=True
+        options.__name__, given, bases=(*plugins, base, options), namespace=namespace, frozen=True
     )
 
 
@@ -137,11 +124,7 @@ class EvaluateShow(JsonOption):
 def _evaluations() -> dict[str, Any]:
     """The command of every experiment that `cadalign evaluate` runs, and `show`."""
     commands = {
-        options.experiment: command_of(
-            options,
-            MethodsCommand if issubclass(options, FunctionOptions) else RunCommand,
-            about=f"{getdoc(options)}\n\n{_EXIT_CODES}",
-        )
+        options.experiment: command_of(options, about=f"{getdoc(options)}\n\n{_EXIT_CODES}")
         for options in known_options()
         if options.command == _COMMAND
     }
@@ -153,8 +136,7 @@ def _sweeps() -> dict[str, Any]:
     from cadalign.evaluation.experiments.simulation import SweepOptions
 
     return {
-        name: command_of(SweepOptions, MethodsCommand, about=about, sweep=name)
-        for name, about in _SWEEPS.items()
+        name: command_of(SweepOptions, about=about, sweep=name) for name, about in _SWEEPS.items()
     }
 
 

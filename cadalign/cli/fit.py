@@ -26,7 +26,6 @@ from cadalign.cli.options import (
     EvidenceOptions,
     FlaggedOptions,
     ManyCommand,
-    ObservationCommand,
     flag_of,
     named_as_flags,
 )
@@ -63,8 +62,29 @@ class _RansacOptions(FlaggedOptions, RansacOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class EstimateOptions(ObservationFit, ObservationCommand):
-    """Model, noise, focal length and robust search of a fit."""
+class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
+    """Align a model to what an observation file holds, and draw the result.
+
+    Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
+    known lengths. Prints the alignment and, where there is more than keypoints of one image, the
+    standard deviations without each piece of evidence. --mask, --model and --camera without any
+    observation align the model to a mask alone. Writes fit.json and overlay.png,
+    overlay_1.png and so on for further views; of a file with several objects of one photo, which
+    share its camera, scene.json and a folder for each. Many observations are a run, which goes on
+    where it was killed: it writes results.parquet and results.csv with a row for each, and
+    report.html. Exit codes of a run: 0 all are aligned, 3 some failed, 1 all failed or refused, 2 a
+    wrong command line.
+    """
+
+    out: Path | None = None
+    """Folder to write to; by default <observation>_fit beside the file or folder."""
+    overlay: Path | None = None
+    """Draw the aligned model over the photo, too, and write it to this picture; further views to
+    FILE_1 and so on. The observation names the model. For many observations, a folder."""
+    overlay_mode: Literal["shaded", "translucent", "lines", "box"] = "shaded"
+    """Style of drawing: in its own colours, as a red veil, its outline and creases, or its box."""
+    overlay_opacity: float = 0.6
+    """Opacity of the shaded or translucent model, 0 to 1."""
 
     # A group's own text: without it, tyro reads the documentation of all options for every fit.
     fitting: Annotated[
@@ -88,32 +108,6 @@ class EstimateOptions(ObservationFit, ObservationCommand):
         given["fitting"] = FitOptions(**vars(self.fitting))
         given["ransac"] = RansacOptions(**vars(self.ransac))
         return ObservationFit(**given)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Fit(ManyCommand, EstimateOptions, CameraOptions, EvidenceOptions):
-    """Align a model to what an observation file holds, and draw the result.
-
-    Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
-    known lengths. Prints the alignment and, where there is more than keypoints of one image, the
-    standard deviations without each piece of evidence. --mask, --model and --camera without any
-    observation align the model to a mask alone. Writes fit.json and overlay.png,
-    overlay_1.png and so on for further views; of a file with several objects of one photo, which
-    share its camera, scene.json and a folder for each. Many observations are a run, which goes on
-    where it was killed: it writes results.parquet and results.csv with a row for each, and
-    report.html. Exit codes of a run: 0 all are aligned, 3 some failed, 1 all failed or refused, 2 a
-    wrong command line.
-    """
-
-    out: Path | None = None
-    """Folder to write to; by default <observation>_fit beside the file or folder."""
-    overlay: Path | None = None
-    """Draw the aligned model over the photo, too, and write it to this picture; further views to
-    FILE_1 and so on. The observation names the model. For many observations, a folder."""
-    overlay_mode: Literal["shaded", "translucent", "lines", "box"] = "shaded"
-    """Style of drawing: in its own colours, as a red veil, its outline and creases, or its box."""
-    overlay_opacity: float = 0.6
-    """Opacity of the shaded or translucent model, 0 to 1."""
 
     def run(self) -> int:
         """Run the fit, or the fits; returns the exit code."""

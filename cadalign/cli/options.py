@@ -72,19 +72,10 @@ def flag_of(name: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ObservationCommand(JsonOption):
-    """Options of the commands on an observation file."""
-
-    out: Path | None = None
-    """Folder to write to; by default, fit writes to <observation>_fit beside the file."""
-    sigma: float | None = None
-    """Standard deviation of the keypoints [px]; by default the file's, or 1."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ManyCommand(ObservationCommand, DetectorOptions):
+class ManyCommand(JsonOption, DetectorOptions):
     """Options of the commands on one observation, or on many."""
 
+    out: Path | None = None
     observations: Annotated[
         tuple[Path, ...],
         tyro.conf.Positional,

@@ -15,7 +15,9 @@ from cadalign.evaluation.portable import names_of
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.parallel import Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
+from cadalign.evaluation.runs.work import Plan
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -131,11 +133,17 @@ def run(
 
     ``workers`` and ``dask`` are those of `evaluate`; ``on_progress`` is told of every chunk.
     """
-    pool = workers_of(
-        options.default_workers if workers is None else workers, dask, threads=options.threads
-    )
-    plan = spec_named(options.experiment).plan(options, folder)
+    plan, pool = prepared(options, folder, workers=workers, dask=dask)
     execute(plan, folder, workers=pool, on_progress=on_progress)
+
+
+def prepared(
+    options: ExperimentOptions, folder: RunFolder, *, workers: int | None, dask: str | None
+) -> tuple[Plan[Any], Workers]:
+    """The plan and the workers of `run`."""
+    count = options.default_workers if workers is None else workers
+    pool = workers_of(count, dask, threads=options.threads)
+    return spec_named(options.experiment).plan(options, folder), pool
 
 
 def _frame(folder: RunFolder) -> pd.DataFrame:

@@ -21,7 +21,7 @@ from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import fingerprint
-from cadalign.io.files import read_bytes, writing
+from cadalign.io.files import made_folder, read_bytes
 from cadalign.shapes.model import ShapeModel
 
 if TYPE_CHECKING:
@@ -122,9 +122,7 @@ def learn(
 
     train = dataset.subset(categories=categories, split=split)
     folder.make()
-    place = folder.path / "learned"
-    with writing(place):
-        place.mkdir(exist_ok=True)
+    place = made_folder(folder.path / "learned")
     shapes = []
     for category in categories:
         file = place / f"{category}-{_hash_of_models(train[category])}.shape"

@@ -153,6 +153,13 @@ def writing(path: Path) -> Iterator[None]:
         ) from None
 
 
+def made_folder(path: Path) -> Path:
+    """Make a folder, with those above it; returns it."""
+    with writing(path):
+        path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def printable(path: Path | str) -> str:
     """A path for a message, quoted where a terminal does not show it, shortened where endless."""
     text = str(path)

@@ -60,7 +60,7 @@ from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.opened import Run
-from cadalign.io.files import dense_json, write_text, writing
+from cadalign.io.files import dense_json, made_folder, write_text
 from cadalign.report.headline import Headline, headline_of
 from cadalign.report.instances import (
     INLINE_LIMIT,
@@ -124,8 +124,7 @@ def write_report(
     """
     page = Path(path)
     found = read_runs(runs)
-    with writing(page.parent):
-        page.parent.mkdir(parents=True, exist_ok=True)
+    made_folder(page.parent)
     table, media, folder = None, {}, None
     metrics = shown_metrics(found)
     if metrics:

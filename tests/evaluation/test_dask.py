@@ -19,7 +19,7 @@ from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.api import run, simulate
 from cadalign.evaluation.experiments.simulation import SweepOptions, sweep_benchmark
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import DaskWorkers
+from cadalign.evaluation.runs.parallel import on_dask
 from cadalign.evaluation.runs.run import Progress
 
 distributed = pytest.importorskip(
@@ -146,7 +146,6 @@ def test_a_lost_scheduler_is_told_of_and_the_run_goes_on(
 @pytest.mark.long
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
 def test_an_address_where_no_scheduler_is_gives_an_error(address: str) -> None:
-    workers = DaskWorkers(address, timeout=1.0)
     with pytest.raises(DataError, match="no Dask scheduler answers") as caught:
-        next(workers.evaluate(sweep_benchmark(KIND.kind, seed=0), []))
+        next(on_dask(sweep_benchmark(KIND.kind, seed=0), [], address=address, timeout=1.0))
     assert caught.value.where == address

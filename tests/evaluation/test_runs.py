@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cloudpickle
@@ -24,9 +25,9 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import (
     KILLED_REASON,
-    InProcess,
-    LocalProcesses,
     evaluate_chunk,
+    in_processes,
+    in_this_process,
 )
 from cadalign.evaluation.runs.run import Progress, execute, workers_of
 from cadalign.evaluation.runs.tables import (
@@ -173,7 +174,7 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path: Path) -> None:
             raise InterruptedError_
 
     folder = RunFolder(tmp_path / "cut")
-    plan, workers = Plan(Squares(), range(100), {"value": 1}, 7), InProcess()
+    plan, workers = Plan(Squares(), range(100), {"value": 1}, 7), in_this_process
     with pytest.raises(InterruptedError_):
         execute(plan, folder, workers=workers, on_progress=interrupt)
     assert not folder.is_finished
@@ -203,7 +204,7 @@ def test_damaged_chunks_are_noticed_at_the_start_and_done_again(
     table: str,
 ) -> None:
     folder = RunFolder(tmp_path / "run")
-    plan, workers = Plan(Squares(), range(100), {"value": 1}, 7), InProcess()
+    plan, workers = Plan(Squares(), range(100), {"value": 1}, 7), in_this_process
 
     def interrupt(progress: Progress) -> None:
         if progress.done >= 35:
@@ -228,9 +229,9 @@ def test_long_differences_are_cut(tmp_path: Path) -> None:
         Plan(Squares(), range(7), {f"value{k}": [k * sign] * 500 for k in range(1, 20)}, 7)
         for sign in (1, -1)
     ]
-    execute(plans[0], RunFolder(tmp_path), workers=InProcess())
+    execute(plans[0], RunFolder(tmp_path), workers=in_this_process)
     with pytest.raises(DataError, match=r"\.\.\. now; and 13 more differences; give") as caught:
-        execute(plans[1], RunFolder(tmp_path), workers=InProcess())
+        execute(plans[1], RunFolder(tmp_path), workers=in_this_process)
     assert len(str(caught.value)) < 2000
 
 
@@ -326,7 +327,7 @@ def test_a_tables_bytes_do_not_show_its_pieces(tmp_path: Path) -> None:
 def test_a_wrong_number_of_workers_is_an_error(count: int) -> None:
     with pytest.raises(InputError, match="not a number of processes"):
         workers_of(count, None)
-    assert workers_of(-1, None) == LocalProcesses(-1)
+    assert str(workers_of(-1, None)) == str(partial(in_processes, count=-1))
 
 
 def test_a_chunk_with_a_failing_task_keeps_its_order() -> None:

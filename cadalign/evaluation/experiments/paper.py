@@ -26,7 +26,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.summary import ALL, Summary, csv_text
-from cadalign.io.files import write_text, writing
+from cadalign.io.files import made_folder, write_text, writing
 from cadalign.web import asset, fill
 
 _TITLE = "The AEPnP paper's tables and figures"
@@ -56,9 +56,7 @@ def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda
     ``index.html`` is the same as a page. ``announce`` gets the name of the next run, and returns
     the function that gets its progress.
     """
-    figures = plan.out / "figures"
-    with writing(figures):
-        figures.mkdir(parents=True, exist_ok=True)
+    made_folder(plan.out / "figures")
     sections = [f"# {_TITLE}\n", _settings(plan)]
     sections += [_table_section(plan, announce)]
     for name in SWEEPS:

@@ -25,7 +25,7 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
 from cadalign.geometry.mesh import Mesh, cluster, mesh_edges, simplify
-from cadalign.io.files import dense_json, write_text, write_whole, writing
+from cadalign.io.files import dense_json, made_folder, write_text, write_whole
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
@@ -183,9 +183,9 @@ def keep_preview(folder: RunFolder, root: Path, task: KeypointTask) -> None:
     except DataError as error:
         logger.warning("no preview of the mesh: %s", error)
         return
-    with writing(folder.previews):
-        folder.previews.mkdir(exist_ok=True)
-    write_preview(folder.previews / f"{record_stem(task.category, task.model_id)}.json", mesh)
+    write_preview(
+        made_folder(folder.previews) / f"{record_stem(task.category, task.model_id)}.json", mesh
+    )
 
 
 _dataset = lru_cache(maxsize=1)(KeypointNet)

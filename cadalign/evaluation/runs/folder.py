@@ -16,7 +16,7 @@ from msgspec import Meta, field
 
 from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file
-from cadalign.io.files import read_text, refuse_nul, write_json, writing
+from cadalign.io.files import made_folder, read_text, refuse_nul, write_json, writing
 
 _FORMAT = 2
 _LONGEST_VALUE = 80
@@ -71,22 +71,18 @@ class RunFolder:
 
     def make(self) -> None:
         """Make the folder."""
-        with writing(self.path):
-            self.path.mkdir(parents=True, exist_ok=True)
+        made_folder(self.path)
 
     def made_for_pictures(self) -> RunFolder:
         """Make the folder and those in it that pictures go to; returns it by its full path."""
         self.make()
         for path in (self.overlays, self.thumbs, self.pictures, self.previews):
-            with writing(path):
-                path.mkdir(exist_ok=True)
+            made_folder(path)
         return RunFolder(self.path.absolute())
 
     def made_figures(self) -> Path:
         """Make the folder of figures; returns it."""
-        with writing(self.figures):
-            self.figures.mkdir(exist_ok=True)
-        return self.figures
+        return made_folder(self.figures)
 
     @contextmanager
     def locked(self) -> Iterator[None]:

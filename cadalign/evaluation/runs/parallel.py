@@ -28,8 +28,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.outcome import reason_of
@@ -46,76 +45,57 @@ _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NU
 KILLED_REASON = f"it killed its worker process {_STRIKES} times (a crash, or out of memory)"
 
 
-@dataclass(frozen=True)
-class Chunk(Generic[T]):
-    """Successive tasks of a run, which has many."""
-
-    index: int
-    tasks: Sequence[T]
-
-
+Chunk = tuple[int, Sequence[T]]
+"""Successive tasks of a run, which has many, and their number."""
 Evaluated = Iterator[tuple[Chunk[T], Rows]]
+Workers = Callable[[Experiment[Any], Iterable[Chunk[Any]]], Evaluated[Any]]
+"""Place where chunks are evaluated, which yields each with its result, in any order."""
 
 
-class Workers(Protocol):
-    """Place where chunks are evaluated."""
-
-    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
-        """Evaluate chunks; yields each with its result, in any order."""
-
-
-@dataclass(frozen=True)
-class InProcess:
-    """No workers: everything happens in this process, in so many threads; a crash ends it.
+def in_this_process(
+    experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, threads: int = 1
+) -> Evaluated[T]:
+    """Evaluate chunks here, in so many threads; a crash ends this process.
 
     Threads serve what lets go of the interpreter lock, such as drawing.
     """
-
-    threads: int = 1
-
-    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
-        if self.threads > 1:
-            with ThreadPoolExecutor(self.threads) as pool:
-                yield from evaluate_on(
-                    lambda: pool, experiment, chunks, window=self.threads, deadly=()
-                )
-            return
-        for chunk in chunks:
-            yield chunk, evaluate_chunk(experiment, chunk.tasks)
+    if threads > 1:
+        with ThreadPoolExecutor(threads) as pool:
+            yield from evaluate_on(lambda: pool, experiment, chunks, window=threads, deadly=())
+        return
+    for chunk in chunks:
+        yield chunk, evaluate_chunk(experiment, chunk[1])
 
 
-@dataclass(frozen=True)
-class LocalProcesses:
-    """So many worker processes on this machine, joblib's; -1 for one for each core."""
+def in_processes(
+    experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, count: int
+) -> Evaluated[T]:
+    """Evaluate chunks in so many processes on this machine, joblib's; -1 for one for each core."""
+    from joblib import cpu_count
+    from joblib.externals.loky import get_reusable_executor
 
-    count: int
+    count = cpu_count() if count < 0 else count
+    used: list[Executor] = []
 
-    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
-        from joblib import cpu_count
-        from joblib.externals.loky import get_reusable_executor
+    def executor() -> Executor:
+        # A broken one is replaced; workers wait a while for more, then end by themselves.
+        pool = get_reusable_executor(
+            max_workers=count,
+            timeout=_IDLE_SECONDS,
+            env=_ENVIRONMENT,
+            initializer=_end_with,
+            initargs=(os.getpid(),),
+        )
+        used[:] = [pool]
+        return cast(Executor, pool)
 
-        count = cpu_count() if self.count < 0 else self.count
-        used: list[Executor] = []
-
-        def executor() -> Executor:
-            # A broken one is replaced; workers wait a while for more, then end by themselves.
-            pool = get_reusable_executor(
-                max_workers=count,
-                timeout=_IDLE_SECONDS,
-                env=_ENVIRONMENT,
-                initializer=_end_with,
-                initargs=(os.getpid(),),
-            )
-            used[:] = [pool]
-            return cast(Executor, pool)
-
-        try:
-            yield from evaluate_on(
-                executor, experiment, chunks, window=count + 1, deadly=(BrokenProcessPool,)
-            )
-        finally:
-            for pool in used:
-                pool.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
+    try:
+        yield from evaluate_on(
+            executor, experiment, chunks, window=count + 1, deadly=(BrokenProcessPool,)
+        )
+    finally:
+        for pool in used:
+            pool.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
 
 
 def _end_with(parent: int) -> None:
@@ -155,7 +135,7 @@ def evaluate_on(
                     exhausted = True
                     break
                 try:
-                    future = executor().submit(evaluate_chunk, experiment, chunk.tasks)
+                    future = executor().submit(evaluate_chunk, experiment, chunk[1])
                 except deadly:
                     suspects.append(chunk)
                     break
@@ -175,7 +155,7 @@ def evaluate_on(
                     raise _cannot_work(reason_of(error)) from error
             if suspects and not running:
                 for chunk in suspects:
-                    yield chunk, _alone(executor, experiment, chunk.tasks, deadly)
+                    yield chunk, _alone(executor, experiment, chunk[1], deadly)
                 suspects = []
     finally:
         for future in running:
@@ -273,65 +253,62 @@ def _quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-@dataclass(frozen=True)
-class DaskWorkers:
-    """The workers of a Dask cluster, whose scheduler has an address such as ``tcp://10.0.0.1:8786``.
+def on_dask(
+    experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, address: str, timeout: float = 30.0
+) -> Evaluated[T]:
+    """Evaluate chunks on a Dask cluster, whose scheduler's address is such as tcp://10.0.0.1:8786.
 
-    They need the same version of cadalign, and for meshes and overlays the same folders under the
-    same names. Dask itself hands a chunk whose worker dies to others, until the cluster's
-    ``distributed.scheduler.allowed-failures`` is exceeded.
+    Its workers need the same version of cadalign, and for meshes and overlays the same folders
+    under the same names. Dask itself hands a chunk whose worker dies to others, until the cluster's
+    ``distributed.scheduler.allowed-failures`` is exceeded. ``timeout`` is that of the scheduler,
+    and of its first worker [s].
     """
-
-    address: str
-    timeout: float = 30.0  # of the scheduler, and of its first worker [s]
-
-    def evaluate(self, experiment: Experiment[T], chunks: Iterable[Chunk[T]]) -> Evaluated[T]:
+    try:
+        from distributed import Client, KilledWorker
+    except ImportError:
+        raise CadalignError(
+            "Dask is not installed", where="--dask", fix="pip install 'cadalign[dask]'"
+        ) from None
+    try:
+        _check_address(address)
+        # `distributed` is not typed throughout.
+        client: Any = Client(  # type: ignore[no-untyped-call]
+            address, timeout=timeout, set_as_default=False
+        )
+    except (OSError, ValueError) as error:
+        raise DataError(
+            f"no Dask scheduler answers ({str(error)[:200]})",
+            where=printable(address),
+            fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
+        ) from None
+    with _quiet(), client:
         try:
-            from distributed import Client, KilledWorker
-        except ImportError:
-            raise CadalignError(
-                "Dask is not installed", where="--dask", fix="pip install 'cadalign[dask]'"
-            ) from None
-        try:
-            _check_address(self.address)
-            # `distributed` is not typed throughout.
-            client: Any = Client(  # type: ignore[no-untyped-call]
-                self.address, timeout=self.timeout, set_as_default=False
-            )
-        except (OSError, ValueError) as error:
+            client.wait_for_workers(1, timeout=timeout)
+        except TimeoutError:
             raise DataError(
-                f"no Dask scheduler answers ({str(error)[:200]})",
-                where=printable(self.address),
-                fix="start one with `dask scheduler`, and give its address, tcp://host:8786",
+                "the Dask cluster has no workers",
+                where=address,
+                fix="start some with `dask worker ADDRESS`",
             ) from None
-        with _quiet(), client:
-            try:
-                client.wait_for_workers(1, timeout=self.timeout)
-            except TimeoutError:
-                raise DataError(
-                    "the Dask cluster has no workers",
-                    where=self.address,
-                    fix="start some with `dask worker ADDRESS`",
-                ) from None
-            threads = sum(client.nthreads().values())
-            # Named by chance: to name a chunk by its content takes longer than to evaluate it.
-            executor = client.get_executor(pure=False)
-            try:
-                yield from evaluate_on(
-                    lambda: executor,
-                    experiment,
-                    chunks,
-                    # Clusters grow, and a round trip may cost more than a chunk.
-                    window=2 * threads + 2,
-                    deadly=(KilledWorker,),
-                )
-            except Exception as error:
-                if client.status == "running" and not isinstance(error, CancelledError):
-                    raise
-                raise CadalignError(
-                    "the Dask cluster has gone away",
-                    where=self.address,
-                    fix="start the same command again with a cluster: the run goes on",
-                ) from None
-            finally:
-                executor.shutdown(wait=False)
+        threads = sum(client.nthreads().values())
+        # Named by chance: to name a chunk by its content takes longer than to evaluate it.
+        executor = client.get_executor(pure=False)
+        try:
+            yield from evaluate_on(
+                lambda: executor,
+                experiment,
+                chunks,
+                # Clusters grow, and a round trip may cost more than a chunk.
+                window=2 * threads + 2,
+                deadly=(KilledWorker,),
+            )
+        except Exception as error:
+            if client.status == "running" and not isinstance(error, CancelledError):
+                raise
+            raise CadalignError(
+                "the Dask cluster has gone away",
+                where=address,
+                fix="start the same command again with a cluster: the run goes on",
+            ) from None
+        finally:
+            executor.shutdown(wait=False)

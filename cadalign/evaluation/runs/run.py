@@ -18,15 +18,16 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from cadalign.errors import InputError
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.parallel import Chunk, DaskWorkers, InProcess, LocalProcesses, Workers
+from cadalign.evaluation.runs.parallel import Workers, in_processes, in_this_process, on_dask
 from cadalign.evaluation.runs.tables import Columns, is_whole, read_table, write_rows, write_tables
 from cadalign.evaluation.runs.work import Experiment, Plan
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import made_folder, write_json
 
 logger = logging.getLogger("cadalign")
 
@@ -72,21 +73,21 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
     ``threads`` share the work of a run without workers.
     """
     if dask is not None:
-        return DaskWorkers(dask)
+        return partial(on_dask, address=dask)
     if count < -1:
         raise InputError(
             f"{count} is not a number of processes",
             where="workers",
             fix="give 1 or more, -1 for one for each core, 0 for none",
         )
-    return LocalProcesses(count) if count else InProcess(threads)
+    return (
+        partial(in_processes, count=count) if count else partial(in_this_process, threads=threads)
+    )
 
 
 def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: OnProgress) -> None:
     """Do the chunks that are not done."""
-    with writing(folder.parts):
-        folder.parts.mkdir(exist_ok=True)
-        _sweep(folder.parts)
+    _sweep(made_folder(folder.parts))
     experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
     starts = range(0, len(tasks), size)
     missing = [k for k in range(len(starts)) if not _is_done(experiment, folder, k)]
@@ -95,13 +96,13 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     on_progress(Progress(done, len(tasks)))
     if not missing:
         return
-    chunks = (Chunk(index, tasks[starts[index] : starts[index] + size]) for index in missing)
-    for chunk, found in workers.evaluate(experiment, chunks):
+    chunks = ((index, tasks[starts[index] : starts[index] + size]) for index in missing)
+    for (index, some), found in workers(experiment, chunks):
         rows = {folder.timings: found.timings, folder.records: found.records}
         for table, columns in _tables(experiment, folder).items():
-            part = folder.part(table, chunk.index)
+            part = folder.part(table, index)
             write_rows(part, columns, rows.get(table, found.rows))
-        done += len(chunk.tasks)
+        done += len(some)
         progress_file.note(done)
         on_progress(Progress(done, len(tasks)))
     progress_file.note(done, last=True)

@@ -132,7 +132,6 @@ def _evaluations() -> dict[str, Any]:
 
 
 def _sweeps() -> dict[str, Any]:
-    """The command of every sweep of the simulation."""
     from cadalign.evaluation.experiments.simulation import SweepOptions
 
     return {

@@ -86,7 +86,6 @@ class LibraryShow:
 
 
 def _describe(library: Library) -> str:
-    """Count the models of each category."""
     counts = Counter(category for category, _ in library.keys)
     listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
     return f"{len(library)} models: {listed}"

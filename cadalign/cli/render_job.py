@@ -161,7 +161,6 @@ def read_keypoints(path: Path, model: Path, mesh: Mesh) -> FloatArray:
 
 
 def _views(word: str, scale: FloatArray) -> list[LabelledView]:
-    """The views that a word names, with labels."""
     if word == "all":
         return [(name, Angles(*angles)) for name, angles in VIEWS.items()]
     if word in VIEWS or not (word.endswith(".json") or Path(word).exists()):

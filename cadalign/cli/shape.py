@@ -81,7 +81,6 @@ class ShapeShow(JsonOption):
 
 
 def _summary(model: ShapeModel) -> dict[str, Any]:
-    """Numbers of a shape model, for JSON and for its text."""
     training, mirror = model.training, model.reflection
     counts = None
     if training is not None:
@@ -113,7 +112,6 @@ def _summary(model: ShapeModel) -> dict[str, Any]:
 
 
 def _text(model: ShapeModel) -> str:
-    """A shape model in lines."""
     summary = _summary(model)
     models = "given" if summary["models"] is None else f"learned from {summary['models']} models"
     lines = [

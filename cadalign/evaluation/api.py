@@ -147,7 +147,6 @@ def prepared(
 
 
 def _frame(folder: RunFolder) -> pd.DataFrame:
-    """The results, with the seconds that they took."""
     run = Run.open(folder.path)
     frame: pd.DataFrame = run.results.to_pandas()
     return frame.assign(seconds=run.cells["seconds"])

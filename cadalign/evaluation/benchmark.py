@@ -212,7 +212,6 @@ class Benchmark:
         )
 
     def _answers(self, method: Method, cases: Sequence[Case]) -> list[tuple[Outcome, Any]]:
-        """One method's outcome of every case, and its estimate or why there is none."""
         instances = [case.instance for case in cases if case.instance is not None]
         solved = self._solved(method, instances)
         pairs = [

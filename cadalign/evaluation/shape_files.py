@@ -196,7 +196,6 @@ def shapes_fingerprint(shapes: Sequence[ShapeModel]) -> str:
 
 
 def _numbers(shape: ShapeModel) -> list[Any]:
-    """The numbers of a shape's components."""
     return [
         np.append([part.weight, *part.mean.ravel(), *part.modes.ravel()], part.residual_sigma)
         for part in shape.components

@@ -241,7 +241,6 @@ def write_line_set(path: Path, exported: AlignedObject, *, frame: Frame = "camer
 
 
 def _pyramid(exported: AlignedObject, number: int, frame: Frame) -> _Lines:
-    """A camera's centre and the corners of its photo."""
     view = exported.views[number]
     distance = float(np.linalg.norm(view.cam_from_model.translation))
     corners = photo_plane(view.camera, None).corners * _FRUSTUM * (distance or 1.0)
@@ -317,7 +316,6 @@ def write_moving_glb(path: Path, objects: Sequence[MovingObject]) -> None:
 
 
 def _animate(tree: dict[str, Any], objects: Sequence[MovingObject]) -> None:
-    """Add the keyframes, in a buffer of their own, and the animation that reads them."""
     nodes = {node.get("name"): number for number, node in enumerate(tree["nodes"])}
     arrays: list[FloatArray] = []
     channels: list[dict[str, Any]] = []

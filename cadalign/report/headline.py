@@ -250,7 +250,6 @@ def _latex(headline: Headline, names: Sequence[str]) -> str:
 def _table(
     headline: Headline, names: Sequence[str], escapes: dict[int, str], best: str
 ) -> tuple[list[str], list[list[str]]]:
-    """The head and the rows as text, numbers rounded, the best ones marked."""
     runs = ["run"] if len(names) > 1 else []
     head = [*runs, headline.group, "method", *(c.heading for c in headline.columns)]
     rows = []
@@ -267,7 +266,6 @@ def _table(
 
 
 def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, str]]:
-    """All rows with their run's name, the paper's behind those on the same category."""
     rows = [(row, names[row.run]) for row in headline.rows]
     for stated in headline.paper:
         place = max(k for k, (row, _) in enumerate(rows) if row.category == stated.category)

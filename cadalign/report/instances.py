@@ -252,7 +252,6 @@ class AssetStore:
             self._write_records(index)
 
     def _write_records(self, index: int) -> None:
-        """Write a file of records."""
         calls, self._calls[index] = self._calls[index], []
         self._exhibit_files[index] = self._write_script(f"exhibits_{index:04d}.js", calls)
 
@@ -262,7 +261,6 @@ class AssetStore:
         return self._address(name)
 
     def _address(self, name: str) -> str:
-        """A file's address, relative to the page."""
         assert self.assets is not None
         folder = os.path.relpath(self.assets, self.page.parent)
         return url_quote(f"{Path(folder).as_posix()}/{name}")
@@ -277,7 +275,6 @@ def _names_in(folder: Path) -> frozenset[str]:
 
 
 def _object(text: str | bytes, path: Path) -> dict[str, Any]:
-    """The JSON object that a text of a file is."""
     try:
         found = msgspec.json.decode(text)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):

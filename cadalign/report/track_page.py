@@ -97,7 +97,6 @@ def write_track_page(
 
 
 def _track_plots(found: Sequence[FoundTrack]) -> list[Plot]:
-    """Plots of pose, speeds and residuals over time, a line for each track."""
     plots = [
         _plot(f"place_{name}", _length(name, f"place {name}"), found, _part(_places, k), _BAND)
         for k, name in enumerate(_AXES)

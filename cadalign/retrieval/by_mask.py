@@ -252,7 +252,6 @@ def cast_match(match: Match, camera: Camera) -> Geometry | None:
 
 
 def _segment(pixels: npt.NDArray[Any], matches: Sequence[Match], camera: Camera) -> BoolArray:
-    """Segment the object by its colours, starting from a box."""
     corners = camera.project(matches[0].box.corners)
     points = np.concatenate([matches[0].points_2d, corners])
     margin = _MARGIN * np.ptp(points, axis=0)

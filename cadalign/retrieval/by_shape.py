@@ -289,7 +289,6 @@ def _poses(
 
 @lru_cache(maxsize=32)
 def _shapes_of(table: ModelTable, category: str, shape: ShapeModel) -> _Shapes:
-    """All models of a category in the terms of its shape model."""
     ids, points = table.keypoints_of(category)
     _, rows, own = np.intersect1d(shape.ids, ids, return_indices=True)
     stacked = np.full((len(points), len(shape.ids) + BOX_ROWS, 3), np.nan)

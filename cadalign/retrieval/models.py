@@ -283,7 +283,6 @@ def row_of(model: LibraryModel) -> dict[str, Any]:
 
 
 def _symmetries_from(text: str, count: int) -> Symmetries:
-    """Read a model's symmetries and check their rows of its ``count`` keypoints."""
     try:
         data, rotations = json.loads(text), []
         for each in data["rotations"]:

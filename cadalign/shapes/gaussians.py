@@ -201,7 +201,6 @@ def _maximise(vectors: Vectors, shares: FloatArray, model: Gaussians, prior: Pri
 
 # SciPy's own checks would take longer than the factorisation of such small matrices.
 def _root(covariance: FloatArray) -> FloatArray:
-    """Lower Cholesky factor."""
     from scipy.linalg.lapack import dpotrf
 
     root, info = dpotrf(covariance, lower=1, clean=1)
@@ -211,7 +210,6 @@ def _root(covariance: FloatArray) -> FloatArray:
 
 
 def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve with a lower Cholesky factor."""
     from scipy.linalg.lapack import dtrtrs
 
     solution, _ = dtrtrs(root, right, lower=1)

@@ -281,7 +281,6 @@ def _truncated(mixture: Gaussians, modes: int) -> Gaussians:
 
 
 def _total(trial: _Trial) -> float:
-    """Log-likelihood of all models."""
     return float(trial.scores.sum())
 
 

@@ -38,7 +38,6 @@ def shape_html(model: ShapeModel) -> str:
 
 
 def _draw(axes: Axes, model: ShapeModel) -> None:
-    """Draw mean keypoints with bars of one standard deviation, seen obliquely."""
     largest = max(model.components, key=lambda component: component.weight)
     view = np.array(_OBLIQUE[model.up_axis or "y"], dtype=float)
     keypoints = largest.mean[:-BOX_ROWS] @ view.T

@@ -87,7 +87,6 @@ def solvers(given: BenchmarkData, *, problems: int = 2000, repetitions: int = 30
 
 
 def _minimal(seed: int, problems: int) -> Row:
-    """Rate of the truth among the solutions, and their number."""
     rng = np.random.default_rng(seed)
     found = solutions = 0
     for _ in range(problems):
@@ -280,7 +279,6 @@ def unknown_focal(
 
 
 def _accuracy(seed: int, points: int, problems: int) -> Row:
-    """Median errors over those of an ideal estimator."""
     rng = np.random.default_rng(seed)
     drawn = [simulate_problem(rng, points=points, noise_px=1.0) for _ in range(problems)]
     batch = cadalign.fit_batch(
@@ -309,7 +307,6 @@ def _accuracy(seed: int, points: int, problems: int) -> Row:
 
 
 def _robust(seed: int, share: float, robust_problems: int) -> Row:
-    """Rate at which outliers are told from inliers."""
     rng = np.random.default_rng(seed)
     found = 0
     for _ in range(robust_problems):

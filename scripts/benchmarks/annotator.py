@@ -162,7 +162,6 @@ def _times(clicks: int, given: BenchmarkData, browser: Browser, folder: Path) ->
 
 
 def _list(photos: int, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-    """The list of a folder of photos, and going from one to the next."""
     case = _case(given, folder)
     large = Image.fromarray(read_photo(case.photo)).resize((2000, 1500))
     case.photo.unlink()
@@ -204,7 +203,6 @@ def _list(photos: int, given: BenchmarkData, browser: Browser, folder: Path) -> 
 
 
 def _kills(kills: int, given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-    """Annotators killed at random moments."""
     rounds = list(kill_at_random(_case(given, folder), rounds=kills, seed=given.seed))
     for each in rounds:
         if each.lost:
@@ -234,7 +232,6 @@ def _new(folder: Path) -> Path:
 def _page(
     browser: Browser, session: Session, *scripts: str, screen: str = "laptop", scheme: str = "light"
 ) -> Iterator[Page]:
-    """The page of a session that is served."""
     width, height = SCREENS[screen]
     size: dict[str, Any] = {"width": width, "height": height, "scheme": scheme}
     with served(session) as access:
@@ -331,7 +328,6 @@ def _serious(page: Page) -> set[str]:
 
 
 def _pictures(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-    """Contact sheets of ten models on every screen, light and dark."""
     sessions = {
         name: _pictured_session(mesh, _new(folder / name))
         for name, mesh in _pictured_models(given.keypointnet)
@@ -381,13 +377,11 @@ def _pictured_models(root: Path | None) -> Iterator[tuple[str, Mesh]]:
 
 
 def _painted(mesh: Mesh, grey: float, *, opacity: float = 1.0) -> Mesh:
-    """The mesh in one grey."""
     material = Material("grey", (grey, grey, grey, opacity))
     return Mesh(mesh.vertices, mesh.faces, polygon=mesh.polygon, materials=(material,))
 
 
 def _pictured_session(mesh: Mesh, folder: Path) -> Session:
-    """A session on a drawing of the mesh, with pairs at visible corners."""
     scene = Scene(mesh)
     turned = look_at(azimuth=215, elevation=25, distance=1.0)
     pose = frame_object(scene.bounds, CAMERA, rotation=turned.rotation, fill=0.8)

@@ -77,7 +77,6 @@ def clicks(given: BenchmarkData, *, draws: int = 3, most: int = 12, within: floa
 
 
 def _needed(clicks: PhotoClicks, method: Estimator, least: int, most: int, within: float) -> int:
-    """The least number from which on all estimates are within the limit."""
     enough = most + 1
     for count in (*range(most, _FEWEST - 1, -1), 0):
         est = attempt(method, clicks.first(count)) if count >= least else None
@@ -237,7 +236,6 @@ def _by_photo(clicks: PhotoClicks) -> Alignment:
 
 
 def _by_grabcut(clicks: PhotoClicks) -> Alignment:
-    """By the mask that GrabCut makes of a band about the outline that the clicks predict."""
     pixels = _outline(clicks, _by_clicks(clicks)).astype(np.uint8)
     width = max(int(_BAND * np.ptp(_box_of(pixels), axis=0).max()), 3)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * width + 1, 2 * width + 1))

@@ -58,7 +58,6 @@ def coverage(
 
 
 def _regions(seed: int, noise_px: float, region_problems: int) -> Iterator[Row]:
-    """Regions of rotation, translation and lengths, by what is estimated from how much."""
     for kind in _KINDS:
         for points in _REGION_SIZES:
             reached = []
@@ -76,7 +75,6 @@ def _regions(seed: int, noise_px: float, region_problems: int) -> Iterator[Row]:
 
 
 def _similar(seed: int, region_problems: int) -> Iterator[Row]:
-    """Bias of the distance, in stated standard deviations, rotations and translations."""
     for stretch in ("free", "none"):
         for shape_sigma in _SHAPE_SIGMAS:
             for points in _SIMILAR_SIZES:
@@ -146,7 +144,6 @@ def _fits(
 def _estimated(
     rng: np.random.Generator, kind: str, points: int, noise_px: float
 ) -> tuple[Result, Alignment]:
-    """An estimate of a random object from its first view, and the truth."""
     model = rng.uniform(-0.5, 0.5, (points, 3))
     scale = np.array([1.0, *np.exp(rng.normal(0, 0.2, 2))])
     differs = _SHAPE_SIGMA if kind.startswith("shape_sigma") else 0.0
@@ -207,7 +204,6 @@ def _similar_estimate(
 
 
 def _regions_reached(result: Result, truth: Alignment) -> list[float]:
-    """Nominal probabilities of the regions of R, t and lengths that reach the truth."""
     covariance, found = result.covariance, []
     for first in (0, 3, 6):
         rows = [row for row in range(first, first + 3) if covariance[row, row] > 0]

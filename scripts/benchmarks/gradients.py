@@ -27,7 +27,6 @@ def _torch() -> Any:
 
 
 def _drawn(rng: np.random.Generator, problems: int, points: int) -> tuple[list[Problem], Any, Any]:
-    """Simulated problems, and their points and pixels as tensors."""
     drawn = [simulate_problem(rng, points=points, noise_px=1.0) for _ in range(problems)]
     tensor = _torch().tensor
     parts = (np.array([getattr(p, name) for p in drawn]) for name in ("points_3d", "points_2d"))

@@ -81,7 +81,6 @@ def masks(
 
 
 def _measure(cases: list[_Case], kind: str, seed: int) -> Row:
-    """Medians over all views for one kind of mask."""
     alone, joint, bounds, bottles, further = [], [], [], [], []
     for case, mask, rng in _damaged(cases, kind, seed):
         without = attempt(align, case.model, case.view(None))
@@ -112,7 +111,6 @@ def _measure(cases: list[_Case], kind: str, seed: int) -> Row:
 
 
 def _neighbours(cases: list[_Case], seed: int, neighbours: int) -> Row:
-    """Rate at which a neighbouring object's mask is named, and its effect on the estimate."""
     named, ratios = [], []
     for number in range(neighbours):
         rng = np.random.default_rng([seed, 2, number])
@@ -237,7 +235,6 @@ class _Case:
 
 
 def _cases_of(given: BenchmarkData, views: int) -> list[_Case]:
-    """Random views of the models."""
     how = {"fill": (0.6, 0.9), "roll": 10.0}
     found = []
     for number, model in enumerate(_models_of(given)):

@@ -95,7 +95,6 @@ def _row(given: BenchmarkData, category: str, problems: int, shape_sigma: float 
 
 
 def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: float) -> Row:
-    """Shares for the models of one category."""
     said: dict[str, list[tuple[bool, bool, bool]]] = {}
     for number in range(problems):
         rng = np.random.default_rng([seed, number])
@@ -126,7 +125,6 @@ def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: flo
 def _seen(
     models: list[FloatArray], rng: np.random.Generator, count: int | None = None
 ) -> SeenModel:
-    """Some keypoints of a random model."""
     points = models[rng.integers(len(models))]
     most = min(len(points), _MOST)
     size = count or int(rng.integers(_FEWEST, most + 1))

@@ -110,7 +110,6 @@ def photo_times(given: BenchmarkData, *, composites: int = 12, frames: int = 40)
 
 
 def _compared(clicks: PhotoClicks) -> Row:
-    """Errors of the clicks alone and with the photo, and what was stated of the latter."""
     first, _, alone = clocked(clicks.aligned)
     second, _, joint = clocked(partial(clicks.aligned, image=clicks.case.pixels))
     before, after = clicks.errors(alone), clicks.errors(joint)
@@ -238,7 +237,6 @@ def bop_cases(given: BenchmarkData) -> Iterator[PhotoCase]:
 
 
 def _occluded_cases(given: BenchmarkData) -> Iterator[PhotoCase]:
-    """The objects of Linemod-Occluded, some of which hide others."""
     folder = given.real("lmo_multiview")
     entries = json.loads((folder / "camera.json").read_text())
     camera = Camera(**{key: value for key, value in entries.items() if key != "depth_scale"})
@@ -303,7 +301,6 @@ def _composites(given: BenchmarkData, count: int, camera: Camera = _CAMERA) -> I
 
 
 def _blurred(drawn: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A photo with blur and noise of its own."""
     drawn = cv2.GaussianBlur(drawn, (0, 0), rng.uniform(0.4, 1.5))
     noisy = drawn + rng.normal(0, rng.uniform(2, 10), drawn.shape)
     return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)

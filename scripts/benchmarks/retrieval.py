@@ -70,7 +70,6 @@ def retrieval(
 
 
 def _measure(path: Path, models: Sequence[LibraryModel], queries: int) -> Table:
-    """Opening, and queries of three levels of noise."""
     reference = section.reference_seconds()
     wall, busy, library = section.clocked(partial(Library.open, path))
     size = f"{len(library):,}"
@@ -86,7 +85,6 @@ def _measure(path: Path, models: Sequence[LibraryModel], queries: int) -> Table:
 
 
 def _run(path: Path, models: Sequence[LibraryModel], run_queries: int) -> Row:
-    """Queries a second of a whole run, start and table included."""
     seeds = range(1 + run_queries)  # each model may show enough keypoints once only
     found = chain.from_iterable(_observed(models, 1.0, seed=seed) for seed in seeds)
     file = path.with_name("queries.jsonl")
@@ -107,7 +105,6 @@ def _run(path: Path, models: Sequence[LibraryModel], run_queries: int) -> Row:
 def _queries(
     library: Library, models: Sequence[LibraryModel], noise_px: float, queries: int
 ) -> list[Row]:
-    """Median and longest time of queries for some of the models."""
     wall, busy, found = [], [], 0
     reference = section.reference_seconds()
     for model, seen in islice(_observed(models, noise_px, seed=0), queries):
@@ -127,7 +124,6 @@ def _queries(
 
 
 def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
-    """A library of so many models, the given ones first, then variations of them."""
     rng = np.random.default_rng(0)
     filled = list(models[:count])
     while len(filled) < count:
@@ -142,7 +138,6 @@ def _jittered(models: Sequence[LibraryModel], count: int) -> Library:
 def _observed(
     models: Sequence[LibraryModel], noise_px: float, *, seed: int
 ) -> Iterator[tuple[LibraryModel, RetrievalQuery]]:
-    """The models that show enough keypoints, each with an observation of it."""
     for model in models:
         task = RetrievalTask(*model.key, noise_px, _KEYPOINTS)
         seen = section.attempt(observe_model, model, task, seed=seed)
@@ -209,7 +204,6 @@ def _queried(models: Sequence[AnnotatedModel], given: BenchmarkData, queries: in
 
 
 def _stretched_mask(model: AnnotatedModel, rng: np.random.Generator) -> np.ndarray:
-    """The mask of a model that is stretched, in a random view."""
     scene = Scene(model.load_mesh())
     scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(2.0))])
     how: dict[str, Any] = {"scale": scale, "fill": (0.6, 0.9), "roll": 10.0, "min_visible": 0}
@@ -259,7 +253,6 @@ def _rankings(
     objects: int,
     noise_px: float,
 ) -> Iterator[Row]:
-    """IoU and milliseconds of the queries, by ranking."""
     models = dataset.subset(categories=[category])[category]
     library = Library.from_models(
         [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
@@ -297,7 +290,6 @@ def _rankings(
 
 
 def _ranking_options(shape: ShapeModel) -> dict[str, dict[str, Any]]:
-    """Options of `Library.retrieve` for each ranking."""
     found: dict[str, dict[str, Any]] = {}
     for suffix, stretch in (("", {}), (", unstretched", {"stretch": "none"})):
         found[f"fit{suffix}"] = stretch

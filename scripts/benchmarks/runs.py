@@ -38,7 +38,6 @@ _OPENCV_DRAWS = 2  # it takes the better part of a second
 
 
 def _used(*call: str) -> Used:
-    """Run a command in a folder of its own, and measure it with its workers."""
     with tempfile.TemporaryDirectory() as folder:
         return section.used_by_command([*call, f"--out={folder}/run"])
 
@@ -62,7 +61,6 @@ def _rate_and_memory(
 
 @contextmanager
 def _dask_cluster() -> Iterator[Any]:
-    """Two Dask workers."""
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -114,7 +112,6 @@ def evaluation(given: BenchmarkData, *, count: int = 2000) -> Tables:
 
 
 def _on_annotations(root: Path, method: str, count: int) -> Row:
-    """Rate of instances whose meshes are not looked at."""
     options = KeypointNetOptions(root, visibility="hull", methods=(method,))
     tasks = KeypointTasks(KeypointNet(root), options)
     experiment = keypointnet_benchmark(options)
@@ -220,7 +217,6 @@ def _fit(file: Path, method: str) -> list[str]:
 
 
 def _wait_for(folder: RunFolder, chunks: int, process: subprocess.Popen[bytes]) -> None:
-    """Wait until a run has done so many chunks."""
     while len(list(folder.parts.glob("???????.parquet"))) < chunks:
         if process.poll() is not None:
             raise SystemExit(f"{folder.path.name}: the run ended before it was interrupted")

@@ -129,7 +129,6 @@ def _pairs(
     keypoints: int,
     noise_px: float,
 ) -> Iterator[list[cadalign.View]]:
-    """Two views of every object."""
     how = {"keypoints": keypoints, "noise_px": noise_px}
     for place, seen in section.unseen_objects(dataset, category, objects, **how):
         known = np.isin(seen.ids, shape.ids)
@@ -211,7 +210,6 @@ def _unseen(
 def _see_near(
     points_3d: FloatArray, ids: Sequence[int], noise_px: float, rng: np.random.Generator
 ) -> _Seen:
-    """Draw a near view of an object, and the noise of its keypoints."""
     gt, _ = sample_hull_view(KeypointHull(points_3d), _NEAR, rng=rng, min_visible=0)
     noise = rng.normal(0, noise_px, (len(points_3d), 2))
     return _Seen(points_3d, _NEAR.project(gt.apply(points_3d)) + noise, tuple(ids), _NEAR, gt)
@@ -349,7 +347,6 @@ def _by_prior(
 def _pair(
     seen: AnnotatedModel, others: Sequence[AnnotatedModel], noise_px: float
 ) -> tuple[FloatArray, _Seen]:
-    """The keypoints of a random other model, and a random view of an object's own ones."""
     rng = instance_rng(0, seen.category, seen.model_id, "similar")
     other = others[int(rng.integers(len(others)))].keypoints
     own = dict(zip(seen.keypoints.ids.tolist(), seen.keypoints.xyz, strict=True))

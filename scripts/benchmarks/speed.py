@@ -161,7 +161,6 @@ def _fits(calls: int) -> Iterator[Row]:
 
 
 def _observation(folder: Path) -> Path:
-    """An observation that names a photo and an OBJ model."""
     (model,) = sample_models(categories=["chair"], per_category=1)
     problem = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
     camera = problem.camera

@@ -118,7 +118,6 @@ def _times(lengths: tuple[int, ...]) -> Iterator[Row]:
 
 
 def _synthetic_category() -> ShapeModel:
-    """A category of ten keypoints and five modes."""
     rng = np.random.default_rng(0)
     mean = rng.uniform(-0.4, 0.4, (_KEYPOINTS, 3))
     modes = 0.05 * rng.normal(size=(5, _KEYPOINTS, 3))

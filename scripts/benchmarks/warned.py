@@ -125,7 +125,6 @@ def _right(
     rng: np.random.Generator,
     noise_px: float,
 ) -> Iterator[tuple[str, _Case]]:
-    """The object with each kind of right model."""
     points, ids = seen.xyz[seen.rows], seen.ids.tolist()
     if len(points) < _LEAST_KEYPOINTS:
         return

@@ -120,7 +120,6 @@ def _clear(folder: RunFolder, config: dict[str, Any]) -> None:
 
 
 def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
-    """Medians per category."""
     counts = (metrics.INSTANCES, metrics.FAILED)
     return ConsoleTable(
         title="Medians per category",
@@ -138,7 +137,6 @@ def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
 
 
 def _write_csv(run: Run, summaries: Sequence[Summary]) -> None:
-    """Write ``results.csv`` with all rows, the seed and the seconds."""
     names = run.results.column_names
     seconds = ["" if time != time else time for time in run.cells["seconds"].tolist()]
     rows = [

@@ -123,7 +123,6 @@ def _describe(run: Run) -> str:
 
 
 def _remarks(run: Run) -> str:
-    """Parts of the files that were not scored."""
     unread, strays = run.config.get("unread") or {}, run.config.get("strays") or {}
     texts = [f"{n} records of {name} could not be read" for name, n in unread.items() if n]
     texts += [f"{n} of {name} are of no photo here" for name, n in strays.items() if n]

@@ -139,7 +139,6 @@ def _summarize_method(category: str, method: str, cells: Cells, bound: float) ->
 
 
 def _success(solved: Cells, degrees: float, fraction: float, *, count: int) -> float:
-    """Share of instances within an angle, and a fraction of diagonal and scales."""
     within = solved["sym_rotation_error_deg"].astype(float) <= degrees
     for name in ("sym_translation_error", "scale_y_error", "scale_z_error"):
         within &= solved[name].astype(float) <= fraction
@@ -182,7 +181,6 @@ def draw_figures(run: Run, summaries: Sequence[Summary]) -> None:
 
 
 def _draw_categories(path: Path, summaries: Sequence[Summary], metric: Metric) -> None:
-    """Draw a metric's medians, a column of points for each category."""
     categories = list(dict.fromkeys(summary.group for summary in summaries))
     places = np.arange(len(categories))
     with new_figure(figsize=(max(6.4, 0.62 * len(categories) + 2), 4.2)) as figure:
@@ -214,7 +212,6 @@ def _draw_categories(path: Path, summaries: Sequence[Summary], metric: Metric) -
 
 
 def _draw_curves(path: Path, run: Run, metric: Metric) -> None:
-    """Draw the share of instances within an error, for each method."""
     cells = run.cells
     errors = metric.factor * cells[metric.key].astype(float)
     with new_figure(figsize=(6.4, 4.2)) as figure:

@@ -69,7 +69,6 @@ def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda
 
 
 def _page(text: str) -> str:
-    """The report in Markdown as a page that needs no network."""
     from markdown_it import MarkdownIt
 
     body = MarkdownIt("commonmark").enable("table").render(text)
@@ -86,7 +85,6 @@ def _settings(plan: PaperPlan) -> str:
 
 
 def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
-    """Do one sweep and describe it."""
     runs = max(SWEEPS[name].runs // 25, 20) if plan.quick else None
     options = SweepOptions(name, runs=runs, seed=plan.seed)
     kind = options.kind

@@ -251,7 +251,6 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
 
 
 def _evidence(dataset: PhotoDataset) -> set[str]:
-    """The evidence that the first photos have."""
     found: set[str] = set()
     for index in range(min(_LOOKED_AT, len(dataset))):
         try:

@@ -159,7 +159,6 @@ _CHECKS: dict[str, tuple[Callable[[float], bool], str, str]] = {
 
 
 def _check_values(kind: SweepKind) -> None:
-    """Check the values of a sweep."""
     if not kind.values:
         raise InputError("none is given", where="values")
     settings = {column: (getattr(kind, column),) for column in _CHECKS}
@@ -243,7 +242,6 @@ class SweepProblems(Setting):
         return simulate_problem(rng, **self._setting(task))
 
     def _setting(self, task: SweepTask) -> Row:
-        """Points, noise and outliers of a task."""
         held = {name: getattr(self.kind, name) for name in ("points", "noise_px", "outlier_share")}
         setting = {**held, self.kind.column: task.value}
         return {**setting, "points": int(setting["points"])}
@@ -377,7 +375,6 @@ def _metrics(kind: SweepKind, run: Run) -> tuple[Metric, ...]:
 
 
 def _held(kind: SweepKind) -> str:
-    """The quantities that are held."""
     noise = "" if kind.column == "noise_px" else f"noise {kind.noise_px:g} px, "
     return noise if kind.column == "points" else f"{noise}{kind.points} points, "
 

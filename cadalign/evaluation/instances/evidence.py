@@ -189,7 +189,6 @@ class EvidenceEstimate:
 
 
 def _align_with(scene: ObjectScene, *, method: str) -> EvidenceEstimate:
-    """Align the scene's model with the evidence that a method gives."""
     given = evidence_for(method, scene)
     result = align(scene.model, given.views, size=given.size)
     return EvidenceEstimate(result.alignment, result, given)
@@ -220,7 +219,6 @@ def evidence_for(method: str, scene: ObjectScene) -> Given:
 
 
 def _of_first(kinds: tuple[str, ...], scene: ObjectScene) -> dict[str, Any]:
-    """Fields of the first view beyond its keypoints."""
     shot, options = scene.shots[0], scene.options
     fields: dict[str, Any] = {}
     if DEPTH in kinds:

@@ -88,7 +88,6 @@ class InstanceSymmetry:
         )
 
     def _turned(self, rotation: FloatArray, relative: FloatArray) -> FloatArray:
-        """The rotation, turned about the axis as near as possible to ``relative``."""
         if self.axis is None:
             return rotation
         n = rotation.T @ relative
@@ -254,7 +253,6 @@ class _Seen(NamedTuple):
 
 
 def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) -> list[Instance]:
-    """The instances of views, with a stretch and noise drawn for each."""
     if not views:
         return []
     low, high = STRETCH_RANGE

@@ -76,7 +76,6 @@ def draw_instance(
 
 
 def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage, Camera]:
-    """A picture of that width, and its camera."""
     height = round(camera.height * width / camera.width)
     small = np.asarray(
         cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8

@@ -232,7 +232,6 @@ def _opened(library: str) -> Library:
 
 @lru_cache(maxsize=2)
 def _by_keypoints(library: str) -> dict[Any, tuple[list[ModelKey], FloatArray]]:
-    """Names and keypoints of the models with the same category and set of keypoints."""
     groups: dict[Any, list[LibraryModel]] = {}
     for model in _opened(library):
         groups.setdefault((model.category, tuple(model.ids.tolist())), []).append(model)

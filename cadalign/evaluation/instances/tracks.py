@@ -171,7 +171,6 @@ class TrackEstimate:
 
 
 def _of_result(result: Result) -> TrackEstimate:
-    """The estimate of a result, whose views are the frames."""
     middle = result.bounds.mean(axis=0)
     return _estimate(result.views, middle, result.degrees_of_freedom)
 

@@ -176,7 +176,6 @@ def _of_mean(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
 
 
 def _of_random_model(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimate:
-    """The estimate of a random model, among those that share enough keypoints with the image."""
     assert seen.learned is not None
     library, task = seen.learned.library(), seen.task
     keys = [key for key in library.keys if key[0] == task.category]
@@ -194,14 +193,12 @@ def _of_random_model(seen: UnseenObject, *, stretch: str | None) -> ShapeEstimat
 def _aligned(
     model: Model | ShapeModel, seen: UnseenObject, *, misfit_px: float = 0.0
 ) -> ShapeEstimate:
-    """Align a model with those given keypoints that it has."""
     bound = max(_INLIER_BOUND * seen.options.sigma, misfit_px)
     ransac = RansacOptions(max_reproj_error=bound) if seen.options.outliers else None
     return ShapeEstimate.of(align(model, seen.view_of(model), ransac=ransac))
 
 
 def _nearest(seen: UnseenObject) -> ShapeEstimate:
-    """The best match of the library."""
     assert seen.learned is not None
     library = seen.learned.library()
     first = library.retrieve(
@@ -220,7 +217,6 @@ def _nearest(seen: UnseenObject) -> ShapeEstimate:
 
 
 def _bound(seen: UnseenObject) -> ShapeEstimate:
-    """The ideal estimate with the object's own model from the keypoints that are no outliers."""
     kept = ~seen.is_outlier
     points, pixels = seen.xyz[seen.rows[kept]], seen.points_2d[kept]
     alignment = limit_estimate(points, pixels, KEYPOINT_CAMERA, seen.gt)
@@ -398,7 +394,6 @@ def _coverage(result: Result, seen: UnseenObject, known: IntArray, rows: IntArra
 
 
 def _described(found: ShapeEstimate, seen: UnseenObject) -> AlignedShape:
-    """An estimate in terms of the object, of which it has some keypoints."""
     known, rows = _shared(found, seen)
     shape = aligned_shape(
         found if found.result is None else found.result,

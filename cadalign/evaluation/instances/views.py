@@ -250,6 +250,5 @@ _scene_of = lru_cache(maxsize=1)(load_scene)
 
 
 def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
-    """The instance of a model with a mesh."""
     assert task.model is not None
     return make_instance(task.model, scene=_scene_of(task.model), view_index=task.view, **how)

@@ -175,7 +175,6 @@ def fit_options(name: str, *, sigma: float, ransac: RansacOptions | None) -> dic
 
 
 def _fit(given: MethodInput, *, name: str) -> Result:
-    """The fit of one instance."""
     from cadalign.estimation.fit import fit
 
     how = fit_options(name, sigma=given.sigma, ransac=given.ransac)
@@ -200,7 +199,6 @@ def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | C
 
 
 def _bound(given: MethodInput) -> Alignment:
-    """The estimate of an ideal estimator that knows the outliers."""
     from cadalign.evaluation.metrics.cramer_rao import limit_estimate
 
     if given.gt is None:

@@ -78,7 +78,6 @@ def rate(key: str, label: str, symbol: str = "", *, head: str = "", **look: Any)
 
 
 def _like(metric: Metric, key: str, label: str, head: str = "", symbol: str = "") -> Metric:
-    """A metric with the unit and the look of another one."""
     head = head or label
     return replace(metric, key=key, label=label, head=head, symbol=symbol or head)
 

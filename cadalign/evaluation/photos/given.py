@@ -195,7 +195,6 @@ def _methods(names: Sequence[str]) -> tuple[Method, ...]:
 
 
 def _pose(instance: GivenPoses, *, index: int) -> PhotoEstimate:
-    """The pose that a method has of an object."""
     target, pose = instance.target, instance.poses[index]
     bounds = target.bounds
     if target.gt is None or bounds is None:

@@ -180,7 +180,6 @@ def _sigma(target: PhotoTarget, protocol: Protocol, options: KeypointOptions, so
 
 
 def _calibrated(sighting: Sighting) -> Sighting:
-    """The sighting with an estimated focal length."""
     found = fit(
         sighting.points_3d * sighting.width,
         sighting.points_2d,
@@ -250,7 +249,6 @@ def with_all_evidence(sighting: Sighting) -> tuple[Model, list[View]]:
 
 
 def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
-    """The data set's model with the object's width."""
     width, bounds = sighting.width, sighting.bounds * sighting.width
     kind: dict[str, Any] = {}
     if base == RIGID:
@@ -276,7 +274,6 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
 
 
 def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(None)) -> View:
-    """The photo's view of the object, with some of the evidence it has."""
     photo, found = sighting.target.photo, sighting.target.found
     given: dict[str, Any] = {}
     if MASK in evidence:

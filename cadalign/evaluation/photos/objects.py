@@ -252,7 +252,6 @@ def _photo(sighting: Sighting) -> tuple[ByteImage, Camera]:
 def _around(
     photo: ByteImage, camera: Camera, sighting: Sighting, points: FloatArray
 ) -> tuple[ByteImage, Camera]:
-    """The part of a photo around the object, and its camera."""
     box = sighting.target.gt_box
     if box is not None and (box.corners[:, 2] > 0).all():
         points = np.concatenate([points, camera.project(box.corners)])

@@ -154,7 +154,6 @@ class _Config(ForeignDocument):
 
 
 def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[str]:
-    """Differences of two configurations, as text."""
     if isinstance(found, dict) and isinstance(wanted, dict):
         for key in sorted({*found, *wanted}):
             inner = f"{name}.{key}" if name else key

@@ -183,7 +183,6 @@ def _finished(folder: RunFolder, columns: Columns) -> tuple[pa.Table, pa.Table]:
 
 
 def _joined(paths: Sequence[Path], columns: Columns) -> pa.Table:
-    """One table of those of chunks."""
     tables = [checked(read_table(path), columns, path=path, fix=DONE_ANEW) for path in paths]
     for path, table in zip(paths, tables, strict=True):
         if table.schema != tables[0].schema:

@@ -86,7 +86,6 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
 
 
 def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: OnProgress) -> None:
-    """Do the chunks that are not done."""
     _sweep(made_folder(folder.parts))
     experiment, tasks, size = plan.experiment, plan.tasks, plan.chunk_size
     starts = range(0, len(tasks), size)
@@ -121,14 +120,12 @@ def _is_done(experiment: Experiment[Any], folder: RunFolder, index: int) -> bool
 
 
 def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> None:
-    """Make one table of the chunks' tables."""
     for table, columns in _tables(experiment, folder).items():
         parts = (folder.part(table, index) for index in range(chunks))
         write_tables(table, columns, map(read_table, parts))
 
 
 def _tables(experiment: Experiment[Any], folder: RunFolder) -> dict[Path, Columns]:
-    """The columns of a run's tables by file."""
     tables = {folder.timings: experiment.timing_columns}
     records: Columns | None = getattr(experiment, "record_columns", None)
     if records is not None:

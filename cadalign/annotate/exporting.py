@@ -84,7 +84,7 @@ def annotated_photos(session: Session) -> list[AnnotatedPhoto]:
             exported = _aligned_object(state)
             if exported is None or session.work_state(state) == "skipped":
                 continue
-            key = None if choice is None else choice.key_of(state.files.model)
+            key = None if choice is None else choice.key_of(state.model.path)
             image = state.image().evidence
             photo = AnnotatedPhoto(
                 _named(state, exported),
@@ -121,7 +121,7 @@ def _aligned_object(state: PhotoState) -> AlignedObject | None:
     mesh = cad.scene.mesh if state.session.shape is None else lines.scene.mesh
     images = [view.image for view in state.observation().views]
     result = replace(live.result, model=None)  # or the mesh, which is warped, would be once more
-    return object_of(result, mesh=mesh, images=images, name=state.files.model.stem)
+    return object_of(result, mesh=mesh, images=images, name=state.model.path.stem)
 
 
 def _named(state: PhotoState, exported: AlignedObject) -> AlignedObject:

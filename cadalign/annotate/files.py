@@ -114,28 +114,27 @@ class Stored:
 
 @dataclass(frozen=True)
 class AnnotationFiles:
-    """Files of one photo; the observation, which names photo and mesh, need not exist yet."""
+    """Files of one object; the observation, which names photos and mesh, need not exist yet."""
 
     observation: Path
-    image: Path
-    model: Path
 
     @property
     def fit(self) -> Path:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
-    def read(self, model: OpenedModel, shape: ObjectShape | None = None) -> Stored:
+    def read(self, photo: Path, model: OpenedModel, shape: ObjectShape | None = None) -> Stored:
         """Read an earlier session's annotation; new model points are added to the registry."""
         registry, tolerance = model.registry, SAME_PLACE * model.cad.diagonal
-        stored = Stored(self.image)
+        stored = Stored(photo)
         parts = []
         if self.observation.exists():
             observation = self._load()
-            further = FurtherEvidence.of(observation, self.image, where=self.observation)
-            photo = observation.views[further.place]
+            refuse_other_model(observation.model, model.path, where=self.observation)
+            further = FurtherEvidence.of(observation, photo, where=self.observation)
+            shown = observation.views[further.place]
             self._warn_of_options(observation, further, shape)
-            document = _document_of(photo, registry, tolerance)
+            document = _document_of(shown, registry, tolerance)
             document = replace(document, name=observation.object_name or "")
             views = []
             for view in further.others:
@@ -143,7 +142,7 @@ class AnnotationFiles:
                     own = _document_of(view, registry, tolerance), view.camera
                     views.append(Stored(view.image, *own, FurtherEvidence(view.evidence)))
             options = observation.fit_options
-            stored = Stored(self.image, document, photo.camera, further, options, tuple(views))
+            stored = Stored(photo, document, shown.camera, further, options, tuple(views))
             with in_file(self.observation), within("unfinished"):
                 parts.append(convert(observation.unfinished or {}, _Unfinished))
         earlier = self._earlier_unfinished()
@@ -185,11 +184,8 @@ class AnnotationFiles:
             of_the_object = {name: data.pop(name) for name in _OF_THE_OBJECT if name in data}
             with in_file(self.observation):
                 data = {"views": [data], **of_the_object}
-                observation = Observation.from_dict(data, folder=self.observation.parent)
-        else:
-            observation = Observation.load(self.observation)
-        refuse_other_model(observation.model, self.model, where=self.observation)
-        return observation
+                return Observation.from_dict(data, folder=self.observation.parent)
+        return Observation.load(self.observation)
 
     def _earlier_unfinished(self) -> _Unfinished | None:
         """The unfinished pairs in a file of an earlier version; None if there is none."""

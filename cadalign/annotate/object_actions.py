@@ -66,7 +66,7 @@ def add_object(state: PhotoState, *, name: str = "", model: Index | None = None)
     stretch = LIKELY_STRETCH if session.shape is None else None
     priors = Priors(stretch, like.intrinsics.likely_focal)
     document = AnnotationDocument(focal=like.document.focal, priors=priors, name=name)
-    files = AnnotationFiles(object_file(first, number), like.photo.path, chosen.path)
+    files = AnnotationFiles(object_file(first, number))
     alike = next((each for each in session.states if each.model is chosen), like)
     further = FurtherEvidence(up_axis=alike.owner.further.up_axis)
     added = PhotoState(
@@ -169,7 +169,6 @@ def model(state: PhotoState, *, category: Text, model: Text) -> ActionOutcome | 
     history = owner.history.changed(lambda document: _carried(document, carried))
     for each in (owner, *owner.views):
         each.model, each.history = new, history
-        each.files = replace(each.files, model=new.path)
         each.live = each.alone = None
         each.proposals = tuple(
             replace(proposal, keypoint=carried[proposal.keypoint])

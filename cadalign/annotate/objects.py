@@ -179,17 +179,15 @@ class PhotoState:
 
     def add_view(self, photo: PhotoFile, intrinsics: Intrinsics) -> PhotoState:
         """The state of the object in a further photo, which its history does not have yet."""
-        files = replace(self.files, image=photo.path)
-        view = PhotoState(
-            self.session, photo, files, intrinsics, self.history, self.model, lead=self
-        )
+        own = self.files, intrinsics, self.history, self.model
+        view = PhotoState(self.session, photo, *own, lead=self)
         self.views.append(view)
         return view
 
     def observed(self) -> tuple[Observation, int]:
         """The pairs that count with the evidence beside them, and the photo's number in it."""
         observation = self.observation()
-        return observation, [view.image for view in observation.views].index(self.files.image)
+        return observation, [view.image for view in observation.views].index(self.photo.path)
 
     def observation(
         self, *, fit_options: Mapping[str, Any] | None = None, to_write: bool = False
@@ -200,7 +198,7 @@ class PhotoState:
         are not known, and adds what is unfinished.
         """
         shape, document, options = self.session.shape, self.document, dict(fit_options or {})
-        fields: dict[str, Any] = {"model": self.files.model, "object_name": document.name or None}
+        fields: dict[str, Any] = {"model": self.model.path, "object_name": document.name or None}
         if shape is not None:
             fields["shape"] = shape.path
             if shape.sigma is not None:
@@ -288,7 +286,7 @@ class PhotoState:
             ids=np.array(keypoints, dtype=np.int64),
             names=tuple(registry[keypoint].name for keypoint in keypoints),
             scores=filled(pair.score for pair in pairs),
-            image=self.files.image,
+            image=self.photo.path,
             depths=np.array(depths) if np.isfinite(depths).any() else None,
         )
 
@@ -311,7 +309,7 @@ class PhotoState:
         """Pairs that are no keypoints of the observation, and further photos without any."""
         views = [
             {
-                "image": written_path(view.files.image, folder=view.files.observation.parent),
+                "image": written_path(view.photo.path, folder=view.files.observation.parent),
                 "camera": view.intrinsics.to_write(view.document.focal).to_dict(
                     pixel_origin="corner"
                 ),

@@ -174,8 +174,8 @@ def _open_object(
 ) -> PhotoState:
     """An object in its first photo, and in its further ones; options add evidence of the first."""
     model = session.models.of(mesh)
-    files = AnnotationFiles(file, photo.path, model.path)
-    stored = files.read(model, session.shape)
+    files = AnnotationFiles(file)
+    stored = files.read(photo.path, model, session.shape)
     intrinsics, focal = _intrinsics(photo, stored.camera, camera)
     priors = stored.priors_or(Priors(LIKELY_STRETCH, intrinsics.likely_focal))
     if session.shape is not None:  # which has a prior of its own on the stretch

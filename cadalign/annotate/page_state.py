@@ -53,7 +53,7 @@ def page_state(
                 "name": state.photo.path.name,
                 "width": state.photo.width,
                 "height": state.photo.height,
-                "model": state.files.model.name,
+                "model": state.model.path.name,
                 "up_axis": state.owner.further.up_axis or "y",
                 "model_number": session.models.number_of(state.model.path),
                 "has_library": session.choice is not None,
@@ -225,13 +225,13 @@ def _candidates(
 
 def _moved(state: PhotoState) -> str:
     """Say that the photo or the model is no longer where it was; empty while both are."""
-    files = state.files
-    gone = [path.name for path in (files.image, files.model) if not os.path.exists(path)]
+    needed = state.photo.path, state.model.path
+    gone = [path.name for path in needed if not os.path.exists(path)]
     if not gone:
         return ""
     return (
         f"{' and '.join(gone)}: moved, renamed or deleted. Go on here, or start anew with the new "
-        f"name and --observation {files.observation.name}."
+        f"name and --observation {state.files.observation.name}."
     )
 
 

@@ -68,7 +68,7 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
         answer: dict[str, Any] = {"revision": revision, "note": "", "none": None, "models": []}
         if choice is None:
             return answer | {"note": "The session has no library: start it with --library."}
-        known, complete = choice.ids_on(state.files.model), state.document.complete_pairs
+        known, complete = choice.ids_on(state.model.path), state.document.complete_pairs
         pairs = [pair for pair in complete if pair.keypoint in known]
         others = len(complete) - len(pairs)
         if len(pairs) < LEAST_PAIRS:
@@ -82,7 +82,7 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
         live, _ = session.live(state)
         if not is_known and live.result is not None:
             camera = live.camera
-        current = choice.key_of(state.files.model)
+        current = choice.key_of(state.model.path)
     sigma = filled(pair.sigma for pair in pairs)
     # Without the lock, for which the next click would wait.
     try:

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from cadalign.annotate.document import AnnotationDocument, history_path, write_history
 from cadalign.annotate.estimate import LiveAlignment, warm_up
+from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import known_points, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel
@@ -264,7 +265,7 @@ class Session:
                 for state in unsaved:
                     path = folder / state.files.observation.name
                     for each in (state, *state.views):
-                        each.files = replace(each.files, observation=path)
+                        each.files = AnnotationFiles(path)
             for state in unsaved:
                 self._write(state)
 

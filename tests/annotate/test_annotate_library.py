@@ -207,7 +207,7 @@ def test_model_is_chosen_by_keys_alone_and_by_a_click(
         before = page.evaluate("annotator.model.mesh.uuid")
         page.keyboard.press("1")
         wait(page, f"{IDLE} && annotator.model.mesh.uuid !== '{before}'")
-        assert session.photos[0].files.model.samefile(case.model)
+        assert session.photos[0].model.path.samefile(case.model)
         assert len(session.photos[0].document.complete_pairs) == marked
         expect(page.locator("dialog[open]")).to_have_count(0)
         page.get_by_role("button", name="Models…").click()
@@ -218,4 +218,4 @@ def test_model_is_chosen_by_keys_alone_and_by_a_click(
         before = page.evaluate("annotator.model.mesh.uuid")
         page.get_by_role("button", name=re.compile("sample_chair_003")).click()
         wait(page, f"{IDLE} && annotator.model.mesh.uuid !== '{before}'")
-        assert session.photos[0].files.model.samefile(other_chair(library))
+        assert session.photos[0].model.path.samefile(other_chair(library))

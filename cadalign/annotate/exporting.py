@@ -125,7 +125,6 @@ def _aligned_object(state: PhotoState) -> AlignedObject | None:
 
 
 def _named(state: PhotoState, exported: AlignedObject) -> AlignedObject:
-    """The object in its photo alone, with its keypoints by name."""
     live, _ = state.session.live(state)
     names: dict[Hashable, Hashable] = {number: point.name for number, point in state.model.registry}
     view = exported.views[live.place]

@@ -123,7 +123,6 @@ def _is_outline(ends: FloatArray, beside: FloatArray, eye: FloatArray) -> BoolAr
 
 
 def _cut(lines: FloatArray, piece: float) -> FloatArray:
-    """Cut lines (k, 2, 3) into pieces of at most that length."""
     if not len(lines):
         return lines
     length = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)

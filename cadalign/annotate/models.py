@@ -130,7 +130,6 @@ class KeypointRegistry:
         return {point.name for point in self._points.values()}
 
     def _free_name(self, name: str) -> str:
-        """The name, with a number appended if it is taken."""
         taken, free, number = self._names, name, 2
         while free in taken:
             free, number = f"{name} ({number})", number + 1
@@ -352,7 +351,6 @@ class Models:
         return self[self.number_of(path)]
 
     def _open(self, path: Path) -> OpenedModel:
-        """Read a model, its given keypoints, and those of earlier sessions."""
         cad = ClickableModel(load_mesh(path))
         own, beside = self._keypoints_path(path), keypoints_file(path, path.parent)
         source = beside if self._models or self._keypoints is None else self._keypoints

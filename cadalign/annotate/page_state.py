@@ -179,7 +179,6 @@ def _priors(state: PhotoState) -> dict[str, Any]:
 
 
 def _shape(state: PhotoState) -> dict[str, Any] | None:
-    """The object's shape, and its keypoints that the model lacks."""
     shape = state.session.shape
     if shape is None:
         return None

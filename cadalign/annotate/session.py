@@ -160,7 +160,6 @@ class Session:
         return live, suggestion
 
     def _align(self, state: PhotoState, others: Mapping[str, LiveAlignment]) -> LiveAlignment:
-        """The alignment with all photos of the object, as this one shows it."""
         missing = self._missing(state)
         if missing:
             return LiveAlignment(message=missing)
@@ -217,7 +216,6 @@ class Session:
         return {label: estimate for label, estimate in found.items() if estimate.tells_focal}
 
     def _known(self, state: PhotoState) -> Known:
-        """Knowledge of the object beside its observation."""
         shape, owner = self.shape, state.owner
         points = [point for _, point in state.model.registry]
         own = {} if shape is None else {shape.id_of(point): point for point in points}
@@ -305,7 +303,6 @@ class Session:
                     other.save_error = str(error)
 
     def _write_object(self, state: PhotoState) -> None:
-        """Write keypoints and observation of an object; raises DataError on failure."""
         live, _ = self.live(state)
         used = frozenset[int]().union(
             *(other.document.keypoints for other in self.states if other.model is state.model)

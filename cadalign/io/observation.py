@@ -243,7 +243,6 @@ class ObservationChanges:
 def _read_camera(
     path: Path, size: tuple[int, int] | None, pixel_origin: PixelOrigin | None
 ) -> Camera:
-    """Read a camera, which runs over many observations use again and again."""
     from cadalign.io.camera_file import read_camera
 
     return read_camera(path, size=size, pixel_origin=pixel_origin)

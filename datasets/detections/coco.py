@@ -201,7 +201,6 @@ def _points(entry: _Object, where: str) -> tuple[FloatArray, Any]:
 
 
 def _scores(third: FloatArray) -> FloatArray:
-    """Scores, from visibility flags where they are that."""
     if np.isin(third, (0, 1, 2)).all() and (third == 2).any():
         return np.choose(third.astype(int), list(VISIBILITY_SCORES))
     return third

@@ -305,7 +305,6 @@ class KeypointNet:
         return self._loaded[category]
 
     def _load_all(self, folder: Path) -> dict[str, _Models]:
-        """All models of a single file, by the names of their class ids."""
         single = folder / f"{_ALL}.json", self.root / f"{_ALL}.json", self.root / "keypointnet.json"
         path = next(filter(Path.is_file, single), None)
         if path is None:

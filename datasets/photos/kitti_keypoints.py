@@ -410,7 +410,6 @@ def _part(path: Path, table: dict[str, Raw], name: str, kind: Any) -> Any:
 
 
 def _numbers(path: Path, multiple: int) -> FloatArray:
-    """All numbers of a text file, a multiple of so many."""
     text = read_text(path)
     try:
         values = np.array(text.split(), dtype=np.float64)

@@ -168,7 +168,6 @@ class _Elements:
         return [text[row :: shape[0]] for row in range(min(shape[0], len(text)))]
 
     def _objects(self, kind: int, shape: tuple[int, ...], depth: int) -> Any:
-        """A cell's or a struct's values, a single one as it is."""
         if kind == _OBJECT:
             self.next()  # the name of its class
         fields = None if kind == _CELL else self._field_names()

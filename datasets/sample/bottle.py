@@ -35,7 +35,6 @@ class _Bottle:
     waist: float = 0.0
 
     def radius_at(self, height: npt.ArrayLike) -> FloatArray:
-        """Radii of the glass at heights."""
         y = np.asarray(height)
         body = np.clip((y - _EDGE) / (self.shoulder - _EDGE), 0, 1)
         above = np.clip((y - self.shoulder) / (self.neck - self.shoulder), 0, 1)
@@ -52,7 +51,6 @@ class _Bottle:
         return 1 + (self.depth - 1) * below, 2 + (self.exponent - 2) * below**0.7
 
     def turned(self, heights: FloatArray, color: Color, *, grow: float = 1.0) -> Solid:
-        """The part of the bottle between the first and the last of some heights."""
         profile = np.stack([grow * self.radius_at(heights), heights], axis=1)
         depth, exponent = self.section(heights)
         return lathe(profile, color, count=40, depth=depth, exponent=exponent)

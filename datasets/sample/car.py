@@ -189,7 +189,6 @@ def _glass_house(c: _Car) -> list[Solid]:
 
 
 def _fittings(c: _Car) -> list[Solid]:
-    """Wheels, lamps, mirrors, grille, plates and bumpers."""
     half, end = c.width / 2, c.length / 2
     lamp, tail = (0.72 * half, c.nose - 0.15, 0.04 - end), (0.76 * half, c.tail - 0.16, end - 0.03)
     right = [

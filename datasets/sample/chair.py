@@ -151,7 +151,6 @@ def _bars(c: _Chair, kind: str) -> list[Solid]:
 
 
 def _add_arms(c: _Chair, solids: list[Solid], pairs: dict[tuple[int, int], Point]) -> None:
-    """Two armrests and their supports."""
     x, y, rear = c.back(0.22 / c.tall, c.width / 2 + 0.01)
     front = -0.32 * c.depth
     color, size = _DARK if c.base == "swivel" else c.frame, (0.05, 0.024, rear - front)
@@ -183,7 +182,6 @@ def _add_legs(c: _Chair, solids: list[Solid], pairs: dict[tuple[int, int], Point
 
 
 def _add_swivel(c: _Chair, solids: list[Solid], tips: dict[int, Point]) -> None:
-    """A column on five spokes with castors."""
     top = c.seat - 0.01
     column = [
         (0.045, 0.06), (0.045, 0.13), (0.03, 0.15), (0.03, 0.24), (0.018, 0.245),

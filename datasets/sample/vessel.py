@@ -197,7 +197,6 @@ def _cargo(v: _Vessel) -> _Above:
 
 
 def _tug(v: _Vessel) -> _Above:
-    """A tug: wheelhouse forward, a funnel, a low open stern."""
     deck, house = v.deck(0.05), 0.62 * v.beam
     y, wide = deck + 0.1 * v.tall, 0.78 * house
     top = y + 0.125

@@ -177,7 +177,6 @@ def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> No
 
 
 def _annotation(model: SampleModel) -> dict[str, Any]:
-    """A model's entry in KeypointNet's ``annotations/<category>.json``."""
     row = {keypoint.semantic_id: i for i, keypoint in enumerate(model.keypoints)}
     mirrored = [{"kp_indexes": [row[number] for number in pair]} for pair in model.mirrored]
     turned = []

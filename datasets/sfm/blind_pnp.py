@@ -160,7 +160,6 @@ class BlindPnP(CorrespondenceSet):
         return min(usual, inverted, key=lambda pair: _distance(pair[0], pair[1], pose))
 
     def _count(self, kind: str, position: int) -> int | None:
-        """Number of points before the padding; None where the files don't say."""
         name = f"num_points_{kind}"
         return int(self._flat(name, position)[0]) if name in self._data else None
 

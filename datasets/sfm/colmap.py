@@ -140,7 +140,6 @@ class Colmap(CorrespondenceSet):
 
 
 def _find_model(root: Path) -> tuple[Path, str]:
-    """The folder and the suffix of a model's files."""
     if not root.is_dir():
         raise DataError("no such folder", where=str(root), fix="give the folder of a COLMAP model")
     incomplete = ""

@@ -118,7 +118,6 @@ def _check_size(value: Any, *, limit: int) -> None:
 
 
 def _items(value: Any) -> Collection[Any]:
-    """The values in a container, none for anything else."""
     if isinstance(value, dict):
         return value.values()
     if isinstance(value, list | tuple | set | frozenset):

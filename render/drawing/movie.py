@@ -119,7 +119,6 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[ByteImage], *, fp
 
 
 def _checked(frames: Iterable[ByteImage]) -> Iterator[ByteImage]:
-    """The frames, all of the first one's shape."""
     shape = None
     for number, image in enumerate(frames):
         shape = image.shape if shape is None else shape

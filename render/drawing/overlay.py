@@ -296,7 +296,6 @@ def _legend_entries(gt_box: Box | None, predicted: bool, *, axes: bool) -> list[
 
 
 def _drawn_pixels(strokes: list[_Stroke]) -> FloatArray:
-    """Pixels of the lines, (n, 2)."""
     share = np.linspace(0, 1, 41)[:, None]
     lines = [s.points[0] + share * (s.points[-1] - s.points[0]) for s in strokes]
     return np.concatenate([np.empty((0, 2)), *lines])

@@ -153,7 +153,6 @@ def turntable(
 
 
 def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:
-    """Feature lines drawn at twice the size and shrunk."""
     doubled = resized_camera(camera, 2 * camera.width, 2 * camera.height)
     lines = line_picture(cast_geometry(scene, doubled, cam_from_model))
     # Two pixels wide there is one pixel wide here.

@@ -114,7 +114,6 @@ class RaycastRenderer:
         return self.name
 
     def _antialias(self, color: ByteImage, posed: PosedScene, samples: int) -> None:
-        """Draw the pixels that differ from a neighbour again, with several rays each."""
         part = color[posed.block.slices]
         unlike = _unlike_neighbours(part)
         if posed.scene.surface.opaque:
@@ -126,7 +125,6 @@ class RaycastRenderer:
         self._sample(color, unlike & ~outline, posed, -(-samples // 2))
 
     def _sample(self, color: ByteImage, chosen: BoolArray, posed: PosedScene, samples: int) -> None:
-        """Draw the chosen pixels of the scene's block with several rays each."""
         rows, columns = np.nonzero(chosen)
         pixels = np.column_stack([columns + posed.block.left, rows + posed.block.top])
         offsets = _subpixel_offsets(samples)

@@ -242,7 +242,6 @@ class Studio:
         return np.asarray(lifted * light[:, None] + shine[:, None], dtype=np.float32)
 
     def _diffuse(self, cosine: LinearArray) -> LinearArray:
-        """Lambert's law for a light of some size."""
         wrap = np.float32(self.wrap)
         return np.asarray(np.maximum((cosine + wrap) / (1 + wrap), 0), dtype=np.float32)
 

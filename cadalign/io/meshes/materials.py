@@ -186,7 +186,6 @@ class Textures:
             return self._pixels(image)
 
     def _pixels(self, image: Image) -> Texture:
-        """The pixels, with opacity where the picture has transparency."""
         transparent = "A" in image.getbands() or "transparency" in image.info
         mode = "RGBA" if transparent else "RGB"
         size = len(mode) * image.width * image.height

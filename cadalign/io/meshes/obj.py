@@ -260,7 +260,6 @@ def _parse_corner(corner: bytes) -> tuple[int, int]:
 def _assign_materials(
     statements: _Statements, path: Path, polygon: IntArray, colored: bool
 ) -> tuple[tuple[Material, ...], npt.NDArray[np.int64]]:
-    """The materials in order of first use, and the number of each triangle's."""
     blocks = [(0, ""), *statements.materials_at]
     starts = np.array([start for start, _ in blocks])
     # Of blocks that start at the same face only the last one colours it: the others are empty.

@@ -153,7 +153,6 @@ def _polygon_rows(data: Any) -> list[npt.NDArray[Any]]:
 
 
 def _mesh(geometry: Any, path: Path, texture: Texture | None) -> Mesh:
-    """One of trimesh's meshes."""
     vertices = np.asarray(geometry.vertices, dtype=float)
     faces = np.asarray(geometry.faces, dtype=np.int64)
     visual = geometry.visual

@@ -98,6 +98,13 @@ class TooFewVisibleError(DegenerateError, RenderError):
     """No view of an object shows as many keypoints as are asked for."""
 
 
+def require_kind(value: object, kind: type, where: str, *, fix: str | None = None) -> None:
+    """Refuse a value that is not of one of cadalign's classes."""
+    if not isinstance(value, kind):
+        what = f"expected a cadalign.{kind.__name__}, got {type(value).__name__}"
+        raise InputError(what, where=where, fix=fix)
+
+
 def unknown(
     kind: str, value: object, known: Iterable[str], *, where: str | None = None
 ) -> InputError:

@@ -19,7 +19,7 @@ from cadalign.batch.experiment import ManyEstimates, plan_run
 from cadalign.batch.options import FitRunOptions, ManyOptions
 from cadalign.batch.sources import ObservationTask
 from cadalign.batch.table import write_csv
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError, require_kind
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result import Result
@@ -235,9 +235,7 @@ def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
 
 
 def _line(number: int, observation: Any) -> bytes:
-    if not isinstance(observation, Observation):
-        what = f"expected a cadalign.Observation, got {type(observation).__name__}"
-        raise InputError(what, where=f"observations[{number}]")
+    require_kind(observation, Observation, f"observations[{number}]")
     return msgspec.json.encode(observation.to_dict(states_origins=True)) + b"\n"
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray, worker_count
-from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake
@@ -128,15 +128,11 @@ def align(
     """
     start = time.perf_counter()
     given = _checked_views(views)
-    _check_size(size)
+    if size is not None:
+        require_kind(size, Size, "size")
     inits = _checked_inits(init, given)
-    options = FitOptions(
-        loss=loss,
-        loss_scale=loss_scale,
-        focal=focal,
-        focal_prior=focal_prior,
-        principal_sigma=principal_sigma,
-    )
+    lens: dict[str, Any] = {"focal": focal, "focal_prior": focal_prior}
+    options = FitOptions(loss=loss, loss_scale=loss_scale, principal_sigma=principal_sigma, **lens)
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
     if motion is not None:
@@ -164,27 +160,17 @@ def _align_cropped(
     model: Model | ShapeModel, views: Sequence[View], options: FitOptions, **given: Any
 ) -> Result:
     """Estimate the principal point, too."""
-    from cadalign.estimation.principal import (
-        check_shiftable,
-        estimate_with_principal_point,
-        shifted,
-    )
+    from cadalign.estimation import principal
 
-    check_shiftable(views)
+    principal.check_shiftable(views)
+    known = replace(options, principal_sigma=None).of_views
 
     def align_at(shift: FloatArray) -> Result:
-        return align(
-            model,
-            [replace(view, camera=shifted(view.camera, shift)) for view in views],
-            loss=options.loss,
-            loss_scale=options.loss_scale,
-            focal=options.focal,
-            focal_prior=options.focal_prior,
-            **given,
-        )
+        moved = [replace(each, camera=principal.shifted(each.camera, shift)) for each in views]
+        return align(model, moved, **known, **given)
 
     sigmas = [view.sigma for view in views]
-    return estimate_with_principal_point(align_at, options, sigmas)
+    return principal.estimate_with_principal_point(align_at, options, sigmas)
 
 
 def _align_all(
@@ -295,20 +281,22 @@ def align_batch(
     sizes = _one_each(size, len(objects), "size", Size)
     starts = _one_each(init, len(objects), "init", Alignment)
 
-    options: dict[str, Any] = {
-        "loss": loss,
-        "loss_scale": loss_scale,
-        "ransac": ransac,
-        "focal": focal,
-        "focal_prior": focal_prior,
-        "principal_sigma": principal_sigma,
-    }
-
     def one(
         views: View | Sequence[View], size: Size | None, init: Alignment | None
     ) -> Result | CadalignError:
         try:
-            return align(model, views, size=size, init=init, **options)
+            return align(
+                model,
+                views,
+                size=size,
+                init=init,
+                loss=loss,
+                loss_scale=loss_scale,
+                ransac=ransac,
+                focal=focal,
+                focal_prior=focal_prior,
+                principal_sigma=principal_sigma,
+            )
         except CadalignError as error:
             return error
 
@@ -330,6 +318,10 @@ def _one_each(
     if len(given) != count:
         fix = "give one for all, or one or None for each"
         raise InputError(f"{len(given)} for {count} objects", where=where, fix=fix)
+    return _require_each(given, where, kind)
+
+
+def _require_each(given: Sequence[Any], where: str, kind: type[T]) -> Sequence[T | None]:
     for number, each in enumerate(given):
         if each is not None and not isinstance(each, kind):
             what = f"expected a cadalign.{kind.__name__} or None, got {type(each).__name__}"
@@ -348,9 +340,7 @@ def _checked_views(given: object) -> list[View]:
     if not views:
         raise InputError("none is given", where="views")
     for number, view in enumerate(views):
-        if not isinstance(view, View):
-            what = f"expected a cadalign.View, got {type(view).__name__}"
-            raise InputError(what, where=f"views[{number}]")
+        require_kind(view, View, f"views[{number}]")
     return views
 
 
@@ -368,12 +358,6 @@ def _check_numbers(model: object, views: Sequence[View]) -> None:
             )
 
 
-def _check_size(size: object) -> None:
-    if size is not None and not isinstance(size, Size):
-        what = f"expected a cadalign.Size, got {type(size).__name__}"
-        raise InputError(what, where="size")
-
-
 def _checked_inits(init: object, views: Sequence[View]) -> list[Alignment | None]:
     """A start or None for each view; for the first one where a single start is given."""
     if init is None or isinstance(init, Alignment):
@@ -384,11 +368,8 @@ def _checked_inits(init: object, views: Sequence[View]) -> list[Alignment | None
     if len(init) != len(views):
         fix = "give one, or one or None for each view"
         raise InputError(f"{len(init)} for {len(views)} views", where="init", fix=fix)
-    for number, each in enumerate(init):
-        if each is not None and not isinstance(each, Alignment):
-            what = f"expected a cadalign.Alignment or None, got {type(each).__name__}"
-            raise InputError(what, where=f"init[{number}]")
-    known = next((each for each in init if each is not None), None)
+    given = list(_require_each(init, "init", Alignment))
     if views[0].cam_from_rig is not None:  # they share one pose
+        known = next((each for each in given if each is not None), None)
         return [known, *[None] * (len(views) - 1)]
-    return list(init)
+    return given

@@ -18,6 +18,13 @@ from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
 from cadalign.solvers.search import Minima
 
 
+def mean_state(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> State:
+    """The state of the mean shape at poses (P, 12) and log scales (3,)."""
+    shape, focals = evidence.shape, np.zeros(len(evidence.focals.low))
+    still = np.zeros(len(shape.modes)), np.zeros_like(shape.mean)
+    return State(poses, focals, log_scales, *still)
+
+
 def pose_and_border(found: JointCovariance, pose: int) -> FloatArray:
     """Covariance (6 + b, 6 + b) of one pose and of the unknowns that all views share."""
     cross = found.cross[pose]

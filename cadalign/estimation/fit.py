@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError, InputError, require_kind
 from cadalign.estimation.assemble import canonical_result, result_of_solution
 from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
@@ -275,11 +275,10 @@ def _copied(sigma: Any) -> Any:
         return np.array(sigma)
 
 
-def _check(ransac: object, scores: object, symmetry: object) -> None:
-    if ransac is not None and not isinstance(ransac, RansacOptions):
-        what = f"expected a cadalign.RansacOptions, got {type(ransac).__name__}"
-        raise InputError(what, where="ransac")
-    if ransac is None and scores is not None:
+def _check(ransac: object, scores: object, symmetry: Symmetry | None) -> None:
+    if ransac is not None:
+        require_kind(ransac, RansacOptions, "ransac")
+    elif scores is not None:
         fix = "give ransac=RansacOptions(...), or the keypoints' sigma instead"
         raise InputError("given without ransac", where="scores", fix=fix)
     if symmetry is not None:

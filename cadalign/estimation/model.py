@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points, as_positive, read_only
-from cadalign.errors import InputError, quote
+from cadalign.errors import InputError, quote, require_kind
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.mesh import Mesh
@@ -84,10 +84,8 @@ class Model:
             raise InputError("a model needs keypoints", where="points_3d", fix="or give a mesh")
         object.__setattr__(self, "points_3d", read_only(points))
         object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
-        mesh: object = self.mesh
-        if mesh is not None and not isinstance(mesh, Mesh):
-            what = f"expected a cadalign.Mesh, got {type(mesh).__name__}"
-            raise InputError(what, where="mesh", fix="read it with cadalign.load_mesh")
+        if self.mesh is not None:
+            require_kind(self.mesh, Mesh, "mesh", fix="read it with cadalign.load_mesh")
         if self.shape_sigma is not None and not len(points):
             fix = "give points_3d, whose positions it is about, or leave it away"
             raise InputError("the model has no keypoints", where="shape_sigma", fix=fix)
@@ -112,11 +110,13 @@ class Model:
         if prior is None and self.shape_sigma is not None:
             prior = SIMILAR_SCALE_SIGMA
         return FitOptions(
-            sigma=sigma,
-            stretch=self.stretch,
-            stretch_sigma=prior,
-            known_axis=self.known_axis,
+            sigma=sigma, stretch=self.stretch, stretch_sigma=prior, known_axis=self.known_axis
         )
+
+
+def is_exact_model(model: object) -> bool:
+    """True for a CAD model whose object has its shape, but for the stretch."""
+    return isinstance(model, Model) and model.shape_sigma is None
 
 
 def check_axis(axis: object) -> None:

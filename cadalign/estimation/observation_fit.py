@@ -297,17 +297,9 @@ class ObservationFit:
             from cadalign.estimation.align import align
 
             model, views, options = self.problem(observation, where, notes.append)
-            names = ("loss", "loss_scale", "focal", "focal_prior", "principal_sigma")
-            chosen = {name: getattr(options, name) for name in names}
+            known: dict[str, Any] = {"size": observation.size, "init": observation.init}
             with status or nullcontext(), self._located(where):
-                result = align(
-                    model,
-                    views,
-                    size=observation.size,
-                    init=observation.init,
-                    ransac=ransac,
-                    **chosen,
-                )
+                result = align(model, views, ransac=ransac, **known, **options.of_views)
         for text in notes:
             note(text)
         return result, views

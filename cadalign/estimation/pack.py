@@ -37,35 +37,33 @@ _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
 _LOSS_SCALE = 3.0  # a keypoint that something hides has the depth of what hides it
+_PLAIN = FitOptions()
 
 
 def evidence_of(
     prior: ShapePrior,
     views: Sequence[View],
-    size: Size | None,
+    size: Size | None = None,
     *,
-    loss: int,
-    loss_scale: float,
+    options: FitOptions = _PLAIN,
     lenses: Lenses | None = None,
     noise: float = 1.0,
     frames: Sequence[int] | None = None,
 ) -> Evidence:
     """Evidence of the views, of the size and of the first component of the prior.
 
-    By default the views' focal lengths are known. Keypoints without a sigma have the standard
-    deviation ``noise`` [px]. ``frames`` number the poses of the views of a
-    moving object.
+    Of the ``options`` the loss counts. By default the views' focal lengths are known. Keypoints
+    without a sigma have the standard deviation ``noise`` [px]. ``frames`` number the poses of the
+    views of a moving object.
 
     Raises InputError if a view names a keypoint that the model lacks, lacks evidence, or has some
     of an up axis that the model lacks, or if only some views have a known pose.
     """
     if lenses is None:
         lenses = Lenses.of(views, "known", None)
-    rows = [
-        prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
-        for number, view in enumerate(views)
-    ]
+    rows = []
     for number, view in enumerate(views):
+        rows.append(prior.rows_of(view.keypoint_ids, f"views[{number}].ids"))
         if frames is None and not tells_something(view):
             fix = "give keypoints, a mask or a direction, or leave the view away"
             raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
@@ -80,7 +78,7 @@ def evidence_of(
         )
     return Evidence(
         prior.components[0],
-        _sightings(rows, views, lenses.cameras, noise, loss, loss_scale),
+        _sightings(rows, views, lenses.cameras, noise, options),
         _rig(views, frames),
         lenses.focals(),
         directions,
@@ -110,8 +108,7 @@ def _sightings(
     views: Sequence[View],
     cameras: Sequence[Camera],
     noise: float,
-    loss: int,
-    loss_scale: float,
+    options: FitOptions,
 ) -> Sightings:
     tables = []
     for number, (rows, view, camera) in enumerate(zip(names, views, cameras, strict=True)):
@@ -125,8 +122,8 @@ def _sightings(
                 rays,
                 np.broadcast_to(whitening_of(sigma, rays, camera), (count, 3)),
                 _depths(view, count),
-                np.full(count, loss),
-                np.full(count, float(loss_scale)),
+                np.full(count, LOSSES[options.loss]),
+                np.full(count, float(options.loss_scale)),
                 focal_slopes(pixels, camera, rays) if camera.distortion else 0.0 * rays,
             )
         )
@@ -251,8 +248,7 @@ class SingleBasis:
     def evidence(self) -> Evidence:
         """The evidence in the form of the kernels."""
         prior = prior_of(self.model)
-        loss, scale = LOSSES[self.options.loss], self.options.loss_scale
-        first = evidence_of(prior, [self.view], None, loss=loss, loss_scale=scale)
+        first = evidence_of(prior, [self.view], options=self.options)
         return first._replace(shape=prior.components[self.component])
 
     @cached_property

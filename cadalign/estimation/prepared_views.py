@@ -15,12 +15,8 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.facing import (
-    faced,
-    rays_ahead,
-    turned_alignment,
-    turned_covariance,
-)
+from cadalign.estimation.estimates import mean_state
+from cadalign.estimation.facing import faced, rays_ahead, turned_alignment, turned_covariance
 from cadalign.estimation.pack import evidence_of, tells_something
 from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.problems import are_on_a_line
@@ -30,8 +26,6 @@ from cadalign.estimation.uncertainty.stated import Stated, Statistics
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
-from cadalign.solvers.constants import LINEAR
-from cadalign.solvers.joint.evidence import State
 from cadalign.solvers.joint.search import refine_joint
 
 Align = Callable[[Sequence[View], Sequence[Alignment | None]], Result]
@@ -135,9 +129,7 @@ def _renumbered(text: str, used: Sequence[int]) -> str:
 
 def lie_on_a_line(points: FloatArray) -> bool:
     """True for points (n, 3) that determine no rotation: fewer than three, or on one line."""
-    if len(points) < _LEAST_POINTS:
-        return True
-    return are_on_a_line(points, _ON_A_LINE)
+    return len(points) < _LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
 
 
 def _camera_of(view: View, estimated: Mapping[Camera, Camera]) -> Camera:
@@ -163,17 +155,9 @@ def _explaining(prior: ShapePrior, view: View, camera: Camera, result: Result) -
     )
     if not len(view.keypoint_ids) and view.up is None:
         return result.alignment
-    evidence = evidence_of(prior, [alone], None, loss=LINEAR, loss_scale=1.0)
     points = np.concatenate([result.points_3d, result.bounds])
-    evidence = with_known_shape(evidence, points)
-    first = result.alignment
-    state = State(
-        np.append(first.rotation.ravel(), first.translation)[None],
-        np.zeros(0),
-        np.log(scale),
-        np.zeros(0),
-        np.zeros_like(points),
-    )
+    evidence = with_known_shape(evidence_of(prior, [alone]), points)
+    state = mean_state(evidence, result.alignment.packed[None, :12], np.log(scale))
     _, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
     return Alignment(state.poses[0, :9].reshape(3, 3), state.poses[0, 9:], scale)
 

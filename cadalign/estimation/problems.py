@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_number, worker_count
-from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
@@ -114,7 +114,7 @@ class Problems:
 def pack_one(points_3d: npt.ArrayLike, points_2d: npt.ArrayLike, camera: Camera) -> Problems:
     """Check one problem's arguments."""
     model, image = _check_pair(points_3d, points_2d, "points_3d", "points_2d")
-    _check_camera(camera)
+    require_kind(camera, Camera, "camera")
     check_pixels(image, camera.width, camera.height, where="points_2d")
     return Problems(model, image, np.array([0, len(model)]), (camera,))
 
@@ -131,7 +131,7 @@ def pack_many(
     given = isinstance(camera, Camera)
     cameras = (camera,) if given else tuple(each_of(camera, "camera", count, "cameras"))
     for single in cameras:
-        _check_camera(single)
+        require_kind(single, Camera, "camera")
     if not count:
         return Problems(np.empty((0, 3)), np.empty((0, 2)), np.zeros(1, dtype=np.int64), cameras)
     problems = None
@@ -194,11 +194,6 @@ def _is_stack(value: object, last: int) -> bool:
         and value.shape[2] == last
         and value.dtype.kind == "f"
     )
-
-
-def _check_camera(camera: object) -> None:
-    if not isinstance(camera, Camera):
-        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
 
 
 def _is_plain(points: npt.ArrayLike, dimension: int) -> bool:

@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_positive
-from cadalign.errors import CadalignError, DegenerateError, InputError, quote
+from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.evidence_kinds import upward
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
@@ -281,11 +281,8 @@ def _checked(
     if not isinstance(objects, Sequence) or not len(objects):
         fix = "give a list of cadalign.SceneObject"
         raise InputError("expected at least one object", where="objects", fix=fix)
-    given: Sequence[object] = objects
-    for number, one in enumerate(given):
-        if not isinstance(one, SceneObject):
-            what = f"expected a cadalign.SceneObject, got {type(one).__name__}"
-            raise InputError(what, where=f"objects[{number}]")
+    for number, one in enumerate(objects):
+        require_kind(one, SceneObject, f"objects[{number}]")
         if one.view.camera != objects[0].view.camera:
             what = "the camera differs from the first object's"
             fix = "give objects of one photo, with its camera"

@@ -17,7 +17,7 @@ from cadalign.estimation.joint_robust import (
     with_sightings,
 )
 from cadalign.estimation.mistakes import Support, area_of, check_support
-from cadalign.estimation.options import LOSSES, FitOptions, RansacOptions
+from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import LENS_ROUNDS, Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
@@ -78,8 +78,7 @@ class JointProblem(NamedTuple):
             self.prior,
             self.views,
             self.size,
-            loss=LOSSES[self.options.loss],
-            loss_scale=self.options.loss_scale,
+            options=self.options,
             lenses=lenses,
             noise=self.noise,
             frames=self.frames,

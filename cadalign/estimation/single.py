@@ -19,7 +19,7 @@ from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
 from cadalign.estimation.joint import Estimate, result_of
 from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
-from cadalign.estimation.model import Model
+from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import SingleBasis, seen_keypoints
 from cadalign.estimation.prior import prior_of
@@ -45,7 +45,7 @@ _DECISIVE = 10.0  # of -2 log likelihood, times the variance of shapes that were
 
 def is_plain(model: object, views: Sequence[View]) -> bool:
     """True where nothing but the keypoints of one view and an exact model is given."""
-    return _is_own(model) and _has_keypoints_alone(views)
+    return is_exact_model(model) and _has_keypoints_alone(views)
 
 
 def is_single(model: object, views: Sequence[View]) -> bool:
@@ -71,14 +71,10 @@ def begins_at_outline(
 
     The own model is refined by them, as its pose stays near where they leave it open.
     """
-    if len(views) > 1 or inits[0] is None or _is_own(model):
+    if len(views) > 1 or inits[0] is None or is_exact_model(model):
         return False
     few = 0 < len(views[0].keypoint_ids) < _LEAST_POINTS
     return few and (views[0].mask is not None or views[0].image is not None)
-
-
-def _is_own(model: object) -> bool:
-    return isinstance(model, Model) and model.shape_sigma is None
 
 
 def _has_keypoints_alone(views: Sequence[View]) -> bool:
@@ -232,5 +228,4 @@ def _given(init: Alignment | None) -> FloatArray:
     """A given start as a pose (1, 12) of the unstretched shape; none (0, 12) without."""
     if init is None:
         return np.empty((0, 12))
-    translation = init.translation / init.scale.mean()
-    return np.concatenate([init.rotation.ravel(), translation])[None]
+    return np.append(init.rotation, init.translation / init.scale.mean())[None]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import require_kind
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angle_between, by_rotation, vector_from_rotation
 from cadalign.geometry.symmetry import Symmetry
@@ -25,14 +25,12 @@ _SAME_DEG = 0.01  # of rotations where there are no deviations, or they are tiny
 _SAME_SCALE = 1e-4
 
 
-def check_symmetry(symmetry: object) -> None:
+def check_symmetry(symmetry: Symmetry) -> None:
     """Check that a symmetry's motions make a group.
 
     Raises InputError if it is something else, or its motions make none.
     """
-    if not isinstance(symmetry, Symmetry):
-        what = f"expected a cadalign.Symmetry, got {type(symmetry).__name__}"
-        raise InputError(what, where="symmetry", fix="see cadalign.Symmetry.from_dict")
+    require_kind(symmetry, Symmetry, "symmetry", fix="see cadalign.Symmetry.from_dict")
     group_of(symmetry)
 
 

@@ -20,7 +20,7 @@ from cadalign.arrays import (
     is_number,
     read_only,
 )
-from cadalign.errors import InputError, quote
+from cadalign.errors import InputError, quote, require_kind
 from cadalign.estimation.model import checked_ids
 from cadalign.estimation.options import Sigma
 from cadalign.geometry.camera import Camera
@@ -129,10 +129,8 @@ class View(DeclaredEvidence):
         for name, value in _DEFAULTS.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
-        camera: object = self.camera
-        if not isinstance(camera, Camera):
-            what = f"expected a cadalign.Camera, got {type(camera).__name__}"
-            raise InputError(what, where="camera")
+        camera = self.camera
+        require_kind(camera, Camera, "camera")
         points = np.empty((0, 2)) if np.size(self.points_2d) == 0 else self.points_2d
         points = as_points(points, name="points_2d", dimension=2)
         check_pixels(points, camera.width, camera.height, where="points_2d")

@@ -31,7 +31,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.categories import require_category
-from cadalign.errors import DegenerateError, InputError
+from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.result import Result
@@ -94,9 +94,7 @@ def shapes_by_category(
         raise InputError(what, where="shape")
     found = {}
     for category, model in shape.items():
-        if not isinstance(model, ShapeModel):
-            what = f"expected a cadalign.ShapeModel, got {type(model).__name__}"
-            raise InputError(what, where=f"shape[{category!r}]")
+        require_kind(model, ShapeModel, f"shape[{category!r}]")
         if any(isinstance(label, str) for label in model.ids):
             what, fix = "its keypoints have names", "learn it from models with semantic ids"
             raise InputError(what, where=f"shape[{category!r}]", fix=fix)

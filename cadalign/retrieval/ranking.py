@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.datasets.models.categories import require_category
-from cadalign.errors import DegenerateError, InputError
+from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.fit import fit_batch
 from cadalign.estimation.options import LOSSES, Sigma
@@ -103,8 +103,7 @@ def observe(
     points_2d: npt.ArrayLike, ids: npt.ArrayLike, camera: Camera, options: RetrievalOptions
 ) -> Observed:
     """Check an image's keypoints and prepare them for the kernels."""
-    if not isinstance(camera, Camera):
-        raise InputError(f"expected a cadalign.Camera, got {type(camera).__name__}", where="camera")
+    require_kind(camera, Camera, "camera")
     require_perspective(camera, "retrieval")
     pixels = as_points(points_2d, name="points_2d", dimension=2)
     ids = check_semantic_ids(ids, len(pixels), where="ids")

@@ -119,7 +119,9 @@ def _solve(objective: Objective, equations: Equations, damping: float, step: Flo
 def solve_damped(equations: Equations, unknowns: int, damping: float, step: FloatArray) -> float:
     """Write the damped step; returns the decrease that it predicts, NaN for no solution."""
     hessian, gradient, factor = equations.hessian, equations.gradient, equations.factor
-    least = least_information(hessian, unknowns)
+    least = 1e-300  # holds unknowns without evidence where they are
+    for k in range(unknowns):
+        least = max(least, LEAST_INFORMATION * hessian[k, k])
     for k in range(unknowns):
         step[k] = -gradient[k]
         for m in range(k + 1):
@@ -129,15 +131,6 @@ def solve_damped(equations: Equations, unknowns: int, damping: float, step: Floa
         return np.nan
     solve_cholesky(factor, unknowns, step)
     return expected_decrease(gradient, step, unknowns)
-
-
-@inlined
-def least_information(hessian: FloatArray, unknowns: int) -> float:
-    """Addition to the diagonal that holds unknowns without evidence where they are."""
-    least = 1e-300
-    for k in range(unknowns):
-        least = max(least, LEAST_INFORMATION * hessian[k, k])
-    return least
 
 
 @move.of(Objective)

@@ -164,19 +164,11 @@ def evaluate_focal(system: FocalObjective, state: FloatArray, equations: Equatio
         for m in range(k):
             hessian[k, m] = hessian[m, k]
     hold_fixed(system.objective.free, UNKNOWNS + 1, hessian, gradient)
-    _hold_at_bounds(system.prior, log_ratio, hessian, gradient)
-    return cost
-
-
-@inlined
-def _hold_at_bounds(
-    prior: LogFocalPrior, log_ratio: float, hessian: FloatArray, gradient: FloatArray
-) -> None:
-    """Hold the focal length where it would leave its bounds."""
-    if leaves_bounds(log_ratio, prior.low, prior.high, gradient[UNKNOWNS]):
+    if leaves_bounds(log_ratio, system.prior.low, system.prior.high, gradient[UNKNOWNS]):
         gradient[UNKNOWNS] = 0.0
         for m in range(UNKNOWNS):
             hessian[UNKNOWNS, m] = hessian[m, UNKNOWNS] = 0.0
+    return cost
 
 
 @cost_at.of(FocalObjective)

@@ -218,12 +218,7 @@ def projection_jacobian(points_3d: FloatArray, camera: Camera, alignment: Alignm
 def predicted_covariances(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     """Covariances (n, 2, 2) [px^2] of predicted projections, without a measurement's own noise.
 
-    Parameters
-    ----------
-    jacobian : (n, 2, 10) float
-        See `projection_jacobian`.
-    covariance : (9, 9) or (10, 10) float
-        Covariance of the unknowns, without the focal length where that is known.
+    By the `projection_jacobian` and the covariance of the unknowns (m, m), the first of its 10.
     """
     jacobian = jacobian[:, :, : len(covariance)]
     return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))

@@ -52,7 +52,8 @@ def intersect_quadrics(memory: FloatArray) -> int:
     x, y, z, best = 1, 2, 3, -1.0
     for i in range(1, 4):
         j, k = i % 3 + 1, (i + 1) % 3 + 1
-        size = abs(_minor(memory, _entry(j, j), _entry(j, k), _entry(k, k)))
+        across = cross(_column(memory, _entry(j, k)), _column(memory, _entry(k, k)))
+        size = abs(dot(_column(memory, _entry(j, j)), across))
         if size > best:
             x, y, z, best = i, j, k, size
     if not best > 0.0:
@@ -102,12 +103,6 @@ def _entry(i: int, j: int) -> int:
     """Position of the coefficient of e_i e_j in a row of quadrics."""
     low, high = min(i, j), max(i, j)
     return low * 4 - low * (low - 1) // 2 + high - low
-
-
-@inlined
-def _minor(memory: FloatArray, a: int, b: int, c: int) -> float:
-    """Determinant of three of the quadrics' columns."""
-    return dot(_column(memory, a), cross(_column(memory, b), _column(memory, c)))
 
 
 @inlined

@@ -317,22 +317,22 @@ class _ShapeTask:
 
         def one(b: int, aligned: _Aligned) -> None:
             seen, component, pose, force = aligned
-            slopes = slopes_of(self.mixture, component, seen, pose, force, False)
+            by_state, by_data = slopes_of(self.mixture, component, seen, pose, force)
             beside = (3 * seen.points[:, None] + np.arange(3)).ravel()
             whole = self.mixture.covariances[component][: 3 * self.keypoints][:, beside]
             turn = np.cross(pose[:9].reshape(3, 3), by_rotation[b], axis=0).sum(axis=1)
             wanted = np.concatenate([turn, by_translation[b], by_points[b].ravel() @ whole])
             try:
-                adjoint = -np.linalg.solve(slopes.by_state.T, wanted)
+                adjoint = -np.linalg.solve(by_state.T, wanted)
             except np.linalg.LinAlgError:
                 return
-            by_data = adjoint @ slopes.by_data
-            if not np.isfinite(by_data).all():
+            pulled = adjoint @ by_data
+            if not np.isfinite(pulled).all():
                 return
             n, present = len(seen.points), batch.present[b]
-            by_rays = by_data[: 2 * n].reshape(n, 1, 2)
+            by_rays = pulled[: 2 * n].reshape(n, 1, 2)
             by_pixels[b, present] = (by_rays @ batch.by_pixels[b, present])[:, 0]
-            by_sigma[b, present] = by_data[2 * n :] / batch.sigmas[b, present]
+            by_sigma[b, present] = pulled[2 * n :] / batch.sigmas[b, present]
 
         @np.errstate(all="ignore")
         def run(first: int, last: int) -> None:

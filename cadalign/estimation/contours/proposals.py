@@ -19,7 +19,7 @@ from cadalign.estimation.contours.view_contour import (
     cost_of_contour,
 )
 from cadalign.estimation.estimates import poses_of
-from cadalign.estimation.model import Model
+from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.geometry.alignment import Alignment
@@ -78,7 +78,7 @@ def minima_of_mask(
             fix="give a calibrated camera, or keypoints",
         )
     contour = contour_view(0, view, _WHERE, camera)
-    is_exact = isinstance(model, Model) and model.shape_sigma is None
+    is_exact = is_exact_model(model)
     proposals: list[_Proposal] = []
     steps, starts = 0, 0
     for is_cut, count in _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR:

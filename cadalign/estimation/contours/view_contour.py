@@ -29,7 +29,7 @@ from cadalign.estimation.contours.contour import (
 )
 from cadalign.estimation.contours.measured import OWN_MODES, Joined, Measured, Place, solved
 from cadalign.estimation.contours.surface import PosedSurface, surfaces_of
-from cadalign.estimation.estimates import pose_and_border, pose_and_lengths, poses_of
+from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_lengths, poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
@@ -344,10 +344,8 @@ def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
     """
     if view.mask_image is None or model.shape_sigma is not None:
         raise InputError("expected a view with a mask, and an exact model", where="view")
-    evidence = evidence_of(prior_of(model), [view], None, loss=LINEAR, loss_scale=1.0)
-    pose = np.concatenate([gt.rotation.ravel(), gt.translation])[None]
-    still = np.zeros_like(evidence.shape.mean)
-    state = State(pose, np.zeros(0), np.log(gt.scale), np.zeros(len(evidence.shape.modes)), still)
+    evidence = evidence_of(prior_of(model), [view])
+    state = mean_state(evidence, gt.packed[None, :12], np.log(gt.scale))
     full, stacked = with_contours(model, [view], evidence, state)
     unknowns = pose_and_border(joint_covariance(full, stacked), 0)
     return pose_and_lengths(full, stacked, unknowns)

@@ -21,6 +21,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
+from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.joint_robust import whitened_lengths, whitened_residuals
 from cadalign.estimation.prepared_views import lie_on_a_line
 from cadalign.estimation.prior import ShapePrior, with_known_shape
@@ -124,13 +125,7 @@ def candidates_of(evidence: Evidence, shape: FloatArray) -> PoseCandidates:
 
 def _cost(own: Evidence, frame: int, pose: FloatArray) -> float:
     """Truncated squares of a frame's own residuals under a pose."""
-    state = State(
-        np.broadcast_to(pose, (frame + 1, 12)),
-        np.zeros(len(own.focals.low)),
-        np.zeros(3),
-        np.zeros(0),
-        np.zeros_like(own.shape.mean),
-    )
+    state = mean_state(own, np.broadcast_to(pose, (frame + 1, 12)), np.zeros(3))
     lengths = np.minimum(whitened_lengths(own, state), _OUTLIER)
     return float((lengths * lengths).sum())
 

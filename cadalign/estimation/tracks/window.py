@@ -15,7 +15,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.tracks.motion import Motion
-from cadalign.solvers.joint.arrow import Arrow, factorize_arrow, invert_arrow
+from cadalign.solvers.joint.arrow import Arrow, dense_matrix, factorize_arrow, invert_arrow
 from cadalign.solvers.joint.evidence import Evidence, Focals, Rig, kept_rows
 from cadalign.solvers.joint.motion import STATE, MotionPrior, moments
 from cadalign.solvers.joint.tracks import (
@@ -171,7 +171,7 @@ def _told_by_first(window: Window) -> Anchor:
     none = kept_rows(evidence.sightings, np.zeros(len(first), dtype=bool))
     nothing = own._replace(sightings=none)
     _, prior = equations_of(Moving(nothing, False, motion, NOTHING_KNOWN), pair)
-    information, gradient = _dense(arrow)
+    information, gradient = dense_matrix(arrow), arrow.gradient.copy()
     size = len(arrow.border)
     information[2 * STATE :, 2 * STATE :] -= prior.border  # it stays in the evidence
     gradient[2 * STATE :] -= prior.gradient[2 * STATE :]
@@ -190,19 +190,3 @@ def _told_by_first(window: Window) -> Anchor:
 
 def _of_views(evidence: Evidence, kept: BoolArray) -> Focals:
     return evidence.focals._replace(group=evidence.focals.group[kept])
-
-
-def _dense(arrow: Arrow) -> tuple[FloatArray, FloatArray]:
-    """The matrix and the gradient of two frames."""
-    size = len(arrow.border)
-    last = 2 * STATE
-    whole = np.zeros((last + size, last + size))
-    for p in range(2):
-        own = slice(STATE * p, STATE * (p + 1))
-        whole[own, own] = arrow.blocks[p]
-        whole[own, last:] = arrow.coupling[p, :, STATE:]
-        whole[last:, own] = arrow.coupling[p, :, STATE:].T
-    whole[:STATE, STATE:last] = arrow.coupling[0, :, :STATE]
-    whole[STATE:last, :STATE] = arrow.coupling[0, :, :STATE].T
-    whole[last:, last:] = arrow.border
-    return whole, arrow.gradient.copy()

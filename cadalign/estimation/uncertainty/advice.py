@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import cast
 
 import numpy as np
@@ -21,7 +22,7 @@ from cadalign.estimation.estimates import (
     with_box,
 )
 from cadalign.estimation.facing import turned_alignment, turned_covariance
-from cadalign.estimation.model import Model
+from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prepared_views import facing_view
 from cadalign.estimation.prior import ShapePrior, is_exact, prior_of, widened
@@ -32,7 +33,6 @@ from cadalign.geometry.camera import needs_facing
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
 from cadalign.io.evidence import LENGTHS, Size
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import Evidence, Shape, State
 
@@ -133,8 +133,7 @@ def rank_evidence(
     return tuple(sorted(found, key=_worst))
 
 
-def _worst(advice: Advice) -> float:
-    return advice.worst
+_worst = attrgetter("worst")
 
 
 def _with_view(scene: _KnownScene, turn_deg: float) -> _KnownScene:
@@ -263,7 +262,7 @@ class _KnownScene:
             poses = tuple(turned_alignment(pose, turn.T) for pose, turn in pairs)
             facing = replace(self, views=views, poses=poses)
             return turned_covariance(facing.covariance(), turns[0])
-        evidence = evidence_of(self.prior, self.views, self.size, loss=LINEAR, loss_scale=1.0)
+        evidence = evidence_of(self.prior, self.views, self.size)
         evidence, state = widened(evidence, self._state(evidence), self.prior.inflation)
         margins, known = self.prior.box_margins, is_exact(evidence)
         if margins is not None:  # the box that results state of a learned shape
@@ -287,10 +286,9 @@ class _KnownScene:
             camera = cast(FloatArray, self.views[0].cam_from_rig)
             turn, shift = camera[:3, :3].T, first.translation - camera[:3, 3]
             poses = (Alignment(turn @ first.rotation, turn @ shift, first.scale),)
-        packed = [np.append(each.rotation.ravel(), each.translation) for each in poses]
+        packed = np.array([each.packed[:12] for each in poses])
         points = np.concatenate([self.points_3d, self.bounds])
-        coefficients, rest = _explained(evidence.shape, points)
-        return State(np.array(packed), np.zeros(0), np.log(first.scale), coefficients, rest)
+        return State(packed, np.zeros(0), np.log(first.scale), *_explained(evidence.shape, points))
 
 
 def _scene_of(
@@ -305,7 +303,7 @@ def _scene_of(
         raise InputError("none is given", where="views")
     prior = prior_of(model)
     masked = [number for number, view in enumerate(views) if view.mask is not None]
-    if masked and not _is_exact_model(model):
+    if masked and not is_exact_model(model):
         what = "the effect of a mask is predicted for an exact model only"
         fix = "leave it away, or give a Model without `shape_sigma`"
         raise InputError(what, where=f"views[{masked[0]}].mask", fix=fix)
@@ -324,16 +322,12 @@ def _scene_of(
     return _KnownScene(model, own, views, estimate.poses, points, estimate.bounds, size)
 
 
-def _is_exact_model(model: Model | ShapeModel) -> bool:
-    return isinstance(model, Model) and model.shape_sigma is None
-
-
 def _poses_from(
     model: Model | ShapeModel, views: Sequence[View], first: Alignment
 ) -> tuple[Alignment, ...]:
     """Poses in every camera from that in the first."""
     fix = "give the Result of `align`"
-    if not _is_exact_model(model):
+    if not is_exact_model(model):
         raise InputError("an alignment does not tell the shape", where="estimate", fix=fix)
     if len(views) == 1:
         return (first,)

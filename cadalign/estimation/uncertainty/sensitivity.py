@@ -13,7 +13,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
-from cadalign.estimation.estimates import placed_box, poses_of
+from cadalign.estimation.estimates import mean_state, placed_box, poses_of
 from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.joint_robust import with_sightings
@@ -31,7 +31,7 @@ from cadalign.estimation.uncertainty.residuals import whitening_matrices
 from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.joint.evidence import State, points_of
+from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.joint.search import has_latent
 from cadalign.solvers.unknowns import leaves_bounds
 
@@ -147,25 +147,13 @@ def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
     sigma = result.sigma if options.sigma is None else options.sigma
     camera = faced(own.camera, own.points_2d)
     view = View(camera, own.points_2d, ids=own.ids, sigma=sigma)
-    focals = int(options.focal == "estimate")
-    evidence = evidence_of(
-        prior_of(model),
-        [view],
-        None,
-        loss=LOSSES[options.loss],
-        loss_scale=options.loss_scale,
-        lenses=Lenses((camera,), (focals - 1,), options.focal_prior),
-    )
+    group = 0 if options.focal == "estimate" else -1
+    lenses = Lenses((camera,), (group,), options.focal_prior)
+    evidence = evidence_of(prior_of(model), [view], options=options, lenses=lenses)
     rows = rows_among(result.ids, own.ids, "ids")
     evidence = with_sightings(evidence, own.inliers[np.argsort(rows, kind="stable")])
     pose = turned_alignment(own.alignment, camera.lens_from_camera.T)
-    state = State(
-        np.concatenate([pose.rotation.ravel(), pose.translation])[None],
-        np.zeros(focals),
-        np.log(pose.scale),
-        np.zeros(0),
-        np.zeros_like(evidence.shape.mean),
-    )
+    state = mean_state(evidence, pose.packed[None, :12], np.log(pose.scale))
     return Basis(evidence, state, principal_sigma=options.principal_sigma)
 
 

@@ -72,6 +72,23 @@ def copy_matrix(source: Arrow, target: Arrow) -> None:
     copy_into(target.border.ravel(), source.border.ravel())
 
 
+def dense_matrix(arrow: Arrow) -> FloatArray:
+    """All entries (U, U), the border last."""
+    (poses, size, width), border = arrow.coupling.shape, len(arrow.border)
+    last, ahead = size * poses, width - border
+    whole = np.zeros((last + border, last + border))
+    for p in range(poses):
+        own, following = slice(size * p, size * (p + 1)), slice(size * (p + 1), size * (p + 2))
+        whole[own, own] = arrow.blocks[p]
+        whole[own, last:] = arrow.coupling[p, :, ahead:]
+        whole[last:, own] = arrow.coupling[p, :, ahead:].T
+        if ahead and p < poses - 1:
+            whole[own, following] = arrow.coupling[p, :, :ahead]
+            whole[following, own] = arrow.coupling[p, :, :ahead].T
+    whole[last:, last:] = arrow.border
+    return whole
+
+
 @kernel
 def add_row(arrow: Arrow, pose: int, row: FloatArray, value: float) -> None:
     """Add an equation ``row . step = -value`` about one pose and the border, (6 + b,)."""

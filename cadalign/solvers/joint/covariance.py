@@ -13,6 +13,7 @@ from cadalign.solvers.evidence import whole_information
 from cadalign.solvers.joint.arrow import (
     Arrow,
     decide_on_undetermined,
+    dense_matrix,
     factorize_arrow,
     invert_arrow,
 )
@@ -106,9 +107,8 @@ def covariances_from(
     covariance = _pose_and_border(inverse, evidence.rig.pose[0])
     by_unknowns, own = _points_by_unknowns(evidence, reduced, state, equations, sighted)
     of_points = _blocks(by_unknowns, covariance) + own
-    _turn_and_move(reduced, state, by_unknowns)
+    turn = _turn_and_move(reduced, state, by_unknowns)
     of_seen = _blocks(by_unknowns, covariance)
-    turn = _cam_from_model(evidence, state)
     for i in range(points):
         of_seen[i] += turn @ own[i] @ turn.T
     return JointCovariance(
@@ -233,15 +233,16 @@ def _blocks(rows: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 @kernel
-def _turn_and_move(evidence: Evidence, state: State, rows: FloatArray) -> None:
+def _turn_and_move(evidence: Evidence, state: State, rows: FloatArray) -> FloatArray:
     """Take derivatives (m, 3, 6 + b) of points from the model's frame to the first camera's.
 
-    There a point is exp(rotation vector) turned + translation, in the rig's frame.
+    There a point is exp(rotation vector) turned + translation, in the rig's frame. Returns the
+    rotation (3, 3) of the camera from the model.
     """
     pose = state.poses[evidence.rig.pose[0]]
     rotation = pose[:9].copy().reshape((3, 3))
     camera = evidence.rig.cam_from_rig[0, :9].copy().reshape((3, 3))
-    turn = camera @ rotation
+    turn: FloatArray = camera @ rotation
     scale = np.exp(state.log_scales)
     point = np.empty(3)
     for i in range(rows.shape[0]):
@@ -255,28 +256,11 @@ def _turn_and_move(evidence: Evidence, state: State, rows: FloatArray) -> None:
         across = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
         rows[i, :, :3] += camera @ across
         rows[i, :, 3:6] += camera
-
-
-@kernel
-def _cam_from_model(evidence: Evidence, state: State) -> FloatArray:
-    """Rotation (3, 3) of the first camera from the model."""
-    camera = evidence.rig.cam_from_rig[0, :9].copy().reshape((3, 3))
-    return camera @ state.poses[evidence.rig.pose[0], :9].copy().reshape((3, 3))
+    return turn
 
 
 def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
     """The cost at a state, and the information (U, U) about all unknowns, border last."""
-    system = Joint(evidence, False)
     equations = joint_room(evidence, 6, 0)
-    cost = evaluate_joint(system, packed(state), equations)
-    arrow = equations.arrow
-    poses, size = len(arrow.blocks), len(arrow.border)
-    first = 6 * poses
-    dense = np.zeros((first + size, first + size))
-    for p in range(poses):
-        own = slice(6 * p, 6 * p + 6)
-        dense[own, own] = arrow.blocks[p]
-        dense[own, first:] = arrow.coupling[p]
-        dense[first:, own] = arrow.coupling[p].T
-    dense[first:, first:] = arrow.border
-    return float(cost), dense
+    cost = evaluate_joint(Joint(evidence, False), packed(state), equations)
+    return float(cost), dense_matrix(equations.arrow)

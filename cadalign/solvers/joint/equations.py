@@ -25,7 +25,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
 from cadalign.solvers.joint.arrow import Arrow, border_start, empty_arrow
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, count_poses, unstretched
+from cadalign.solvers.joint.evidence import Evidence, Shape, State, unstretched
 from cadalign.solvers.joint.rows import count_equations, exp_of, first_scale, stretched_point
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
 from cadalign.solvers.projection import turn, turn_back
@@ -59,7 +59,7 @@ class JointEquations(NamedTuple):
 def joint_room(evidence: Evidence, size: int, ahead: int) -> JointEquations:
     """Room for the normal equations; size and number ahead are those of `Arrow`."""
     sightings, rig = evidence.sightings, evidence.rig
-    poses, points = count_poses(evidence), evidence.shape.mean.shape[0]
+    poses, points = rig.pose.max() + 1, evidence.shape.mean.shape[0]
     border = evidence.focals.low.shape[0] + 3 + evidence.shape.modes.shape[0]
     order = np.argsort(rig.pose[sightings.image] * points + sightings.point, kind="mergesort")
     first = np.zeros(poses + 1, dtype=np.int64)

@@ -220,12 +220,3 @@ def unstretched(shape: Shape, state: State, i: int, a: int) -> float:
     for k in range(shape.modes.shape[0]):
         value += state.coefficients[k] * shape.modes[k, i, a]
     return float(value)
-
-
-@kernel
-def count_poses(evidence: Evidence) -> int:
-    """Number of poses."""
-    poses = 0
-    for v in range(evidence.rig.pose.shape[0]):
-        poses = max(poses, evidence.rig.pose[v] + 1)
-    return poses

@@ -118,18 +118,12 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
     for a in range(3):
         if evidence.scales.free[a] == 0.0:
             hold(arrow, first_scale(evidence) + a)
-    _hold_at_bounds(evidence, state, arrow)
-    return cost
-
-
-@inlined
-def _hold_at_bounds(evidence: Evidence, state: State, arrow: Arrow) -> None:
-    """Hold focal lengths where they would leave their bounds."""
     focals = evidence.focals
     for f in range(focals.low.shape[0]):
         slope = arrow.gradient[border_start(arrow) + f]
         if leaves_bounds(state.log_focals[f], focals.low[f], focals.high[f], slope):
             hold(arrow, f)
+    return cost
 
 
 @cost_at.of(Joint)

@@ -225,32 +225,20 @@ def _block(whole: FloatArray, told: FloatArray, square: float, i: int, j: int) -
 _DIFFERENCE = 1e-5  # in standard deviations, radians, and shares of lengths
 
 
-class StateSlopes(NamedTuple):
-    """Derivatives of a step of pose and forces (6 + 3 n), by these and by the data.
-
-    At the optimum the step that the equations predict is zero. Its derivatives by the state and by
-    the data, from central differences of the equations themselves, give those of the state by the
-    implicit function theorem: ``ds = -(dG/ds)^-1 dG/dd dd``. All that the objective holds counts,
-    the determinant that the shape leaves and the weights of a robust loss included.
-
-    ``by_state`` (6 + 3 n, 6 + 3 n); ``by_data`` (6 + 3 n, d) by the rays (2 n), the log sigmas (n)
-    and, where asked for, the mean's keypoints (3 n).
-    """
-
-    by_state: FloatArray
-    by_data: FloatArray
-
-
 @kernel
 def slopes_of(
-    mixture: Mixture,
-    component: int,
-    seen: Seen,
-    pose: FloatArray,
-    force: FloatArray,
-    with_mean: bool,
-) -> StateSlopes:
-    """The slopes at an optimum, whose ``pose`` (12,) and ``force`` (n, 3) are given."""
+    mixture: Mixture, component: int, seen: Seen, pose: FloatArray, force: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of a step of pose and forces (6 + 3 n), by these and by the data.
+
+    At the optimum, whose ``pose`` (12,) and ``force`` (n, 3) are given, the step that the equations
+    predict is zero. Its derivatives by the state and by the data, from central differences of the
+    equations themselves, give those of the state by the implicit function theorem:
+    ``ds = -(dG/ds)^-1 dG/dd dd``. All that the objective holds counts, the determinant that the
+    shape leaves and the weights of a robust loss included.
+
+    By the state (6 + 3 n, 6 + 3 n); by the rays (2 n) and the log sigmas (n), (6 + 3 n, 3 n).
+    """
     target = target_of(mixture, component, seen)
     n = target.mean.shape[0]
     covariance = target.covariance
@@ -260,63 +248,38 @@ def slopes_of(
         for m in range(3 * n):
             state[POSE + k] += covariance[k, m] * force[m // 3, m % 3]
     size = POSE_UNKNOWNS + 3 * n
-    by_state = np.empty((size, size))
-    by_data = np.empty((size, 6 * n if with_mean else 3 * n))
-    system = Posed(target, seen, True)
-    for k in range(size):
-        step, unit = np.zeros(POSE_UNKNOWNS), _DIFFERENCE
-        if k >= POSE_UNKNOWNS:
-            spread = covariance[k - POSE_UNKNOWNS, k - POSE_UNKNOWNS]
-            unit = _DIFFERENCE / np.sqrt(spread) if spread > 0.0 else 1.0
-        elif k >= 3:
+    slopes = np.zeros((size, size + 3 * n))
+    for k in range(size + 3 * n):
+        step, unit, m = np.zeros(POSE_UNKNOWNS), _DIFFERENCE, k - POSE_UNKNOWNS
+        if 3 <= k < POSE_UNKNOWNS:
             unit = _DIFFERENCE * abs(state[11])
-        for side in range(2):
-            change = unit if side == 0 else -unit
-            moved = state.copy()
+        elif POSE_UNKNOWNS <= k < size:
+            unit = _DIFFERENCE / np.sqrt(covariance[m, m]) if covariance[m, m] > 0.0 else 1.0
+        elif size <= k < size + 2 * n:
+            unit = _DIFFERENCE / seen.whitening[(k - size) // 2, 0]
+        for sign in (1.0, -1.0):
+            change, moved, changed = sign * unit, state.copy(), seen
             if k < POSE_UNKNOWNS:
                 step[k] = change
                 move_rigid(state, step, moved)
-            else:
-                m = k - POSE_UNKNOWNS
+            elif k < size:
                 moved[POSE + 3 * n + m] += change
                 for j in range(3 * n):
                     moved[POSE + j] += change * covariance[j, m]
-            found = step_at(system, moved, 3 * n)
-            if side == 0:
-                by_state[:, k] = found
             else:
-                by_state[:, k] = (by_state[:, k] - found) / (2.0 * unit)
-    for k in range(by_data.shape[1]):
-        unit = _DIFFERENCE
-        if k < 2 * n:
-            unit = _DIFFERENCE / seen.whitening[k // 2, 0]
-        elif k >= 3 * n:
-            unit = _DIFFERENCE * abs(state[11])
-        for side in range(2):
-            changed = _changed(system, k, unit if side == 0 else -unit)
-            found = step_at(changed, state, 3 * n)
-            if side == 0:
-                by_data[:, k] = found
-            else:
-                by_data[:, k] = (by_data[:, k] - found) / (2.0 * unit)
-    return StateSlopes(by_state, by_data)
+                changed = _changed(seen, k - size, change)
+            slopes[:, k] += sign * step_at(Posed(target, changed, True), moved, 3 * n)
+        slopes[:, k] /= 2.0 * unit
+    return slopes[:, :size].copy(), slopes[:, size:].copy()
 
 
 @kernel
-def _changed(system: Posed, datum: int, change: float) -> Posed:
-    """The system with one datum changed."""
-    target, seen = system.target, system.seen
-    n = target.mean.shape[0]
-    rays, whitening, mean = seen.rays.copy(), seen.whitening.copy(), target.mean.copy()
-    if datum < 2 * n:
+def _changed(seen: Seen, datum: int, change: float) -> Seen:
+    """The keypoints with one coordinate of a ray, or one log sigma, changed."""
+    rays, whitening, others = seen.rays.copy(), seen.whitening.copy(), 2 * seen.points.shape[0]
+    if datum < others:
         rays[datum // 2, datum % 2] += change
-    elif datum < 3 * n:
-        for c in range(3):
-            whitening[datum - 2 * n, c] *= np.exp(-change)
     else:
-        mean[(datum - 3 * n) // 3, (datum - 3 * n) % 3] += change
-    return Posed(
-        GaussianTarget(mean, target.covariance),
-        Seen(seen.points, rays, whitening, seen.loss, seen.loss_scale),
-        True,
-    )
+        for c in range(3):
+            whitening[datum - others, c] *= np.exp(-change)
+    return Seen(seen.points, rays, whitening, seen.loss, seen.loss_scale)

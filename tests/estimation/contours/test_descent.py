@@ -20,7 +20,6 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.render import Scene, cast_geometry, sample_view
-from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.evidence import State
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
@@ -106,7 +105,7 @@ def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
     mask = cast_geometry(Scene(BOX), CAMERA, truth).mask
     pixels = CAMERA.project(truth.apply(CORNERS)) + rng.normal(0, 1, (8, 2))
     model, view = Model(points_3d=CORNERS, mesh=BOX), View(CAMERA, pixels, mask=mask)
-    evidence = evidence_of(prior_of(model), [view], None, loss=LINEAR, loss_scale=1.0)
+    evidence = evidence_of(prior_of(model), [view])
     pose = np.append(truth.rotation.ravel(), truth.translation)[None]
     still = np.zeros_like(evidence.shape.mean)
     start = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)

@@ -133,10 +133,7 @@ class ManyEstimates:
 def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     """Plan the estimates of the observations of all inputs.
 
-    Raises
-    ------
-    CadalignError
-        If an input cannot be read, or what a detector's file needs is missing.
+    Raises CadalignError if an input cannot be read, or what a detector's file needs is missing.
     """
     tasks = read_sources(options.inputs)
     model = _model_keypoints(options) if tasks.has_detections else None

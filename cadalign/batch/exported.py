@@ -37,23 +37,11 @@ def read_exported(
     world_from_cam: FloatArray | None = None,
     metres: float = 1.0,
 ) -> AlignedObject:
-    """Read the result of `cadalign fit` and what it was fitted to.
+    """Read the result of `cadalign fit`, the file ``fit``, and what it was fitted to.
 
-    Parameters
-    ----------
-    fit : Path
-        The file ``fit.json``.
-    observation : Path, optional
-        The observation; by default ``photo.json`` beside the folder ``photo_fit`` of the fit.
-    shape : Path, optional
-        The learned shape that was fitted; by default the observation's, if it names one.
-    world_from_cam, metres
-        As for `AlignedObject`.
-
-    Raises
-    ------
-    DataError
-        If a file is missing or invalid, or the observation is not the one that was fitted.
+    By default the ``observation`` is ``photo.json`` beside the folder ``photo_fit`` of the fit, and
+    the learned ``shape`` the observation's, if it names one. Raises DataError if a file is missing
+    or invalid, or the observation is not the one that was fitted.
     """
     data = read_json(fit)
     if not isinstance(data, Mapping):
@@ -78,8 +66,12 @@ def exported_object(
         mesh = None if seen.model is None else _loaded(seen.model)
     else:
         opened = _shape(result, seen, shape)
-        with in_file(path):
-            result = _with_ids(result, seen, opened)
+        with in_file(path):  # older files lack the ids of keypoints
+            ids: Any = own_ids(seen.views)
+            if opened is not None:
+                ids = [shape_ids(image, opened) for image in seen.views]
+            pairs = zip(result.views, ids, strict=True)
+            result = replace(result, views=tuple(replace(view, ids=own) for view, own in pairs))
         mesh = _warped(result, seen, opened, path)
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]
@@ -125,15 +117,6 @@ def _shape(aligned: Result, seen: Observation, shape: Path | None) -> ShapeModel
         what = f"{len(opened.ids)} keypoints that are not the fit's {len(aligned.ids)}"
         raise DataError(what, where=str(path), fix="give the shape that was fitted")
     return opened
-
-
-def _with_ids(result: Result, seen: Observation, shape: ShapeModel | None) -> Result:
-    """The result with the ids of every view's keypoints, which older files lack."""
-    ids: Any = own_ids(seen.views)
-    if shape is not None:
-        ids = [shape_ids(image, shape) for image in seen.views]
-    views = zip(result.views, ids, strict=True)
-    return replace(result, views=tuple(replace(view, ids=own) for view, own in views))
 
 
 def _warped(

@@ -185,13 +185,7 @@ def pool_of(count: int, workers: int | None, dask: str | None, *, threads: int =
 
 
 def options_of(given: dict[str, Any]) -> FitRunOptions:
-    """The options of a run by their names, without inputs; see `fit_many`.
-
-    Raises
-    ------
-    InputError
-        If a name is not known.
-    """
+    """The options of a run by their names, without inputs; see `fit_many`."""
     kinds: tuple[Any, ...] = (ObservationFit, FitOptions, DetectorOptions, ObservationChanges)
     names = [(field.name, kind) for kind in kinds for field in fields(kind)]
     owners = {name: kind for name, kind in reversed(names) if name != "fitting"}

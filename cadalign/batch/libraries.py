@@ -87,24 +87,9 @@ def build_library(
 ) -> tuple[Library, list[Row]]:
     """Build the library of a data set's models, as a run that goes on where it was killed.
 
-    Parameters
-    ----------
-    dataset : KeypointNet
-    folder : Path
-        The run's folder; a finished run in it is done anew.
-    workers, dask, on_progress
-        As for `cadalign.fit_many`.
-
-    Returns
-    -------
-    Library
-    list of dict
-        Rows of the models that are left out, or whose mesh is.
-
-    Raises
-    ------
-    DataError
-        If there are no models, or the folder cannot be written or holds another run.
+    A finished run in the ``folder`` is done anew; further arguments are those of
+    `cadalign.fit_many`. Also returns rows of the models that are left out, or whose mesh is. Raises
+    DataError if there are no models, or the folder cannot be written or holds another run.
     """
     tasks = [_task(dataset, key) for key in dataset.ids()]
     run = RunFolder(folder)

@@ -12,7 +12,7 @@ from cadalign.errors import DataError
 from cadalign.estimation.detector_noise import opened_noise
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.stated import Stated
+from cadalign.estimation.result_parts import Stated
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.io.evidence import ObservedImage

@@ -61,12 +61,8 @@ def draw_fit(folder: RunFolder, row: Row, seen: Observation, result: Result) -> 
     """Write the pictures of an aligned observation; says what could not be drawn.
 
     ``pictures`` gets the photo, ``thumbs`` the part around the object with its box, ``sketches`` a
-    preview of the model's mesh, warped to the estimated shape.
-
-    Raises
-    ------
-    AbortError
-        If a picture cannot be written, as on a full disk.
+    preview of the model's mesh, warped to the estimated shape. Raises AbortError if a picture
+    cannot be written, as on a full disk.
     """
     names = page_names(row)
     stem = record_stem(names["category"], names["model_id"])

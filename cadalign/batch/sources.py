@@ -143,6 +143,7 @@ class ObservationTasks(Sequence[ObservationTask]):
     def __init__(self, sources: Sequence[Source]) -> None:
         self._sources = sources
         self._ends = list(accumulate(map(len, sources)))
+        self.has_detections = any(isinstance(source, Detections) for source in sources)
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -162,11 +163,6 @@ class ObservationTasks(Sequence[ObservationTask]):
             first, index = stop, index + 1
         return found
 
-    @property
-    def has_detections(self) -> bool:
-        """True if a detector's file is among the inputs."""
-        return any(isinstance(source, Detections) for source in self._sources)
-
     def fingerprint(self) -> str:
         """A text that changes with the content of the inputs."""
         return fingerprint("\n".join(source.fingerprint() for source in self._sources))
@@ -175,10 +171,7 @@ class ObservationTasks(Sequence[ObservationTask]):
 def read_sources(inputs: Iterable[Path]) -> ObservationTasks:
     """Find the observations of inputs.
 
-    Raises
-    ------
-    DataError
-        If a file cannot be read, or an input holds no observation.
+    Raises DataError if a file cannot be read, or an input holds no observation.
     """
     sources: list[Source] = []
     for path in inputs:

@@ -199,7 +199,6 @@ class FitSpec(Spec):
     """The specification, whose runs are `FitRun`."""
 
     def open(self, path: Path, name: str | None = None) -> Run:
-        """Read a run."""
         return FitRun.open(path, name)
 
 

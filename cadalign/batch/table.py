@@ -98,6 +98,9 @@ def naming_row(row: int, source: str, observation: Observation | None) -> Row:
 def result_row(result: Result) -> Row:
     """The cells of a result."""
     pose, std, warnings = result.alignment, result.std, result.warnings
+    sigma: Any = result.sigma
+    if sigma is None and result.options is not None:
+        sigma = result.options.sigma
     row: Row = {
         "status": OK,
         "reason": "",
@@ -106,7 +109,7 @@ def result_row(result: Result) -> Row:
         "keypoints": len(result.inliers),
         "inliers": int(result.inliers.sum()),
         "focal_length": result.camera.fx,
-        "sigma": _one_sigma(result),
+        "sigma": None if sigma is None or np.ndim(sigma) else float(sigma),
         "rms_px": result.rms,
         "cost": result.cost,
         "alternatives": len(result.alternatives),
@@ -159,14 +162,6 @@ def write_csv(folder: RunFolder) -> None:
                 writer.write_table(without_lists(table))
 
     write_whole(folder.path / "results.csv", write)
-
-
-def _one_sigma(result: Result) -> float | None:
-    """The standard deviation of all keypoints."""
-    if result.sigma is not None:
-        return float(result.sigma)
-    given: Any = None if result.options is None else result.options.sigma
-    return None if given is None or np.ndim(given) else float(given)
 
 
 def read_rows(folder: RunFolder) -> list[Row]:

@@ -77,13 +77,8 @@ def tracks_of(
     named after them. Without a ``camera`` each file's own is taken. Keypoints are those of the
     model's ``ids``, by name, by semantic id, or in the model's order.
 
-    Raises
-    ------
-    DataError
-        If two objects of one frame have the same track, the keypoints are none of the model's, or
-        frames are too far apart to have numbers.
-    InputError
-        If no camera is known.
+    Raises DataError if two objects of one frame have the same track, the keypoints are none of the
+    model's, or frames are too far apart to have numbers; InputError if no camera is known.
     """
     numbers = frame_numbers([each.image or "" for each in objects])
     by_track: dict[tuple[str, str], dict[int, ImageKeypoints]] = defaultdict(dict)
@@ -192,23 +187,22 @@ def draw_video(video: Video, found: Sequence[FoundTrack], *, first: int = 0) -> 
     """Draw box, keypoints and mesh of every track over the pictures of its frames.
 
     Frames that no track has are as they were; objects that are nearer are drawn later. ``first`` is
-    the number of the video's first frame among the tracks' ones.
-
-    Raises
-    ------
-    InputError
-        If the pictures are not of the camera's size.
-    DataError
-        If a picture cannot be read.
+    the number of the video's first frame among the tracks' ones. Raises InputError if the pictures
+    are not of the camera's size; DataError if one cannot be read.
     """
     shown: dict[int, list[tuple[FoundTrack, int]]] = defaultdict(list)
     for each in found:
         for place, number in enumerate(each.track.frames):
             shown[number].append((each, place))
     scenes = {each.track.name: None if each.mesh is None else Scene(each.mesh) for each in found}
+
+    def nearness(shown: tuple[FoundTrack, int]) -> float:
+        each, place = shown
+        return -float(each.result.views[place].alignment.translation[2])
+
     for number, picture in video.pictures(first=first):
         drawn = picture
-        for each, place in sorted(shown[number], key=_nearness):
+        for each, place in sorted(shown[number], key=nearness):
             drawn = _draw(drawn, each, place, scenes[each.track.name])
         yield drawn
 
@@ -228,11 +222,6 @@ def moving_object(each: FoundTrack) -> MovingObject:
     # Times in glTF are not negative.
     times = path.times - min(float(path.times[0]), 0.0)
     return MovingObject(each.track.name, mesh.stretched(path.scale), times, path.poses)
-
-
-def _nearness(shown: tuple[FoundTrack, int]) -> float:
-    each, place = shown
-    return -float(each.result.views[place].alignment.translation[2])
 
 
 def _draw(picture: ByteImage, each: FoundTrack, place: int, scene: Scene | None) -> ByteImage:

@@ -281,22 +281,14 @@ def align_batch(
     sizes = _one_each(size, len(objects), "size", Size)
     starts = _one_each(init, len(objects), "init", Alignment)
 
+    chosen: dict[str, Any] = {"loss": loss, "loss_scale": loss_scale, "ransac": ransac}
+    chosen |= {"focal": focal, "focal_prior": focal_prior, "principal_sigma": principal_sigma}
+
     def one(
         views: View | Sequence[View], size: Size | None, init: Alignment | None
     ) -> Result | CadalignError:
         try:
-            return align(
-                model,
-                views,
-                size=size,
-                init=init,
-                loss=loss,
-                loss_scale=loss_scale,
-                ransac=ransac,
-                focal=focal,
-                focal_prior=focal_prior,
-                principal_sigma=principal_sigma,
-            )
+            return align(model, views, size=size, init=init, **chosen)
         except CadalignError as error:
             return error
 

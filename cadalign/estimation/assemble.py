@@ -12,9 +12,14 @@ from cadalign.arrays import FloatArray
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import Problems, Solutions
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult, quickly
+from cadalign.estimation.result_parts import (
+    Alternative,
+    FitStats,
+    KeypointStatistics,
+    ViewResult,
+    quickly,
+)
 from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
-from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 

@@ -15,8 +15,7 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior, PriorOption
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
-from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.uncertainty.stated import Stated
+from cadalign.estimation.result_parts import Alternative, FitStats, Stated, ViewResult
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

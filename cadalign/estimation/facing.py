@@ -24,13 +24,7 @@ _ROUNDS = 64
 
 
 def require_perspective(camera: Camera, what: str) -> None:
-    """Refuse a wide lens for ``what`` does without frames that face the keypoints.
-
-    Raises
-    ------
-    InputError
-        If the camera has one.
-    """
+    """Refuse a wide lens for ``what`` does without frames that face the keypoints."""
     if camera.is_wide:
         fix = "undistort the photo, or crop it to a pinhole's view"
         raise InputError(f"{what} takes no {camera.lens} lens", where="camera.lens", fix=fix)
@@ -78,11 +72,8 @@ def rays_ahead(points_2d: FloatArray, camera: Camera, *, clips: bool = False) ->
     """Rays (n, 2) of the pixels (n, 2) of a wide lens, in the frame that the camera faces.
 
     With ``clips``, rays beside the frame's field are moved to its border: those of outliers.
-
-    Raises
-    ------
-    InputError
-        If the lens model cannot be inverted at a pixel, or a ray lies beside the field.
+    Raises InputError if the lens model cannot be inverted at a pixel, or a ray lies beside the
+    field.
     """
     rays = camera.unproject(points_2d)
     border = math.radians(_REACH)

@@ -174,13 +174,7 @@ def prior_of_camera(prior: PriorOption, camera: Camera) -> FocalPrior | None:
 
 
 def check_prior(prior: object, *, focal: str) -> None:
-    """Refuse what is no prior, and one on a known focal length.
-
-    Raises
-    ------
-    InputError
-        If it is one of these.
-    """
+    """Refuse what is no prior, and one on a known focal length."""
     if prior is None or (isinstance(prior, str) and prior == USUAL):
         return
     if not isinstance(prior, FocalPrior):
@@ -195,13 +189,7 @@ def check_prior(prior: object, *, focal: str) -> None:
 
 
 def check_estimable(cameras: Sequence[Camera]) -> None:
-    """Refuse to estimate the focal length of a wide lens.
-
-    Raises
-    ------
-    InputError
-        If a camera has one.
-    """
+    """Refuse to estimate the focal length of a wide lens."""
     for camera in cameras:
         if camera.is_wide:
             what = f"the focal length of a {camera.lens} lens is not estimated"
@@ -269,12 +257,13 @@ def _focal_in_pixels(tags: Mapping[int, Any], width: int, height: int, where: st
     if millimetres is not None and original is not None:
         # The 35 mm equivalent holds the digital zoom already, the lens's own focal length does not.
         millimetres *= max(_positive(tags, _DIGITAL_ZOOM, "DigitalZoomRatio", where) or 1.0, 1.0)
-        sensor = _sensor_width(tags)
+        name = str(tags.get(_MODEL) or "").strip("\0 ").lower()
+        sensors = [each for pattern, each in _SENSOR_WIDTHS_MM if re.match(pattern, name)]
         if density is not None:
             unit = _UNIT_MM.get(tags.get(_PLANE_UNIT, 2), 25.4)
             focals.append(millimetres * density / unit * width / original)
-        elif equivalent is None and sensor is not None:
-            focals.append(millimetres / sensor * max(width, height))
+        elif equivalent is None and sensors:
+            focals.append(millimetres / sensors[0] * max(width, height))
     side = max(width, height)
     if any(not SHORTEST * side < focal < LONGEST * side for focal in focals):
         named = ", ".join(f"{focal:.4g} px" for focal in focals)
@@ -309,13 +298,6 @@ def _positive(tags: Mapping[int, Any], tag: int, name: str, where: str) -> float
         return None  # EXIF's way to say that it is not known, or not used
     logger.warning("%s: the EXIF data state %s %s; ignored", where, name, brief(tags[tag]))
     return None
-
-
-def _sensor_width(tags: Mapping[int, Any]) -> float | None:
-    """The width of the sensor [mm], if the camera's model is known."""
-    name = str(tags.get(_MODEL) or "").strip("\0 ").lower()
-    found = (width for pattern, width in _SENSOR_WIDTHS_MM if re.match(pattern, name))
-    return next(found, None)
 
 
 def _original_width(tags: Mapping[int, Any], width: int, height: int) -> float | None:

@@ -28,7 +28,7 @@ from cadalign.estimation.mistakes import outside_image
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior, is_exact, widened
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
+from cadalign.estimation.result_parts import Alternative, FitStats, Stated, ViewResult
 from cadalign.estimation.search import JointProblem, Minimum
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.symmetry import (
@@ -41,7 +41,6 @@ from cadalign.estimation.symmetry import (
 from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
-from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
     another_pose,

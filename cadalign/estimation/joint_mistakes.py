@@ -20,6 +20,7 @@ from cadalign.estimation.mistakes import (
     other_sizes,
 )
 from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.prior import is_exact
 from cadalign.estimation.search import (
     JointProblem,
     Minimum,
@@ -44,9 +45,8 @@ def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions | 
     """
     if ransac is None:
         return _mistake_in_all(problem, best)
-    is_exact = not best.evidence.shape.spread.any() and not len(best.evidence.shape.modes)
     are_few = best.inliers.mean() > _FEW_REJECTED
-    if are_few and (is_exact or _misfit(best) < _LEAST_UNCERTAIN_MISFIT):
+    if are_few and (is_exact(best.evidence) or _misfit(best) < _LEAST_UNCERTAIN_MISFIT):
         return None
 
     def explain(mistake: Mistake) -> Explained | None:

@@ -87,10 +87,6 @@ class KeypointBatch:
         rows = [weights * (c * c + d * d), mixed], [mixed, weights * (a * a + b * b)]
         return np.ascontiguousarray(np.array(rows).transpose(2, 3, 0, 1))
 
-    def camera(self, problem: int) -> Camera:
-        """The camera of a problem."""
-        return self.cameras[problem if len(self.cameras) > 1 else 0]
-
 
 @dataclass(frozen=True, eq=False)
 class FitTask:

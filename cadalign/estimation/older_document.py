@@ -10,7 +10,7 @@ import numpy as np
 
 from cadalign.estimation.options import AXES
 from cadalign.estimation.result_data import ResultData
-from cadalign.estimation.uncertainty.stated import KeypointStatistics
+from cadalign.estimation.result_parts import KeypointStatistics
 
 Kind = TypeVar("Kind", bound=ResultData)
 

@@ -21,8 +21,7 @@ from cadalign.estimation.pack import evidence_of, tells_something
 from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.problems import are_on_a_line
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import ViewResult
-from cadalign.estimation.uncertainty.stated import Stated, Statistics
+from cadalign.estimation.result_parts import Stated, Statistics, ViewResult
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing

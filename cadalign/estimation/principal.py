@@ -17,8 +17,8 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.options import FitOptions, Sigma, pixel_information
 from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Stated
 from cadalign.estimation.uncertainty.posterior import Likelihood
-from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import vector_from_rotation
@@ -34,25 +34,10 @@ def estimate_with_principal_point(
 ) -> Result:
     """Estimate everything and the principal point that the views have in common.
 
-    Parameters
-    ----------
-    estimate_at : callable
-        The estimate with cameras whose principal points are `shifted` by (2,) float [px].
-    options : FitOptions
-        ``principal_sigma`` is the prior's standard deviation.
-    sigmas : sequence of float, (n,) float, (n, 2, 2) float or None
-        Standard deviations of each view's keypoints [px]; None for the result's estimate.
-
-    Returns
-    -------
-    Result
-        With the estimated cameras; ``principal_std`` has the standard deviations of their principal
-        points, and the covariances what they add.
-
-    Raises
-    ------
-    DegenerateError
-        If the steps do not settle.
+    ``estimate_at`` makes the estimate with cameras whose principal points are `shifted` by (2,)
+    float [px]; ``sigmas`` are the standard deviations of each view's keypoints [px], None for the
+    result's estimate. Covariances of the result hold what the principal point adds. Raises
+    DegenerateError if the steps do not settle.
     """
     assert options.principal_sigma is not None
     prior, difference = options.principal_sigma**-2, _DIFFERENCE * options.principal_sigma
@@ -83,13 +68,7 @@ def shifted(camera: Camera, shift: FloatArray) -> Camera:
 
 
 def check_shiftable(views: Sequence[View]) -> None:
-    """Refuse views of several cameras, and evidence beside keypoints that a camera measures.
-
-    Raises
-    ------
-    InputError
-        If there are such.
-    """
+    """Refuse views of several cameras, and evidence beside keypoints that a camera measures."""
     for number, view in enumerate(views):
         if view.camera != views[0].camera:
             raise InputError(

@@ -31,8 +31,6 @@ _COMMON_SCALE_SIGMA = 3.0  # of the log of a size that other evidence determines
 _SAME_SCALE_SIGMA = 1e-4
 _PROPORTION_SIGMA = 3.0  # of free log scales about their mean, lest an unseen axis collapses
 _NO_BOUND = ScalePrior(0.0, 0.0)
-_SETTLED = 1e-8  # change of a log focal length
-LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,14 +214,6 @@ class Lenses:
     def _firsts(self) -> list[Camera]:
         return [self.cameras[self.groups.index(group)] for group in range(self.count)]
 
-    @property
-    def have_distortion(self) -> bool:
-        """True if an unknown lens has distortion."""
-        return any(
-            camera.distortion and group >= 0
-            for camera, group in zip(self.cameras, self.groups, strict=True)
-        )
-
     def focals(self) -> Focals:
         """Bounds and priors in the form of the kernels."""
         ranges = [log_focal_range(camera, self.prior, camera.fx) for camera in self._firsts]
@@ -245,8 +235,3 @@ class Lenses:
         """Focal lengths to start from: (F,) logarithms relative to the references, each."""
         grids = [np.log(focal_grid(camera, self.prior) / camera.fx) for camera in self._firsts]
         return list(np.array(grids).T) if grids else [np.zeros(0)]
-
-    @staticmethod
-    def is_settled(log_focals: FloatArray) -> bool:
-        """True if the references are where the estimate is."""
-        return bool(np.abs(log_focals).max(initial=0.0) < _SETTLED)

@@ -72,12 +72,6 @@ class Problems:
         pairs = np.concatenate([self.points_3d, self.points_2d], axis=1)
         return np.array([distinct_rows(pairs[self.rows(b)]) for b in range(len(self))])
 
-    def each_camera(self) -> Sequence[Camera]:
-        """The camera of every problem; none at all where no lens has distortion."""
-        if not any(camera.distortion for camera in self.cameras):
-            return ()
-        return self.cameras if len(self.cameras) > 1 else self.cameras * len(self)
-
     def with_focals(self, focals: FloatArray) -> Problems:
         """The same problems seen with the focal lengths (B,); NaN leaves a camera as it is."""
         cameras = tuple(

@@ -18,11 +18,12 @@ from cadalign.estimation.result_parts import (
     NO_STATS,
     Alternative,
     FitStats,
+    Statistics,
     ViewResult,
     extent,
+    points_covariances,
     rms_of,
 )
-from cadalign.estimation.uncertainty.stated import Statistics, points_covariances
 from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

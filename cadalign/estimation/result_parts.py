@@ -1,19 +1,39 @@
-"""Parts of a result: what is said of a view, of an alternative, and of the effort."""
+"""Parts of a result: what is said of a view, an alternative, the effort, and the uncertainty.
+
+Statements about the uncertainty are stored, or computed when they are asked for. Covariances are
+those of the rotation vector in the camera frame [rad], the translation, the logarithms of the
+lengths along x, y, z, and, where it was estimated, of the focal length.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.uncertainty.stated import Statistics
-from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
+from cadalign.estimation.focal import focal_doubt
+from cadalign.estimation.options import pixel_information
+from cadalign.estimation.uncertainty.posterior import FittedKeypoints, posterior_covariance
+from cadalign.estimation.uncertainty.summary import (
+    EvidenceSummary,
+    Misfit,
+    Uncertainty,
+    another_pose,
+    uncertainty_of,
+    weaknesses_of_keypoints,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import by_rotation
+
+if TYPE_CHECKING:
+    from cadalign.estimation.consensus import RobustSearch
+    from cadalign.estimation.uncertainty.evidence import AnyBasis
 
 T = TypeVar("T")
 
@@ -78,6 +98,157 @@ class FitStats:
 
 
 NO_STATS = FitStats(0, 0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """Statements that are known."""
+
+    covariance: FloatArray | None
+    fisher_covariance: FloatArray | None = None
+    points_covariance: FloatArray | None = None
+    points_cam_covariance: FloatArray | None = None
+    warnings: tuple[str, ...] = ()
+    misfit: Misfit | None = None
+    evidence: tuple[EvidenceSummary, ...] = ()
+    degrees_of_freedom: float | None = None
+    basis: AnyBasis | None = None
+
+    @classmethod
+    def of(cls, statistics: Statistics) -> Stated:
+        """All statements, computed now."""
+        return cls(**{name: getattr(statistics, name) for name in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointStatistics(FittedKeypoints):
+    """Statements about an exact or stretched model's keypoints in one view.
+
+    ``search`` is how inliers were searched for, where they were.
+    """
+
+    search: RobustSearch | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    points_covariance = points_cam_covariance = degrees_of_freedom = basis = None
+
+    @cached_property
+    def covariance(self) -> FloatArray | None:
+        """See `cadalign.Result.covariance`."""
+        if self.fisher_covariance is None:
+            return None
+        covariance = posterior_covariance(self)
+        if self.symmetry is None:
+            return covariance
+        from cadalign.estimation.symmetry import held_axes, without_free_turns
+        from cadalign.geometry.symmetry_group import group_of  # most models have none
+
+        held = held_axes(self.options.stretched_axes)
+        best = group_of(self.symmetry).canonical(self.alignment, held=held)
+        return without_free_turns(covariance, best)
+
+    @cached_property
+    def misfit(self) -> Misfit | None:
+        """See `cadalign.Result.misfit`."""
+        if self.fisher_covariance is None:
+            return None
+        from cadalign.estimation.uncertainty.misfit import find_misfit
+
+        return find_misfit(self)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about mistakes, a misfit, and what the keypoints do not determine."""
+        mistake = self._mistake()
+        if mistake is not None:  # nothing else can be said of the alignment
+            return (mistake,)
+        placed = self._placed()
+        if self.covariance is None:
+            return placed
+        if self.misfit is not None:
+            doubts = [str(self.misfit)]
+        else:
+            from cadalign.estimation.uncertainty.misfit import unverified_stretch
+
+            unverified = unverified_stretch(self)
+            doubts = [] if unverified is None else [unverified]
+        chance = self.search and self.search.doubt(self.residuals, self.inliers)
+        if chance:
+            doubts.append(chance)
+        kept, options = self.points_3d[self.inliers], self.options
+        is_estimated = options.focal == "estimate"
+        weak = weaknesses_of_keypoints(
+            kept,
+            self.alignment,
+            self.covariance,
+            redundancy=2 * len(kept) - options.unknowns,
+            stretch_sigma=options.stretch_sigma,
+            doubt=focal_doubt(self.camera, options.focal_prior) if is_estimated else None,
+        )
+        others: tuple[str, ...] = ()
+        # Likelihoods tell nothing where keypoints do not fit, or others than these were rejected.
+        if self.misfit is None and self.search is None:
+            poses = [(each.alignment, each.relative_likelihood) for each in self.alternatives]
+            others = another_pose(self.alignment, poses, self.covariance)
+        return (*placed, *doubts, *weak, *others)
+
+    def _placed(self) -> tuple[str, ...]:
+        """Warnings about keypoints and a principal point outside of the image."""
+        ahead = np.isfinite(self.residuals).all(axis=1)
+        in_camera = self.alignment.apply(self.points_3d[ahead])
+        observed = self.camera.project_where_ahead(in_camera) - self.residuals[ahead]
+        if self.camera.is_centred and self.camera.contains(observed).all():
+            return ()
+        from cadalign.estimation.mistakes import outside_image  # rarely asked
+
+        return outside_image(observed, self.camera, agree=self.misfit is None)
+
+    def _mistake(self) -> str | None:
+        if self.search is None:
+            if self.fisher_covariance is None:
+                return None
+            if self.misfit is None and self.options.sigma is not None:
+                return None
+            from cadalign.estimation.uncertainty.misfit import mistake_in_fit
+
+            return mistake_in_fit(self, self.misfit)
+        from cadalign.estimation.consensus import mistake_in  # with the kernels of the search
+
+        return mistake_in(self.search, self.search.explained(self.alignment, self.residuals))
+
+    @cached_property
+    def evidence(self) -> tuple[EvidenceSummary, ...]:
+        """Agreement of the keypoints that the estimate rests on."""
+        residuals = self.residuals[self.inliers]
+        count = max(len(residuals), 1)
+        rms = float(np.sqrt((residuals * residuals).sum() / count))
+        sigma = self.chosen_sigma
+        if np.ndim(sigma) == 0:
+            unit = 1.0 if sigma is None else float(sigma)
+            with np.errstate(over="ignore"):  # of the least positive number
+                in_sigmas = float(np.nan_to_num(np.divide(rms / np.sqrt(2.0), unit)))
+        else:
+            information = pixel_information(sigma, len(self.residuals))[self.inliers]
+            whitened = np.einsum("ni,nij,nj->", residuals, information, residuals)
+            in_sigmas = float(np.sqrt(whitened / (2 * count)))
+        return (EvidenceSummary("keypoints", 0, len(residuals), in_sigmas, rms, "px"),)
+
+
+Statistics = Stated | KeypointStatistics
+"""What is stated, by whatever door a result came."""
+
+
+def points_covariances(
+    points: FloatArray, alignment: Alignment, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariances (m, 3, 3) of stretched points in the model's frame and in the camera's."""
+    covariance = covariance[:9, :9]
+    stretched = points * alignment.scale
+    by_logs = stretched[:, :, None] * np.eye(3)
+    of_points = by_logs @ covariance[6:, 6:] @ by_logs.swapaxes(1, 2)
+    turned = stretched @ alignment.rotation.T
+    shifts = np.broadcast_to(np.eye(3), by_logs.shape)
+    rows = np.concatenate([by_rotation(turned), shifts, alignment.rotation @ by_logs], axis=2)
+    return of_points, rows @ covariance @ rows.swapaxes(1, 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,10 +33,9 @@ from cadalign.estimation.problems import (
     check_sigmas,
 )
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import FitStats
+from cadalign.estimation.result_parts import FitStats, KeypointStatistics
 from cadalign.estimation.solve import solve_one
 from cadalign.estimation.uncertainty.residuals import f_quantile
-from cadalign.estimation.uncertainty.stated import KeypointStatistics
 
 _INLIER_ROUNDS = 5
 _REACH = 3.0  # estimated sigmas within which keypoints agree

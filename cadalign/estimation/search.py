@@ -10,7 +10,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.joint_robust import (
-    JointConsensus,
     robust_minima,
     robust_starts,
     whitened_lengths,
@@ -19,7 +18,7 @@ from cadalign.estimation.joint_robust import (
 from cadalign.estimation.mistakes import Support, area_of, check_support
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import LENS_ROUNDS, Lenses, ShapePrior
+from cadalign.estimation.prior import Lenses, ShapePrior
 from cadalign.estimation.problems import no_redundancy_error
 from cadalign.estimation.starts import Start, Starts, starts_of
 from cadalign.estimation.uncertainty.posterior import widening_of
@@ -35,6 +34,8 @@ if TYPE_CHECKING:
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
 _ITERATIONS = 100  # about a lens that is linearised anew
+_LENS_ROUNDS = 12  # of linearising lenses with distortion about the focal lengths
+_SETTLED = 1e-8  # change of a log focal length
 _MOST_FREE = 2  # scales that keypoints determine; the size follows from other evidence
 
 _NOISES = np.geomspace(0.1, 100.0, 10)  # [px]
@@ -143,28 +144,26 @@ def minima_at_noise(
             minima_of, used = search_joint(evidence, *starts)
             every = np.ones(len(evidence.sightings.point), dtype=bool)
             found = [
-                JointConsensus(every, evidence, state, float(cost), float(score))
+                (every, evidence, state, float(cost), float(score))
                 for state, cost, score in zip(*minima_of, strict=True)
             ]
         else:
             threshold = thresholds(evidence, problem.lenses, problem.threshold(ransac))
+            projects = ransac.max_reproj_error is None
             found, used = robust_minima(
-                evidence,
-                starts,
-                threshold,
-                settles=ransac.refine,
-                projects=ransac.max_reproj_error is None,
+                evidence, starts, threshold, settles=ransac.refine, projects=projects
             )
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
-            Minimum(number, *each._replace(score=each.score + prior_score), problem.lenses)
-            for each in found
+            Minimum(number, kept, own, state, cost, score + prior_score, problem.lenses)
+            for kept, own, state, cost, score in found
         )
     if ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)
         _check_support(problem, best, problem.threshold(ransac))
-    if problem.lenses.have_distortion:
+    lenses = zip(problem.lenses.cameras, problem.lenses.groups, strict=True)
+    if any(camera.distortion and group >= 0 for camera, group in lenses):
         minima = [_relinearised(problem, each) for each in minima]
     minima.sort(key=lambda minimum: minimum.score)
     return minima, iterations, hypotheses
@@ -213,9 +212,9 @@ def _starts(
 def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
     """The minimum with lenses linearised about its own focal lengths."""
     prior_score = minimum.prior_score
-    for _ in range(LENS_ROUNDS):
+    for _ in range(_LENS_ROUNDS):
         log_focals = minimum.state.log_focals
-        if Lenses.is_settled(log_focals):
+        if np.abs(log_focals).max(initial=0.0) < _SETTLED:
             break
         lenses = minimum.lenses.at(log_focals)
         there = problem.evidence(minimum.evidence.shape, lenses)

@@ -84,7 +84,14 @@ def solve(
     residuals, statuses = _residuals(seen, points, found)
     found = found._replace(residuals=residuals, statuses=statuses)
     if np.count_nonzero(statuses):
-        found = found._replace(errors=_errors(problems, options, found))
+        errors = {
+            b: solver_error(
+                statuses[b], found.info[b, 3], problems.points_3d[problems.rows(b)], options
+            )
+            for b in np.flatnonzero(statuses).tolist()
+            if b not in found.errors
+        }
+        found = found._replace(errors={**found.errors, **errors})
     return found if options.known_axis == "x" else _in_model_axes(found, options)
 
 
@@ -128,18 +135,6 @@ def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | 
 def _is_plain(sigma: Sigma | None, sigmas: Sequence[Sigma] | None) -> bool:
     """True for one positive number, which needs no further check."""
     return sigmas is None and type(sigma) is float and 0.0 < sigma < math.inf
-
-
-def _errors(problems: Problems, options: FitOptions, found: Solutions) -> Errors:
-    """Those found on the way, and otherwise those of the statuses."""
-    errors = {
-        b: solver_error(
-            found.statuses[b], found.info[b, 3], problems.points_3d[problems.rows(b)], options
-        )
-        for b in np.flatnonzero(found.statuses).tolist()
-        if b not in found.errors
-    }
-    return {**found.errors, **errors}
 
 
 def _rays(problems: Problems) -> tuple[FloatArray, Errors]:
@@ -200,7 +195,11 @@ def _solve_optimal(
     if not exact.any():
         return found
     if options.focal == "known" and options.sigma is not None:
-        found = _with_exact(found, search(np.ones(len(problems)), is_bounded=False), exact)
+        unbounded = search(np.ones(len(problems)), is_bounded=False)
+        # Where none fits exactly without a bound, this keeps the optimum from running off.
+        chosen = exact & (unbounded.costs[:, 0] < _EXACT_COST)
+        for name in ("poses", "costs", "covariances", "statuses", "info"):
+            getattr(found, name)[chosen] = getattr(unbounded, name)[chosen]
     return _with_exact_sorted(found, exact & (found.info[:, 0] > 1))
 
 
@@ -318,26 +317,17 @@ def _residuals(
     residuals, statuses = reproject_batch(
         *given, found.poses, problems.calibrations, found.statuses
     )
-    for b, camera in enumerate(problems.each_camera()):
+    if not any(camera.distortion for camera in problems.cameras):
+        return residuals, statuses
+    for b in range(len(problems)):
+        camera, rows = problems.camera(b), problems.rows(b)
         if camera.distortion and statuses[b] == OK and b not in found.errors:
-            rows = problems.rows(b)
             pixels = problems.points_2d[rows] + residuals[rows]
             rays = (pixels - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
             residuals[rows] = camera.pixels_from_normalized(rays) - problems.points_2d[rows]
             if not np.isfinite(residuals[rows]).all():
                 statuses[b] = OUT_OF_RANGE
     return residuals, statuses
-
-
-def _with_exact(found: Solutions, unbounded: Solutions, exact: BoolArray) -> Solutions:
-    """Solutions that fit exactly without a bound, where ``exact`` (B,) marks such problems.
-
-    Where none does, the bound keeps the optimum from running off.
-    """
-    chosen = exact & (unbounded.costs[:, 0] < _EXACT_COST)
-    for name in ("poses", "costs", "covariances", "statuses", "info"):
-        getattr(found, name)[chosen] = getattr(unbounded, name)[chosen]
-    return found
 
 
 def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:

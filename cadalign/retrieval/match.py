@@ -13,8 +13,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import ViewResult
-from cadalign.estimation.uncertainty.stated import Stated
+from cadalign.estimation.result_parts import Stated, ViewResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

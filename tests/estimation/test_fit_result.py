@@ -13,8 +13,13 @@ from support.problems import fit_problem, problem_of
 from cadalign import Alignment, FocalPrior, Result
 from cadalign.errors import InputError
 from cadalign.estimation.options import FitOptions
-from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
-from cadalign.estimation.uncertainty.stated import KeypointStatistics, Stated
+from cadalign.estimation.result_parts import (
+    Alternative,
+    FitStats,
+    KeypointStatistics,
+    Stated,
+    ViewResult,
+)
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])

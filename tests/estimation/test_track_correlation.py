@@ -80,5 +80,4 @@ def test_a_few_pairs_are_no_correlation() -> None:
     assert SuccessiveErrors(0.5, 1.0, 4).correlation == 0
     assert SuccessiveErrors(0.5, 1.0, 400).correlation == 0.5
     assert SuccessiveErrors(-0.5, 1.0, 400).correlation == 0
-    both = SuccessiveErrors(1.0, 2.0, 100).plus(SuccessiveErrors(2.0, 2.0, 100))
-    assert both.correlation == pytest.approx(0.75)
+    assert SuccessiveErrors(3.0, 4.0, 200).correlation == pytest.approx(0.75)

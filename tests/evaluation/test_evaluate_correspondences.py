@@ -19,8 +19,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import ViewResult
-from cadalign.estimation.uncertainty.stated import Stated
+from cadalign.estimation.result_parts import Stated, ViewResult
 from cadalign.evaluation import plots
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.correspondences import SPEC, CorrespondenceOptions, summarize

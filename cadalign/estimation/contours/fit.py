@@ -24,8 +24,8 @@ from cadalign.estimation.contours.view_contour import ViewContour, contour_view
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Result
+from cadalign.estimation.result_parts import Stated
 from cadalign.estimation.search import Minimum
-from cadalign.estimation.uncertainty.stated import Stated
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
@@ -67,13 +67,11 @@ class Refined(NamedTuple):
         """The result with what is known of the masks or photos."""
         stated = Stated.of(result.statistics)
         basis = stated.basis
-        if self.photos and basis is not None:
-            basis = replace(basis, photos=self.photos)
         statistics = replace(
             stated,
             evidence=(*result.evidence, *self.summaries),
             warnings=(*result.warnings, *self.warnings),
-            basis=basis,
+            basis=basis and replace(basis, photos=self.photos or basis.photos),
         )
         residuals = self.residuals or result.mask_residuals
         return replace(result, mask_residuals=residuals, statistics=statistics)
@@ -110,9 +108,8 @@ def fit_masks(
     """Refine the likely minima of the other evidence with the views' masks.
 
     The ``minima`` without masks, the likeliest first, are starts where these leave something open.
-    Raises InputError if a mask has no contour, or
-    the model has no mesh; DegenerateError if there is no estimate without the masks and no rim near
-    them.
+    Raises InputError if a mask has no contour, or the model has no mesh; DegenerateError if there
+    is no estimate without the masks and no rim near them.
     """
     contours = [
         contour_view(number, view, f"views[{number}].mask", minima[0].lenses.cameras[number])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -81,13 +80,16 @@ def minima_of_mask(
     is_exact = is_exact_model(model)
     proposals: list[_Proposal] = []
     steps, starts = 0, 0
+    sigma = max(_MEETS_PX, _MEETS * contour.contour.size)
+    met = np.log(sigma) + (1 + np.log(2 * np.pi)) / 2
     for is_cut, count in _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR:
         for alignment, surface in _resembling(problem, model, count, is_cut=is_cut):
             found, iterations = _approached(problem, alignment, surface, contour)
             starts, steps = starts + 1, steps + iterations
             if found is not None:
                 proposals.append(found)
-        if _is_met(proposals, contour):
+        cost = min((proposal.cost for proposal in proposals), default=np.inf)
+        if cost < met:  # as likely as one whose whole outline meets the contour
             break
     proposals.sort(key=lambda proposal: proposal.cost)
     misfit = proposals[0].misfit if proposals else np.inf
@@ -112,13 +114,6 @@ def minima_of_mask(
         if np.exp(-score / 2) >= LEAST_LIKELIHOOD
     ]
     return likely, steps, starts, mistake
-
-
-def _is_met(proposals: Sequence[_Proposal], contour: ViewContour) -> bool:
-    """True if the best proposal is as likely as one whose whole outline meets the contour."""
-    sigma = max(_MEETS_PX, _MEETS * contour.contour.size)
-    cost = min((proposal.cost for proposal in proposals), default=np.inf)
-    return bool(cost < np.log(sigma) + (1 + np.log(2 * np.pi)) / 2)
 
 
 def _resembling(

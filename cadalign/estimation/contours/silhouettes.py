@@ -98,14 +98,6 @@ def overlaps(views: Whitened, query: Whitened) -> FloatArray:
     return np.asarray(common / (areas[:, None] + weighted[:, 0].sum() - common), dtype=np.float64)
 
 
-def turn_of(number: int, *, mirrored: bool) -> FloatArray:
-    """The turn (2, 2) of one of the overlaps, from the silhouette's plane to the query's."""
-    angle = 2 * np.pi * number / _TURNS
-    cosine, sine = np.cos(angle), np.sin(angle)
-    turn = np.array([[cosine, -sine], [sine, cosine]])
-    return np.diag([1.0, -1.0]) @ turn if mirrored else turn
-
-
 def _radii(count: int) -> FloatArray:
     return np.asarray(_OUTERMOST * (np.arange(count) + 0.5) / count)
 
@@ -327,9 +319,13 @@ def _affine_cameras(atlas: Atlas, query: Whitened) -> list[tuple[FloatArray, Flo
     peaks = np.nonzero(is_peak)
     best = np.argsort(-overlap[peaks])[:_MOST_AFFINE]
     found = []
-    for flip, row, turn in zip(*(each[best].tolist() for each in peaks), strict=True):
-        turned = turn_of(turn, mirrored=bool(flip))
-        plane = query.spread[0] @ turned @ np.linalg.inv(atlas.views.spread[row])
+    for flip, row, number in zip(*(each[best].tolist() for each in peaks), strict=True):
+        angle = 2 * np.pi * number / _TURNS
+        cosine, sine = np.cos(angle), np.sin(angle)
+        turn = np.array([[cosine, -sine], [sine, cosine]])
+        if flip:
+            turn = np.diag([1.0, -1.0]) @ turn
+        plane = query.spread[0] @ turn @ np.linalg.inv(atlas.views.spread[row])
         found.append((plane @ atlas.bases[row], query.mean[0] - plane @ atlas.views.mean[row]))
     return found
 

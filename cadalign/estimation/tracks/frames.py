@@ -106,7 +106,10 @@ class PoseCandidates(NamedTuple):
 
 
 def candidates_of(evidence: Evidence, shape: FloatArray) -> PoseCandidates:
-    """PoseCandidates of every frame for a shape (m, 3); frames of few keypoints have none."""
+    """PoseCandidates of every frame for a shape (m, 3); frames of few keypoints have none.
+
+    The costs are truncated squares of a frame's own residuals.
+    """
     still = with_known_shape(evidence, shape)
     poses, frames, costs = [], [], []
     order = np.argsort(evidence.rig.pose, kind="stable")
@@ -117,17 +120,12 @@ def candidates_of(evidence: Evidence, shape: FloatArray) -> PoseCandidates:
         for pose in view_starts(still, view)[0][:_MOST]:
             poses.append(in_rig(pose, evidence.rig.cam_from_rig[view]))
             frames.append(frame)
-            costs.append(_cost(own, frame, poses[-1]))
+            state = mean_state(own, np.broadcast_to(poses[-1], (frame + 1, 12)), np.zeros(3))
+            lengths = np.minimum(whitened_lengths(own, state), _OUTLIER)
+            costs.append(float((lengths * lengths).sum()))
     return PoseCandidates(
         np.array(poses).reshape(-1, 12), np.array(frames, dtype=np.int64), np.array(costs)
     )
-
-
-def _cost(own: Evidence, frame: int, pose: FloatArray) -> float:
-    """Truncated squares of a frame's own residuals under a pose."""
-    state = mean_state(own, np.broadcast_to(pose, (frame + 1, 12)), np.zeros(3))
-    lengths = np.minimum(whitened_lengths(own, state), _OUTLIER)
-    return float((lengths * lengths).sum())
 
 
 def best_path(
@@ -213,7 +211,7 @@ class SuccessiveErrors(NamedTuple):
 
     products: float = 0.0
     squares: float = 0.0
-    number: int = 0
+    number: float = 0.0
 
     @classmethod
     def of(cls, evidence: Evidence, state: State, *, first: int = 0) -> SuccessiveErrors:
@@ -226,14 +224,6 @@ class SuccessiveErrors(NamedTuple):
         if not np.isfinite(before).all() or not np.isfinite(after).all():
             return cls()
         return cls(float((before * after).sum()), float((after**2).sum()), before.size)
-
-    def plus(self, other: SuccessiveErrors) -> SuccessiveErrors:
-        """The sums of both."""
-        return SuccessiveErrors(
-            self.products + other.products,
-            self.squares + other.squares,
-            self.number + other.number,
-        )
 
     @property
     def correlation(self) -> float:

@@ -233,7 +233,12 @@ def _state_at(
         change[k] = _STEP * (scale if k % 6 >= 3 else 1.0)
         ends = [_mean(time, _stepped(known, sign * change))[0] for sign in (1, -1)]
         slopes[:, k] = _step_between(ends[1], ends[0]) / (2 * change[k])
-    variances = np.repeat(np.square(strength), 3) * _own_variance(time, known)
+    # Variance of an integrated random walk of unit strength, given the ends.
+    around = abs(time - known[0][0])
+    if len(known) == 2:
+        after = known[1][0] - time
+        around = around * after / (around + after)
+    variances = np.repeat(np.square(strength), 3) * (around**3 / 3)
     turned = np.zeros((6, 6))
     turned[:3, :3] = turned[3:, 3:] = pose[:9].reshape(3, 3)
     return pose, velocity, slopes @ covariance @ slopes.T + turned * variances @ turned.T
@@ -254,15 +259,6 @@ def _mean(time: float, known: list[_Known]) -> tuple[FloatArray, FloatArray]:
     velocity = 6 * (s - s**2) / length * twist
     velocity += (1 - 4 * s + 3 * s**2) * first + (3 * s**2 - 2 * s) * last
     return moved_by(pose, along), velocity
-
-
-def _own_variance(time: float, known: list[_Known]) -> float:
-    """Variance of an integrated random walk of unit strength, given the ends."""
-    before = abs(time - known[0][0])
-    if len(known) == 1:
-        return before**3 / 3
-    after = known[1][0] - time
-    return (before * after / (before + after)) ** 3 / 3
 
 
 def _stepped(known: list[_Known], change: FloatArray) -> list[_Known]:

@@ -169,7 +169,8 @@ class Tracker:
         if share.size and inliers.mean() >= _AGREE:
             last = len(window.times) - 2
             newest = SuccessiveErrors.of(window.evidence, window.path.state, first=last)
-            self._errors = self._errors.plus(newest)
+            sums = zip(self._errors, newest, strict=True)
+            self._errors = SuccessiveErrors(*(before + new for before, new in sums))
         if len(inliers):
             contradicts = inliers.mean() < _MOST_LOST
             self._contradicting = self._contradicting + 1 if contradicts else 0

@@ -23,12 +23,12 @@ from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import Lenses, prior_of, rows_among, widened
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
 from cadalign.estimation.result_data import ResultData
+from cadalign.estimation.result_parts import KeypointStatistics
 from cadalign.estimation.symmetry import equal_slopes
 from cadalign.estimation.uncertainty.derivatives import UNKNOWNS, Optima, lens_slopes
 from cadalign.estimation.uncertainty.differences import JointOptimum
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis
 from cadalign.estimation.uncertainty.residuals import whitening_matrices
-from cadalign.estimation.uncertainty.stated import KeypointStatistics
 from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import points_of

@@ -92,7 +92,6 @@ class ManyEstimates:
         return Rows([row], [timing], [_record(task.row, seen, found)])
 
     def _observation(self, task: ObservationTask) -> Observation:
-        """The observation of a task, with the shape that is to be fitted."""
         folder, shape = Path(task.folder), self.options.learned
         if isinstance(task.content, ImageKeypoints):
             seen = self._detected(task.content, folder)
@@ -105,7 +104,6 @@ class ManyEstimates:
         return seen if shape is None else replace(seen, shape=shape.absolute())
 
     def _detected(self, found: ImageKeypoints, folder: Path) -> Observation:
-        """A detector's keypoints paired with the model's."""
         detector, changes = self.options.detector, self.options.changes
         assert self.model is not None
         photo = None
@@ -170,7 +168,6 @@ _exists = lru_cache(maxsize=1024)(Path.is_file)
 
 
 def _parsed(content: bytes, name: str) -> Any:
-    """The JSON of a line."""
     try:
         return msgspec.json.decode(content)
     except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:

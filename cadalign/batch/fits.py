@@ -234,7 +234,6 @@ def _line(number: int, observation: Any) -> bytes:
 
 
 def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[ObservationTask]]:
-    """Observations as tasks, so many at a time."""
     source = enumerate(observations)
     for index in count():
         tasks = [
@@ -247,7 +246,6 @@ def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[Ob
 
 
 def _tally(folder: RunFolder) -> Tally:
-    """Count the failures of a finished run."""
     counts: Counter[str] = Counter()
     total = 0
     for table in read_groups(folder.results, fix=DONE_ANEW):

@@ -145,7 +145,6 @@ def _changed(part: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """A value for JSON."""
     if isinstance(value, dict):
         return {name: _plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

@@ -94,14 +94,12 @@ def draw_fit(folder: RunFolder, row: Row, seen: Observation, result: Result) -> 
 
 
 def _mesh(seen: Observation, result: Result) -> Mesh | None:
-    """The object's mesh in the model's frame, before the stretch."""
     if result.model is not None:
         return mesh_of(seen, result)
     return None if seen.model is None else load_mesh(seen.model)
 
 
 def _resized(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
-    """A photo in a size for a page, and its camera."""
     factor = min(1.0, _MOST / max(camera.width, camera.height))
     size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
     if size != photo.shape[1::-1]:
@@ -110,7 +108,6 @@ def _resized(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
 
 
 def _thumb(photo: ByteImage, camera: Camera, result: Result) -> ByteImage:
-    """The part of a photo around the object, with its box and keypoints."""
     box = Box.from_model(result.bounds, result.alignment)
     scale = camera.width / result.camera.width
     observed = rescaled_pixels(result.views[0].points_2d, scale)
@@ -123,7 +120,6 @@ def _thumb(photo: ByteImage, camera: Camera, result: Result) -> ByteImage:
 
 
 def _cropped(photo: ByteImage, points: FloatArray) -> ByteImage:
-    """The part of a photo around points, in the size of a thumb."""
     limit = np.array(photo.shape[1::-1], dtype=float)
     low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
     across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel

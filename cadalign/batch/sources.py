@@ -229,7 +229,6 @@ def _folder(path: Path) -> str:
 
 
 def _kind_of_file(path: Path) -> str:
-    """The kind of a JSON file's content."""
     try:
         content = read_bytes(path)
         data = msgspec.json.decode(content, type=dict[str, msgspec.Raw] | list[msgspec.Raw])

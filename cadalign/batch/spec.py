@@ -184,7 +184,6 @@ def _by_model(run: Run) -> Run | None:
 
 
 def _plots(runs: Sequence[Run]) -> list[Plot]:
-    """Shares of the observations within a residual and within an uncertainty."""
     curves = [(metric, _PLACES) for metric in (metrics.RMS, ROTATION_STD)]
     return cumulative_curves(runs, curves=curves, of="of the observations")
 

@@ -159,7 +159,6 @@ def align(
 def _align_cropped(
     model: Model | ShapeModel, views: Sequence[View], options: FitOptions, **given: Any
 ) -> Result:
-    """Estimate the principal point, too."""
     from cadalign.estimation import principal
 
     principal.check_shiftable(views)
@@ -322,7 +321,6 @@ def _require_each(given: Sequence[Any], where: str, kind: type[T]) -> Sequence[T
 
 
 def _checked_views(given: object) -> list[View]:
-    """The views, one or several."""
     if isinstance(given, View):
         return [given]
     if not isinstance(given, Iterable):

@@ -57,7 +57,6 @@ class _Task:
     noise: float
 
     def system(self, focal: float) -> FocalObjective:
-        """The system of 9 unknowns with a focal length [px] as its reference."""
         rays, whitening = focal_view(self.points_2d, self.camera, focal, self.sigma)
         loss, bend = LOSSES[self.options.loss], self.options.loss_scale * self.noise
         prior = LogFocalPrior(*log_focal_range(self.camera, self.options.focal_prior, focal))

@@ -288,7 +288,6 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
 
 
 def _in_rig(views: Sequence[View], minimum: Minimum, best: Estimate) -> Alignment | None:
-    """The alignment in the frame that the views share."""
     if views[0].cam_from_rig is None:
         return None
     camera, pose = minimum.evidence.rig.cam_from_rig[0], best.poses[0]

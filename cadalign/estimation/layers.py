@@ -272,7 +272,6 @@ def _polished(
 
 
 def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> BatchMinima:
-    """The best minima of some problems."""
     present, cameras = batch.present, batch.cameras
     offsets = np.concatenate([[0], np.cumsum(batch.counts)]).astype(np.int64)
     problems = Problems(points[present], batch.pixels[present], offsets, cameras)

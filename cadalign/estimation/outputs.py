@@ -96,7 +96,6 @@ def _pose_rows(
 
 
 def _plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> None:
-    """Draw a mesh over the photo, shaded and translucent, with its outline."""
     shade = _shade(camera, alignment, mesh)
     seen = np.isfinite(shade)
     if not seen.any():
@@ -113,7 +112,6 @@ def _plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> 
 
 
 def _plot_box(axes: Axes, camera: Camera, box: Box) -> None:
-    """Draw the edges of a box in the camera frame."""
     corners = box.corners
     share = np.linspace(0, 1, _LINE_POINTS)[:, None]
     for first, second in BOX_EDGES:

@@ -105,7 +105,6 @@ def _with_principal_point(
     covariance: FloatArray,
     options: FitOptions,
 ) -> Result:
-    """The result with the uncertainty that the principal point adds."""
     views = []
     for number, view in enumerate(result.views):
         stated = Stated.of(view.statistics)

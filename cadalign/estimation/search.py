@@ -285,7 +285,7 @@ def _start(init: Inits, evidence: Evidence) -> Start | None:
     scale = np.array(given[0].scale)
     if held.any():
         scale = np.where(held, 1.0, scale / scale[held].mean())
-    return Start(poses, np.log(scale))
+    return poses, np.log(scale)
 
 
 def find_minima(

@@ -51,11 +51,8 @@ class Starts(NamedTuple):
     log_scales: FloatArray
 
 
-class Start(NamedTuple):
-    """A given start: a pose (12,) or None for each pose of the evidence, and log scales (3,)."""
-
-    poses: Sequence[FloatArray | None]
-    log_scales: FloatArray
+Start = tuple[Sequence[FloatArray | None], FloatArray]
+"""A given start: a pose (12,) or None for each pose of the evidence, and log scales (3,)."""
 
 
 def starts_of(evidence: Evidence, init: Start | None = None) -> Starts:
@@ -89,12 +86,12 @@ def _proposed(evidence: Evidence, init: Start | None) -> list[_Start]:
     if init is not None:
         unknowns = 6 * poses + int(evidence.scales.free.sum())
         is_open = count_equations(evidence) - len(evidence.shape.modes) < unknowns
-        for given, found_of_pose in zip(init.poses, per_pose, strict=True):
+        for given, found_of_pose in zip(init[0], per_pose, strict=True):
             if given is None:
                 continue
             if is_open:  # what the keypoints alone suggest is arbitrary
                 found_of_pose.clear()
-            found_of_pose.insert(0, (given, init.log_scales))
+            found_of_pose.insert(0, (given, init[1]))
     elif is_metric and poses == 1:
         placed = _metric_starts(evidence, per_pose[0])
         if placed:
@@ -138,7 +135,6 @@ def _with_rig(evidence: Evidence, per_pose: list[list[_Start]]) -> list[_Start]:
 
 
 def _of_pose(evidence: Evidence, pose: int) -> Evidence:
-    """The evidence of the views that share a pose."""
     chosen = evidence.rig.pose == pose
     kept = {}
     for name in ("sightings", "directions", "offsets", "planes"):

@@ -162,7 +162,6 @@ class View(DeclaredEvidence):
                 object.__setattr__(self, name, as_positive(getattr(self, name), name=name))
 
     def _keep(self, name: str, value: npt.NDArray[Any]) -> None:
-        """Set a field to what was checked."""
         object.__setattr__(self, name, read_only(value))
 
     def __repr__(self) -> str:

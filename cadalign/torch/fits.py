@@ -285,8 +285,6 @@ class _ShapeTask:
         return _Aligned(seen, int(minima.label[0]), state[:POSE].copy(), force_of(state))
 
     def aligned(self) -> list[_Aligned | None]:
-        """The best minimum of every problem."""
-
         @np.errstate(all="ignore")
         def run(first: int, last: int) -> list[_Aligned | None]:
             return [self._minimum(problem) for problem in range(first, last)]

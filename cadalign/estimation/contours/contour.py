@@ -347,21 +347,17 @@ def across_rims(contour: Contour, rims: Rims) -> FloatArray:
     return np.where(usable[:, None], across / scale, contour.normals)
 
 
-class MaskImage(NamedTuple):
-    """A mask (h, w) of probabilities, and where each sample of its contour lies on it, (S,) [px].
+MaskImage = tuple[Image, FloatArray]
+"""A mask (h, w) of probabilities, and where each sample of its contour lies on it, (S,) [px].
 
-    These ``crossings`` are distances along the samples' normals, NaN where there is none.
-    """
-
-    inside: Image
-    crossings: FloatArray
+These places are distances along the samples' normals, NaN where there is none."""
 
 
 def mask_image(mask: FloatArray | BoolArray, contour: Contour) -> MaskImage:
     """A mask with the places of its contour's samples."""
     inside = np.ascontiguousarray(mask, dtype=np.float32)
     none = np.zeros(len(contour.points))
-    return MaskImage(inside, crossings(smoothed(inside), contour.points, contour.normals, none))
+    return inside, crossings(smoothed(inside), contour.points, contour.normals, none)
 
 
 def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims) -> FloatArray:
@@ -374,25 +370,26 @@ def extraction_bias(sight: Sight, mask: MaskImage, contour: Contour, rims: Rims)
     if not len(rows):
         return bias
     some, offsets = contour.taken(rows), rims.offset[rows]
-    corner, rendered = _rendered(sight, mask, some.at(offsets), np.abs(offsets))
+    inside, places = mask
+    corner, rendered = _rendered(sight, inside, some.at(offsets), np.abs(offsets))
     own = crossings(smoothed(rendered), some.points - corner, some.normals, offsets)
-    bias[rows] = np.nan_to_num(offsets - (own - mask.crossings[rows]))
+    bias[rows] = np.nan_to_num(offsets - (own - places[rows]))
     return np.where(np.abs(bias) < REACH, bias, 0.0)
 
 
 def _rendered(
-    sight: Sight, mask: MaskImage, rims: FloatArray, distances: FloatArray
+    sight: Sight, mask: Image, rims: FloatArray, distances: FloatArray
 ) -> tuple[IntArray, Image]:
     """The silhouette near rims (S, 2) [px], the mask about them; first the corner (2,) of it.
 
     Where rims are at small ``distances`` (S,) [px] from the contour, all but the nearest pixels are
     those of the mask.
     """
-    height, width = mask.inside.shape
+    height, width = mask.shape
     places = np.clip(np.rint(rims).astype(int), 0, [width - 1, height - 1])
     corner = np.maximum(places.min(axis=0) - _MARGIN, 0)
     right, bottom = places.max(axis=0) + _MARGIN + 1
-    rendered = mask.inside[corner[1] : bottom, corner[0] : right].copy()
+    rendered = mask[corner[1] : bottom, corner[0] : right].copy()
     near, least = np.zeros(rendered.shape, dtype=np.uint8), 0.0
     for most, band in _BANDS:
         columns, rows = (places[(distances >= least) & (distances < most)] - corner).T

@@ -92,7 +92,6 @@ class _Candidate(NamedTuple):
 
     @property
     def minimum(self) -> Minimum:
-        """The minimum that the rounds led to."""
         evidence, state, *_ = self.settled.joined
         return self.start._replace(
             evidence=evidence, state=state, cost=self.settled.cost, score=self.score
@@ -118,7 +117,8 @@ def fit_masks(
     ]
     keypoints = len(prior.ids)
     first = minima[0]
-    choice = surfaces_of(model, first.points[:keypoints], f"views[{contours[0].image}].mask")
+    where = f"views[{contours[0].image}].mask"
+    surfaces, convex = surfaces_of(model, first.points[:keypoints], where)
     is_open = not _is_determined(first)
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
@@ -127,16 +127,14 @@ def fit_masks(
     explore = partial(_explored, starts, keypoints, is_wide=is_open)
     best: list[_Candidate] = []
     while used:
-        best = explore(used, choice.surfaces)
-        if not choice.hulls and not is_open and (not best or _misfit(best[0].settled) > _AGREEING):
-            displaced = _explored(
-                _displaced(first), keypoints, used, choice.surfaces, is_wide=False
-            )
+        best = explore(used, surfaces)
+        if not convex and not is_open and (not best or _misfit(best[0].settled) > _AGREEING):
+            displaced = _explored(_displaced(first), keypoints, used, surfaces, is_wide=False)
             best = sorted([*best, *displaced[:1]], key=lambda each: _misfit(each.settled))
-        hulls = [_hull_contour(each, views[each.image]) for each in used] if choice.hulls else []
+        hulls = [_hull_contour(each, views[each.image]) for each in used] if convex else []
         known = [each for each in hulls if each is not None]
         if known and len(known) == len(used):
-            by_hulls = explore(known, choice.hulls)
+            by_hulls = explore(known, convex)
             # Hulls that agree so much better: the rest of the outline is another object's.
             if by_hulls and (
                 not best or _misfit(by_hulls[0].settled) < _HULL_GAIN * _misfit(best[0].settled)

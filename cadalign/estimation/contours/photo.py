@@ -321,7 +321,7 @@ def fit_photos(
     ]
     keypoints = len(prior.ids)
     where = f"views[{photos[0].image}].image"
-    surface = surfaces_of(model, minima[0].points[:keypoints], where).surfaces[0]
+    surface = surfaces_of(model, minima[0].points[:keypoints], where)[0][0]
     warnings: list[str] = []
     found: dict[int, OutlineSupport] = {}
     left_out: dict[int, OutlineSupport] = {}

@@ -70,39 +70,26 @@ def _histogram(bins: IntArray) -> FloatArray:
     return np.asarray((1 - _FLOOR) * shares + _FLOOR / _BINS**3)
 
 
-class Regions(NamedTuple):
-    """Colours on both sides of an outline.
+def regions_of(inside: IntArray, outside: IntArray) -> tuple[FloatArray, float]:
+    """Learn from the bins of the colours inside and outside: odds and contrast.
 
-    ``odds`` are, by bins, the probability of the object minus that of the background; ``contrast``
+    The odds are, by bins, the probability of the object minus that of the background; the contrast
     is the mutual information of side and colour [nats], 0 without any, log 2 at most.
     """
-
-    odds: FloatArray
-    contrast: float
-
-
-def regions_of(inside: IntArray, outside: IntArray) -> Regions:
-    """Learn from the bins of the colours inside and outside."""
     own, other = _histogram(inside), _histogram(outside)
     both = (own + other) / 2
     contrast = (own * np.log(own / both) + other * np.log(other / both)).sum() / 2
-    return Regions((own - other) / (2 * both), float(contrast))
+    return (own - other) / (2 * both), float(contrast)
 
 
-class Crossings(NamedTuple):
-    """Places at which S lines leave the object, in steps outwards from their middles.
-
-    ``places`` (S,) and ``variances`` (S,), infinite where a line has no edge.
-    """
-
-    places: FloatArray
-    variances: FloatArray
-
-
-def crossings_of(odds: FloatArray, valid: BoolArray, edges: FloatArray) -> Crossings:
+def crossings_of(
+    odds: FloatArray, valid: BoolArray, edges: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Find where the colours along lines change from the object's to the background's.
 
-    ``odds`` (S, 2 K + 1) are those of `Regions` at steps from the inside outwards, of which
+    Returns places (S,), in steps outwards from the lines' middles, and their variances.
+
+    ``odds`` (S, 2 K + 1) are those of `regions_of` at steps from the inside outwards, of which
     ``valid`` ones count; ``edges`` (S, 2 K + 1) are further log likelihoods of the places. The
     posterior is taken relative to the uniform prior on the line, so that a line without contrast
     has an infinite variance, and one with several crossings a large one.
@@ -123,7 +110,7 @@ def crossings_of(odds: FloatArray, valid: BoolArray, edges: FloatArray) -> Cross
     safe = np.where(is_told, precision, 1.0)
     places = mean / variance / safe
     is_told &= np.abs(places) < count / 2
-    return Crossings(np.where(is_told, places, 0.0), np.where(is_told, 1 / safe, np.inf))
+    return np.where(is_told, places, 0.0), np.where(is_told, 1 / safe, np.inf)
 
 
 def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
@@ -258,7 +245,7 @@ class Outline(NamedTuple):
 
     ``places`` (S,) [px] are outwards from the silhouette's contour, by ``reach`` at most; their
     standard deviations ``sigmas`` (S,) are infinite where nothing is told; ``contrast`` is that of
-    `Regions`.
+    `regions_of`.
     """
 
     silhouette: Silhouette
@@ -284,7 +271,7 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     inside, outside = _colors_beside(photo, silhouette, reach, step)
     if min(len(inside), len(outside)) < _LEAST_PIXELS:
         return None
-    regions = regions_of(inside, outside)
+    odds, contrast = regions_of(inside, outside)
     contour = silhouette.contour
     steps = step * np.arange(-STEPS, STEPS + 1)
     pixels = contour.points[:, None] + steps[:, None] * contour.normals[:, None]
@@ -293,9 +280,8 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     edges = np.zeros(valid.shape)
     if step <= _EDGE_STEP:
         edges = edges_of(colors.astype(np.float64), valid, step)
-    found = crossings_of(regions.odds[bins_of(colors)], valid, edges)
-    sigmas = step * np.sqrt(found.variances)
-    return Outline(silhouette, step * found.places, sigmas, regions.contrast, reach)
+    places, variances = crossings_of(odds[bins_of(colors)], valid, edges)
+    return Outline(silhouette, step * places, step * np.sqrt(variances), contrast, reach)
 
 
 def _colors_beside(

@@ -130,8 +130,8 @@ def _resembling(
             surface.mesh, mask, camera, free=free, count=count, is_cut=is_cut
         )
     ]
-    best = sorted(found, key=lambda pair: -pair[0].iou)[:count]
-    return [(each.alignment, surface) for each, surface in best]
+    best = sorted(found, key=lambda pair: -pair[0][0])[:count]
+    return [(alignment, surface) for (_, alignment), surface in best]
 
 
 def _approached(
@@ -163,7 +163,7 @@ def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:
         training = cast(TrainingShapes, model.training)
         rows = _varied(training, mean)
         shapes = list(training.points_3d[rows].astype(np.float64))
-    return [surfaces_of(model, points, _WHERE).surfaces[0] for points in shapes]
+    return [surfaces_of(model, points, _WHERE)[0][0] for points in shapes]
 
 
 def _varied(training: TrainingShapes, mean: FloatArray) -> list[int]:

@@ -219,13 +219,6 @@ def _sampled(
     return Whitened(corner + cell * mean, cell * spread, rings)
 
 
-class Resembling(NamedTuple):
-    """An alignment, and the intersection over union of its silhouette, or a part, and the mask."""
-
-    alignment: Alignment
-    iou: float
-
-
 def resembling_poses(
     mesh: Mesh,
     mask: FloatArray | BoolArray,
@@ -234,23 +227,23 @@ def resembling_poses(
     free: BoolArray,
     count: int,
     is_cut: bool = False,
-) -> list[Resembling]:
+) -> list[tuple[float, Alignment]]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
+    Each comes after the intersection over union of its silhouette, or a part, and the mask.
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
     lies beyond a line.
     """
     atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
     query = whitened(view.image, view.corner, view.cell)
     poses = [_pose_of(*each, atlas, free) for each in _affine_cameras(atlas, query)]
-    found = [Resembling(pose, _overlap(atlas, view, pose, is_cut=is_cut)) for pose in poses]
-    found.sort(key=lambda each: -each.iou)
-    kept: list[Resembling] = []
-    for each in found:
-        if len(kept) < count and all(differ(each.alignment, other.alignment) for other in kept):
-            kept.append(each)
-    turn = view.camera_from_facing
-    return [each._replace(alignment=turned_alignment(each.alignment, turn)) for each in kept]
+    found = [(_overlap(atlas, view, pose, is_cut=is_cut), pose) for pose in poses]
+    found.sort(key=lambda each: -each[0])
+    kept: list[tuple[float, Alignment]] = []
+    for iou, pose in found:
+        if len(kept) < count and all(differ(pose, other) for _, other in kept):
+            kept.append((iou, pose))
+    return [(iou, turned_alignment(pose, view.camera_from_facing)) for iou, pose in kept]
 
 
 def outline_of_mask(mask: FloatArray | BoolArray, camera: Camera) -> Whitened:

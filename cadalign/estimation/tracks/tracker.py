@@ -241,7 +241,6 @@ class Tracker:
         return self._evidence(), found.path._replace(state=state)
 
     def _evidence(self) -> Evidence:
-        """Evidence of the recent views."""
         views, shape = self._recent, self._shape
         assert shape is not None
         problem = self._problem(views, range(len(views)))

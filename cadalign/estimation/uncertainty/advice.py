@@ -250,7 +250,6 @@ class _KnownScene:
     size: Size | None
 
     def points_of(self, ids: Sequence[Hashable], where: str = "ids") -> FloatArray:
-        """Keypoints (n, 3) by their ids."""
         return np.asarray(self.points_3d[self.prior.rows_of(tuple(ids), where)])
 
     def covariance(self) -> FloatArray:
@@ -325,7 +324,6 @@ def _scene_of(
 def _poses_from(
     model: Model | ShapeModel, views: Sequence[View], first: Alignment
 ) -> tuple[Alignment, ...]:
-    """Poses in every camera from that in the first."""
     fix = "give the Result of `align`"
     if not is_exact_model(model):
         raise InputError("an alignment does not tell the shape", where="estimate", fix=fix)

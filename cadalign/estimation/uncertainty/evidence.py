@@ -232,7 +232,6 @@ def plane_distances(evidence: Evidence, state: State) -> FloatArray:
 
 
 def _of_known(evidence: Evidence, state: State, piece: Piece) -> list[EvidenceSummary]:
-    """The summaries of a piece's known directions and distances."""
     in_directions, in_offsets = _known_in(evidence, piece)
     found = []
     directions = kept_rows(evidence.directions, in_directions)
@@ -307,7 +306,6 @@ def contributions_of(basis: AnyBasis) -> tuple[Contribution, ...]:
 def _contribution(
     kind: str, view: int | None, evidence: Evidence, state: State, turn: FloatArray | None
 ) -> Contribution:
-    """The contribution of a piece, from the evidence without it."""
     evidence, state = reduced(evidence, state)  # displacements of several views are modes
     _, information = information_of(evidence, state)
     sizes = np.sqrt(information.diagonal())

@@ -135,7 +135,6 @@ def sensitivity_of(result: ResultData, *, exact: bool, view: int) -> Sensitivity
 
 
 def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
-    """The evidence of a fit, and its state."""
     own = result.views[0]
     model = Model(
         points_3d=result.points_3d,
@@ -158,7 +157,6 @@ def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
 
 
 def _of_keypoints(result: ResultData, fitted: KeypointStatistics, exact: bool) -> Sensitivity:
-    """The sensitivity of a fit, in closed form."""
     kept, view, options = fitted.inliers, result.views[0], fitted.options
     camera, alignment, n = view.camera, fitted.alignment, len(kept)
     pixels = np.require(view.points_2d[kept], requirements=["C", "W"])

@@ -224,6 +224,12 @@ def result_of_minima(
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
     likely = _one_of_equals(likely, symmetry, held)
+    best, in_rig = likely[0], None
+    if views[0].cam_from_rig is not None:
+        camera, pose = minimum.evidence.rig.cam_from_rig[0], best.poses[0]
+        rotation = camera[:9].reshape(3, 3)
+        turned = nearest_rotation(rotation.T @ pose.rotation)
+        in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[9:]), best.scale)
     tails = ShapeTails(inflation, prior.degrees_of_freedom)
     track = minimum.track
     if track is None:
@@ -238,7 +244,7 @@ def result_of_minima(
         inliers=_inliers(prior, views, minimum),
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=warnings if mistake is None else (mistake,),
-        evidence=summaries_of(minimum.evidence, minimum.state, likely[0].cameras),
+        evidence=summaries_of(minimum.evidence, minimum.state, best.cameras),
         basis=None if track else Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
         cost=minimum.cost,
         stats=stats,
@@ -247,7 +253,7 @@ def result_of_minima(
         known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
         stretched_axes=stretched_axes(held),
         symmetry=symmetry,
-        rig_from_model=_in_rig(views, minimum, likely[0]),
+        rig_from_model=in_rig,
         focal="estimate" if minimum.lenses.count else "known",
         focal_prior=prior_of_camera(minimum.lenses.prior, views[0].camera),
     )
@@ -285,15 +291,6 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
         likelihood,
         tuple(minimum.lenses.cameras_at(state.log_focals)),
     )
-
-
-def _in_rig(views: Sequence[View], minimum: Minimum, best: Estimate) -> Alignment | None:
-    if views[0].cam_from_rig is None:
-        return None
-    camera, pose = minimum.evidence.rig.cam_from_rig[0], best.poses[0]
-    rotation, shift = camera[:9].reshape(3, 3), camera[9:]
-    turned = nearest_rotation(rotation.T @ pose.rotation)
-    return Alignment(turned, rotation.T @ (pose.translation - shift), best.scale)
 
 
 def _inliers(prior: ShapePrior, views: Sequence[View], minimum: Minimum) -> list[BoolArray]:

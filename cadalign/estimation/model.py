@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, as_floats, as_points, as_positive, read_only
+from cadalign.arrays import as_floats, as_points, as_positive, read_only
 from cadalign.errors import InputError, quote, require_kind
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions
 from cadalign.estimation.symmetry import check_symmetry
+from cadalign.geometry.box import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.names import renamed
@@ -91,7 +92,7 @@ class Model:
             raise InputError("the model has no keypoints", where="shape_sigma", fix=fix)
         given = self.bounds
         if given is None:
-            given = self.mesh.bounds if self.mesh is not None else _extent(points)
+            given = self.mesh.bounds if self.mesh is not None else extent(points)
         bounds = as_floats(given, name="bounds", shape=(2, 3))
         if (bounds[1] < bounds[0]).any():
             raise InputError("the first row must hold the least coordinates", where="bounds")
@@ -144,7 +145,3 @@ def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
             raise InputError(f"{quote(name)} occurs twice", where="ids", fix="give each once")
         seen.add(name)
     return listed
-
-
-def _extent(points: FloatArray) -> FloatArray:
-    return np.stack([points.min(axis=0), points.max(axis=0)])

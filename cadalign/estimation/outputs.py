@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.result_parts import ViewResult
 from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
@@ -198,8 +197,14 @@ def object_of(
     if len(photos) != len(result.views):
         what = f"{len(photos)}, but the result has {len(result.views)} views"
         raise InputError(what, where="images", fix="give one or None for each")
+    views = []
+    for view, photo in zip(result.views, photos, strict=True):
+        # Without keypoints behind the camera, and those whose ids an older file lacks.
+        ahead = np.flatnonzero(np.isfinite(view.residuals).all(axis=1))[: len(view.ids)]
+        ids = tuple(view.ids[row] for row in ahead.tolist())
+        views.append(ExportView(view.camera, view.alignment, photo, view.points_2d[ahead], ids))
     return AlignedObject(
-        tuple(_exported(view, photo) for view, photo in zip(result.views, photos, strict=True)),
+        tuple(views),
         result.points_3d,
         result.ids,
         result.known_mesh(mesh),
@@ -212,10 +217,3 @@ def object_of(
 
 object_of_fit = object_of_align = object_of
 """Names of earlier versions."""
-
-
-def _exported(view: ViewResult, photo: Photo) -> ExportView:
-    """A view without the keypoints behind its camera, and those whose ids an older file lacks."""
-    ahead = np.flatnonzero(np.isfinite(view.residuals).all(axis=1))[: len(view.ids)]
-    ids = tuple(view.ids[row] for row in ahead.tolist())
-    return ExportView(view.camera, view.alignment, photo, view.points_2d[ahead], ids)

@@ -258,11 +258,14 @@ def whitening_of(sigma: Sigma | None, rays: FloatArray, camera: Camera) -> Float
         return np.array([[camera.fx / sigma, 0.0, camera.fy / sigma]])
     information = pixel_information(sigma, len(rays))
     to_pixels = np.diag([camera.fx, camera.fy]) @ camera.distortion_jacobian(rays)
-    of_rays = np.swapaxes(to_pixels, 1, 2) @ information @ to_pixels
-    a = np.sqrt(of_rays[:, 0, 0])
-    b = of_rays[:, 0, 1] / a
-    c = np.sqrt(of_rays[:, 1, 1] - b * b)
-    return np.stack([a, b, c], axis=1)
+    return whitening_by(np.swapaxes(to_pixels, 1, 2) @ information @ to_pixels)
+
+
+def whitening_by(information: FloatArray) -> FloatArray:
+    """Weights (n, 3) of `whitening_of` by the information (n, 2, 2) of the rays."""
+    a = np.sqrt(information[:, 0, 0])
+    b = information[:, 0, 1] / a
+    return np.stack([a, b, np.sqrt(information[:, 1, 1] - b * b)], axis=1)
 
 
 def check_sigmas(sigmas: Sequence[Sigma | None], counts: IntArray) -> None:

@@ -20,13 +20,12 @@ from cadalign.estimation.result_parts import (
     FitStats,
     Statistics,
     ViewResult,
-    extent,
     points_covariances,
     rms_of,
 )
 from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.box import Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 

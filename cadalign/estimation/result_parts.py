@@ -27,7 +27,7 @@ from cadalign.estimation.uncertainty.summary import (
     weaknesses_of_keypoints,
 )
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.box import Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
 
@@ -312,8 +312,3 @@ def rms_of(residuals: FloatArray, inliers: BoolArray) -> float:
     """Root mean square length of residuals (n, 2), of the inliers (n,) alone."""
     kept = residuals[inliers]
     return float(np.sqrt((kept * kept).sum() / max(len(kept), 1)))
-
-
-def extent(points: FloatArray) -> FloatArray:
-    """Least and greatest coordinates (2, 3) of points."""
-    return np.array([points.min(axis=0), points.max(axis=0)])

@@ -92,7 +92,13 @@ def solve(
             if b not in found.errors
         }
         found = found._replace(errors={**found.errors, **errors})
-    return found if options.known_axis == "x" else _in_model_axes(found, options)
+    if options.known_axis == "x":
+        return found
+    covariances = found.covariances
+    if covariances is not None and options.known_axis == "y":  # solved as z, x
+        swapped = [0, 1, 2, 3, 4, 5, 7, 6, 8][: covariances.shape[1]]
+        covariances = covariances[:, swapped][:, :, swapped]
+    return found._replace(poses=options.in_model_axes(found.poses), covariances=covariances)
 
 
 def _solve_facing(
@@ -368,15 +374,6 @@ def _one_minimum(poses: FloatArray, statuses: IntArray, errors: Errors) -> Solut
     info = np.empty((len(poses), 4), dtype=np.int64)
     info[:] = _ONE_MINIMUM
     return Solutions(poses, costs, None, statuses, info, errors=errors)
-
-
-def _in_model_axes(found: Solutions, options: FitOptions) -> Solutions:
-    """Turn solutions for the reordered model axes into solutions for the model's own."""
-    covariances = found.covariances
-    if covariances is not None and options.known_axis == "y":  # solved as z, x
-        swapped = [0, 1, 2, 3, 4, 5, 7, 6, 8][: covariances.shape[1]]
-        covariances = covariances[:, swapped][:, :, swapped]
-    return found._replace(poses=options.in_model_axes(found.poses), covariances=covariances)
 
 
 def solve_one(problems: Problems, options: FitOptions) -> Solutions:

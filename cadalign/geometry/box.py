@@ -19,6 +19,11 @@ BOX_EDGES = tuple((i, i | 1 << k) for k in range(3) for i in range(8) if not i >
 """The 12 edges as pairs of corner numbers: four along x, four along y, four along z."""
 
 
+def extent(points: FloatArray) -> FloatArray:
+    """Least and greatest coordinates (2, 3) of points (n, 3)."""
+    return np.array([points.min(axis=0), points.max(axis=0)])
+
+
 @dataclass(frozen=True, eq=False)
 class Box:
     """An oriented box.

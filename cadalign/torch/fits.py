@@ -16,7 +16,7 @@ from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.layers import FitTask, KeypointBatch, fits_of
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import prior_of
-from cadalign.estimation.problems import in_threads
+from cadalign.estimation.problems import in_threads, whitening_by
 from cadalign.geometry.camera import Camera
 from cadalign.names import renamed
 from cadalign.shapes.model import ShapeModel
@@ -266,11 +266,8 @@ class _ShapeTask:
         """Present keypoints of a problem as the kernels take them."""
         batch = self.batch
         present = batch.present[problem]
-        information = batch.information[problem, present]
+        whitening = whitening_by(batch.information[problem, present])
         loss, bend = LOSSES[self.options.loss], float(self.options.loss_scale)
-        a = np.sqrt(information[:, 0, 0])
-        b = information[:, 0, 1] / a
-        whitening = np.stack([a, b, np.sqrt(information[:, 1, 1] - b * b)], axis=1)
         return Seen(self.rows[present], batch.rays[problem, present], whitening, loss, bend)
 
     def _minimum(self, problem: int) -> _Aligned | None:

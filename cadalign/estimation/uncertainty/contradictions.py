@@ -103,8 +103,7 @@ def _contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str,
     alike = _as_likely(best, suspects, noise)
     *names, last = [name_of(*trial.piece) for trial in alike]
     sigmas = np.sqrt(best.saved / best.misfit / best.equations)
-    hints = (_wrong_unit(evidence, trial) or _wrong_axis(evidence, trial) for trial in alike)
-    hint = next(filter(None, hints), "")
+    hint = next(filter(None, (_hint(evidence, trial) for trial in alike)), "")
     named = f"{', '.join(names)} or {last}" if names else last
     return (f"{named} contradicts the other evidence, by {sigmas:.2g} sigma{hint}",)
 
@@ -203,16 +202,11 @@ def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
 # Hints -------------------------------------------------------------------------------------------
 
 
-def _wrong_unit(evidence: Evidence, trial: _Trial) -> str:
-    """A hint at measurements that are hundreds of times too large or small; else nothing."""
+def _hint(evidence: Evidence, trial: _Trial) -> str:
+    """A hint at another unit of measurements, or at a direction of another axis; else nothing."""
     factor = measured_factor(evidence, trial.state, trial.piece)
-    if factor is None or _is_plausible(factor):
-        return ""
-    return f": {name_of(*trial.piece)} is {factor:.3g} times what is expected, {_UNIT}"
-
-
-def _wrong_axis(evidence: Evidence, trial: _Trial) -> str:
-    """A hint at a direction that another axis of the model has; else nothing."""
+    if factor is not None and not _is_plausible(factor):
+        return f": {name_of(*trial.piece)} is {factor:.3g} times what is expected, {_UNIT}"
     if trial.piece.kind != "gravity":
         return ""
     directions, rig = evidence.directions, evidence.rig

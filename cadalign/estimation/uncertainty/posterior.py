@@ -292,7 +292,9 @@ def _sample(
         pixels, deviations, log_scales, log_focals = chart.evaluate(steps)
         costs = likelihood.squares(pixels - observed) @ loss_weights / widening
         costs += likelihood.penalties(log_scales, log_focals)
-        log_weights = -costs / 2 + _log_haar_density(steps[:, :3])
+        angles = np.linalg.norm(steps[:, :3], axis=1)
+        haar = np.log(np.sinc(angles / (2 * np.pi)) ** 2)  # uniform rotations, over their vectors
+        log_weights = -costs / 2 + np.where(angles < np.pi, haar, -np.inf)
         log_weights += (_FREEDOM + len(free)) / 2 * np.log1p((draws**2).sum(axis=1) / _FREEDOM)
         outside = (np.abs(steps[:, 5:]) > _MOST_LOG_RATIO).any(axis=1)
         log_weights[outside | ~np.isfinite(log_weights)] = -np.inf
@@ -365,11 +367,3 @@ def _widened(
     known = variance.diagonal()
     shrunk = np.where(known * prior > 0.5, np.sqrt(known / covariance.diagonal()), 1.0)
     return np.asarray(covariance * shrunk * shrunk[:, None])
-
-
-def _log_haar_density(vectors: FloatArray) -> FloatArray:
-    """Log density (k,) of the uniform distribution of rotations, over their vectors (k, 3)."""
-    angles = np.linalg.norm(vectors, axis=1)
-    with np.errstate(divide="ignore"):
-        density = np.sinc(angles / (2 * np.pi)) ** 2
-        return np.where(angles < np.pi, np.log(density), -np.inf)

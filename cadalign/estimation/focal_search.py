@@ -156,8 +156,11 @@ def _minima(task: _Task) -> tuple[tuple[FloatArray, FloatArray, FloatArray], int
     minima = _below(coarse, reference, starts, _STEPS)
     if coarse is not local:
         iterations += int(minima.counts[1])
-        likely = minima.states[: _count_likely(minima, len(coarse.points))]
-        minima = _below(local, reference, likely, _STEPS_OF_ALL_POINTS)
+        costs = minima.costs[: min(int(minima.counts[0]), _MOST_LIKELY)]
+        # A wrong sigma should not make every other minimum look unlikely.
+        variance = max(1.0, minima.costs[0] / (2.0 * len(coarse.points) - UNKNOWNS - 1))
+        likely = int((costs - minima.costs[0] < _UNLIKELY * variance).sum())
+        minima = _below(local, reference, minima.states[:likely], _STEPS_OF_ALL_POINTS)
     states = minima.states[: minima.counts[0]]
     poses = states[:, :POSE_SIZE].copy()
     for pose in poses:
@@ -165,14 +168,6 @@ def _minima(task: _Task) -> tuple[tuple[FloatArray, FloatArray, FloatArray], int
         uncenter(pose, center, unit)
     focals, costs = reference * np.exp(states[:, POSE_SIZE]), minima.costs[: len(states)]
     return (poses, focals, costs), iterations + int(minima.counts[1]), hypotheses
-
-
-def _count_likely(minima: Minima, count: int) -> int:
-    """The number of minima for some of the points, ``count``, that all points may still prefer."""
-    costs = minima.costs[: min(int(minima.counts[0]), _MOST_LIKELY)]
-    # A wrong sigma should not make every other minimum look unlikely.
-    variance = max(1.0, minima.costs[0] / (2.0 * count - UNKNOWNS - 1))
-    return int((costs - minima.costs[0] < _UNLIKELY * variance).sum())
 
 
 def _below(task: _Task, reference: float, starts: FloatArray, steps: int) -> Minima:

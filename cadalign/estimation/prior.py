@@ -220,10 +220,6 @@ class Lenses:
         columns = np.ascontiguousarray(np.array(ranges).reshape(-1, 4).T)
         return Focals(np.array(self.groups, dtype=np.int64), *columns)
 
-    def at(self, log_focals: FloatArray) -> Lenses:
-        """The lenses, their references moved to exp(log_focals) (F,) times their focals."""
-        return Lenses(tuple(self.cameras_at(log_focals)), self.groups, self.prior)
-
     def cameras_at(self, log_focals: FloatArray) -> list[Camera]:
         """The cameras of all views at focal lengths (F,), logarithms relative to the references."""
         return [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
@@ -216,7 +217,8 @@ def _relinearised(problem: JointProblem, minimum: Minimum) -> Minimum:
         log_focals = minimum.state.log_focals
         if np.abs(log_focals).max(initial=0.0) < _SETTLED:
             break
-        lenses = minimum.lenses.at(log_focals)
+        cameras = tuple(minimum.lenses.cameras_at(log_focals))
+        lenses = replace(minimum.lenses, cameras=cameras)
         there = problem.evidence(minimum.evidence.shape, lenses)
         evidence = with_sightings(there, minimum.inliers)
         state = minimum.state._replace(log_focals=np.zeros_like(log_focals))

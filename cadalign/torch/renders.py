@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -127,20 +128,8 @@ def render_views(
                 np.asarray(model.mesh.bounds),
             )
         )
-    images, points_2d, visible, points_3d, rotation, translation, bounds = (
-        np.array(each) for each in zip(*rows, strict=True)
-    )
-    return RenderedViews(
-        images,
-        points_2d,
-        visible,
-        points_3d,
-        rotation,
-        translation,
-        bounds,
-        camera,
-        tuple(ids),
-    )
+    columns: list[Any] = [np.array(each) for each in zip(*rows, strict=True)]
+    return RenderedViews(*[*columns, camera, tuple(ids)])
 
 
 def _points(model: SampleModel, ids: Sequence[int]) -> FloatArray:

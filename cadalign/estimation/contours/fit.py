@@ -119,7 +119,12 @@ def fit_masks(
     first = minima[0]
     where = f"views[{contours[0].image}].mask"
     surfaces, convex = surfaces_of(model, first.points[:keypoints], where)
-    is_open = not _is_determined(first)
+    # Where the evidence without masks leaves unknowns open, any minimum may be the one.
+    _, information = information_of(*reduced(first.evidence, first.state))
+    sizes, is_open = information.diagonal(), True
+    if np.isfinite(sizes).all() and (sizes > 0).all():
+        least = np.linalg.eigvalsh(scaled(information)[0])[0]
+        is_open = not least > _LEAST_INFORMATION
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
@@ -172,14 +177,6 @@ def fit_masks(
     ]
     found = [each.minimum for each in best] if used else list(minima)
     return Refined(found, summaries, warnings, tuple(residuals))
-
-
-def _is_determined(minimum: Minimum) -> bool:
-    """True if the evidence without masks determines all unknowns."""
-    _, information = information_of(*reduced(minimum.evidence, minimum.state))
-    if not np.isfinite(information.diagonal()).all() or not (information.diagonal() > 0).all():
-        return False
-    return bool(np.linalg.eigvalsh(scaled(information)[0])[0] > _LEAST_INFORMATION)
 
 
 def _displaced(start: Minimum) -> list[tuple[Minimum, State]]:

@@ -28,6 +28,7 @@ from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
+from cadalign.geometry.rotations import angle_between
 
 _DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
 _CELLS = 80  # of a silhouette's or a mask's image
@@ -390,7 +391,6 @@ def _overlap(atlas: Atlas, view: _Facing, pose: Alignment, *, is_cut: bool) -> f
 
 def differ(one: Alignment, other: Alignment) -> bool:
     """True if rotations or scales are too far apart for one start to lead to both."""
-    cosine = (np.trace(one.rotation.T @ other.rotation) - 1) / 2
-    turn = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    turn = angle_between(one.rotation, other.rotation)
     stretch = np.abs(np.log(one.scale / other.scale)).max()
     return bool(turn > _DISTINCT_DEG or stretch > _DISTINCT_STRETCH)

@@ -70,11 +70,6 @@ class Motion:
         fix = 'give "smooth", or a cadalign.Motion with the strength of its accelerations'
         raise InputError(f"{quote(given)} is no motion", where="motion", fix=fix)
 
-    @classmethod
-    def of_strength(cls, strength: FloatArray) -> Motion:
-        """The motion of a solver's strengths (2,)."""
-        return cls(float(np.degrees(strength[0])), float(strength[1]))
-
     def strength(self, unknown: FloatArray) -> FloatArray:
         """Strengths (2,) in the solver's units; those that are not given are ``unknown``."""
         angular = None if self.angular_sigma is None else np.radians(self.angular_sigma)

@@ -288,6 +288,7 @@ def _result(
     result = result_of_minima(model, problem, [minimum], stats)
     wide, state = widened(evidence, path.state, problem.prior.inflation)
     covariance = moving_covariance(wide, found.motion, path._replace(state=state))
+    turning, moving = found.motion.strength.tolist()
     trajectory = Trajectory(
         frames.times,
         path.state.poses,
@@ -295,7 +296,7 @@ def _result(
         widening * covariance.frames,
         widening * covariance.links,
         np.exp(path.state.log_scales),
-        Motion.of_strength(found.motion.strength),
+        Motion(float(np.degrees(turning)), moving),
         found.correlation,
     )
     return replace(result, trajectory=trajectory)

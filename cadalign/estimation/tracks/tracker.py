@@ -213,7 +213,10 @@ class Tracker:
         _, window = window.refined(_ITERATIONS)
         if self._fits(window).mean() < _LEAST_SHARE:
             return nothing
-        self._seen_motion = SeenMotion.of_first(found.motion)
+        per_frame, seconds = found.motion.told, found.motion.seconds
+        count = 1.0 / per_frame if per_frame > 0 else len(seconds) + 1.0
+        # The first frames suggest its strength as one residual would.
+        self._seen_motion = SeenMotion(found.motion.strength**2, np.ones(2), count)
         window = self._shortened(window)
         self._window, self._is_lost, self._contradicting = window, False, 0
         return self._told(view, self._agreement(window), True)

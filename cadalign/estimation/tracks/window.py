@@ -111,12 +111,6 @@ class SeenMotion(NamedTuple):
     told: FloatArray
     frames: float
 
-    @classmethod
-    def of_first(cls, prior: MotionPrior) -> SeenMotion:
-        """A motion whose strength the first frames of a track suggest, as one residual would."""
-        frames = 1.0 / prior.told if prior.told > 0 else len(prior.seconds) + 1.0
-        return cls(prior.strength**2, np.ones(2), frames)
-
     def after(self, window: Window) -> SeenMotion:
         """The motion with what the first frame of a window adds, which leaves it."""
         squares, told = window.first_change()

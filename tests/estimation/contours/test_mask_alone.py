@@ -144,8 +144,8 @@ class TestSilhouettes:
         truth = posed(1, (1.0, 1.4, 0.7))
         mask = mask_of(body(), truth)
         found = resembling_poses(body(), mask, CAMERA, free=FREE, count=16)
-        overlaps = [each.iou for each in found]
+        overlaps = [iou for iou, _ in found]
         assert overlaps == sorted(overlaps, reverse=True)
-        assert len({each.alignment.rotation.tobytes() for each in found}) == len(found)
-        nearest = min(rotation_error(est=each.alignment, gt=truth) for each in found)
+        assert len({pose.rotation.tobytes() for _, pose in found}) == len(found)
+        nearest = min(rotation_error(est=pose, gt=truth) for _, pose in found)
         assert nearest < 25.0

@@ -32,6 +32,7 @@ from cadalign.estimation.result import Result
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.tables import Columns
 from cadalign.evaluation.summary import median
+from cadalign.geometry.box import extent
 from cadalign.io.documents import in_file
 from cadalign.io.files import dense_json
 from cadalign.io.observation import Observation
@@ -70,8 +71,7 @@ class RetrieveRunOptions(ManyOptions):
 
     def warm_up(self, seen: Observation) -> Result:
         points, ids = seen.points_3d, np.arange(len(seen.points_3d))
-        bounds = np.array([points.min(axis=0), points.max(axis=0)])
-        library = Library.from_models([LibraryModel("", "", points, ids, bounds)])
+        library = Library.from_models([LibraryModel("", "", points, ids, extent(points))])
         return library.retrieve(seen.points_2d, ids, seen.camera, workers=1)[0].result
 
     def read(self, data: Any, where: str, *, folder: Path) -> Observation:

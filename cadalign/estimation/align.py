@@ -23,12 +23,7 @@ from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import (
-    JointProblem,
-    find_minima,
-    minima_at_start,
-    widened_by_noise,
-)
+from cadalign.estimation.search import JointProblem, find_minima, minima_at_start, widened_by_noise
 from cadalign.estimation.single import (
     align_plain,
     align_single,

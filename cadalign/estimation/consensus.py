@@ -33,12 +33,7 @@ from cadalign.estimation.options import (
     RansacOptions,
     pixel_information,
 )
-from cadalign.estimation.problems import (
-    Problems,
-    are_in_one_plane,
-    rays_of,
-    whitening_of,
-)
+from cadalign.estimation.problems import Problems, are_in_one_plane, rays_of, whitening_of
 from cadalign.estimation.solve import solve_one
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -43,7 +43,7 @@ def robust_starts(
 
     ``scores`` (n_v,) are those of every view's keypoints.
     """
-    starts = starts_of(with_loss(evidence, CAUCHY), init)
+    starts = starts_of(under_cauchy(evidence), init)
     if evidence.rig.pose.max() > 0:
         return starts
     samples = np.array(
@@ -74,7 +74,7 @@ def robust_minima(
     Thresholds are widened by what each point's own displacement ``projects`` to: the residual of a
     point that is left out has all of it.
     """
-    minima, iterations = search_joint(with_loss(evidence, CAUCHY), *starts)
+    minima, iterations = search_joint(under_cauchy(evidence), *starts)
     found = []
     for state in minima.states[:_KEPT]:
         limits = np.hypot(threshold, _WIDENING * _projected(evidence, state) * projects)
@@ -138,10 +138,10 @@ def _projected(evidence: Evidence, state: State) -> FloatArray:
     return np.asarray(root * scale * shape.spread[sightings.point] / np.maximum(depths, _NEAREST))
 
 
-def with_loss(evidence: Evidence, loss: int) -> Evidence:
-    """The same evidence under another loss."""
+def under_cauchy(evidence: Evidence) -> Evidence:
+    """The same evidence under Cauchy's loss."""
     old = evidence.sightings
-    return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), loss)))
+    return evidence._replace(sightings=old._replace(loss=np.full(len(old.loss), CAUCHY)))
 
 
 def with_sightings(evidence: Evidence, kept: BoolArray) -> Evidence:

@@ -24,14 +24,8 @@ from cadalign.estimation.mistakes import (
     disagreeing,
     log_expected_by_chance,
 )
-from cadalign.estimation.options import (
-    FitOptions,
-    RansacOptions,
-)
-from cadalign.estimation.problems import (
-    Problems,
-    check_sigmas,
-)
+from cadalign.estimation.options import FitOptions, RansacOptions
+from cadalign.estimation.problems import Problems, check_sigmas
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats, KeypointStatistics
 from cadalign.estimation.solve import solve_one

@@ -81,15 +81,9 @@ class AlignedScene:
 
     def to_dict(self) -> dict[str, Any]:
         """Shared unknowns and warnings in the form of JSON, without the objects' results."""
-        return {
-            "camera": self.camera.to_dict(),
-            "focal_std": self.focal_std,
-            "up": None if self.up is None else self.up.tolist(),
-            "up_std_deg": self.up_std_deg,
-            "camera_height": self.camera_height,
-            "camera_height_std": self.camera_height_std,
-            "warnings": list(self.warnings),
-        }
+        plain = {name: value for name, value in vars(self).items() if name != "results"}
+        up = None if self.up is None else self.up.tolist()
+        return plain | {"camera": self.camera.to_dict(), "up": up, "warnings": list(self.warnings)}
 
     def __str__(self) -> str:
         """Shared unknowns and warnings as text; ``results`` have a text of each object."""

@@ -23,11 +23,7 @@ from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
 from cadalign.io.meshes.load import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.warp import LinearWarp, linear_warp
-from cadalign.solvers.joint.evidence import (
-    Shape,
-    State,
-    points_of,
-)
+from cadalign.solvers.joint.evidence import Shape, State, points_of
 
 _QHULL = "QJ Pp"  # joggled, for a flat mesh has a hull, too
 _MOST_MESHES = 3  # training models that are tried, the nearest ones

@@ -17,7 +17,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.joint import result_of_minima
-from cadalign.estimation.joint_robust import whitened_lengths, with_loss, with_sightings
+from cadalign.estimation.joint_robust import under_cauchy, whitened_lengths, with_sightings
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import Lenses, prior_of, widened
@@ -39,7 +39,6 @@ from cadalign.estimation.uncertainty.posterior import widening_of
 from cadalign.estimation.view import View
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.motion import MotionPrior
 from cadalign.solvers.joint.tracks import Path, moving_covariance, refine_moving
@@ -162,9 +161,7 @@ def _first_path(
     lenses = tuple(cameras.get(each, each) for each in problem.lenses.cameras)
     known = Lenses(lenses, (-1,) * len(lenses))
     still = problem.evidence(first.evidence.shape, known)
-    candidates = candidates_of(
-        with_loss(still, CAUCHY), first.points * np.exp(first.state.log_scales)
-    )
+    candidates = candidates_of(under_cauchy(still), first.points * np.exp(first.state.log_scales))
     seen = evidence.rig.pose[evidence.sightings.image]
     counts = np.bincount(seen, minlength=len(frames.times))
     rows = best_path(candidates, frames.times, counts, may_skip=may_skip)
@@ -194,7 +191,7 @@ def _smoothed(
     unknown = _first_strength(path, times, seen)
     prior = MotionPrior(seconds, motion.strength(unknown))
     inliers = np.ones(len(evidence.sightings.point), dtype=bool)
-    used = evidence if limits is None else with_loss(evidence, CAUCHY)
+    used = evidence if limits is None else under_cauchy(evidence)
     path, prior, spent = _likeliest(used, path, prior, motion)
     for _ in range(_INLIER_ROUNDS):
         if limits is None:

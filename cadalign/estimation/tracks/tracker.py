@@ -10,7 +10,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, is_whole
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation.align import align
-from cadalign.estimation.joint_robust import whitened_lengths, with_loss
+from cadalign.estimation.joint_robust import under_cauchy, whitened_lengths
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prepared_views import lie_on_a_line
@@ -24,7 +24,6 @@ from cadalign.estimation.tracks.window import SeenMotion, Window, begun_again
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import Evidence, Shape, points_of
 from cadalign.solvers.joint.search import reduce_modes, reduced_state
 from cadalign.solvers.joint.tracks import Path
@@ -249,7 +248,7 @@ class Tracker:
         problem = self._problem(views, range(len(views)))
         evidence = problem.evidence(shape, problem.lenses)
         evidence = weakened(evidence, self._errors.correlation)
-        return evidence if self._ransac is None else with_loss(evidence, CAUCHY)
+        return evidence if self._ransac is None else under_cauchy(evidence)
 
     def _grown(self, window: Window, view: View) -> Window:
         """The window with a further frame, at which its velocity would lead."""
@@ -275,7 +274,7 @@ class Tracker:
         problem = self._problem([view], [0])
         evidence = problem.evidence(self._prior.components[0], problem.lenses)
         shape = points_of(self._window.evidence.shape, self._window.path.state)
-        found = candidates_of(with_loss(evidence, CAUCHY), shape)
+        found = candidates_of(under_cauchy(evidence), shape)
         return found.poses[np.argsort(found.costs)][:2]
 
     def _agreement(self, window: Window) -> BoolArray:

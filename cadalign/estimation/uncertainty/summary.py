@@ -282,12 +282,10 @@ class Misfit:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, for JSON."""
-        return {
-            "chi_square": self.chi_square,
-            "redundancy": self.redundancy,
-            "free_scale": None if self.free_scale is None else list(self.free_scale),
+        return vars(self) | {
+            "free_scale": self.free_scale and list(self.free_scale),
             "outliers": [{"row": row, "distance_px": px} for row, px in self.outliers.items()],
-            "camera": None if self.camera is None else self.camera.to_dict(),
+            "camera": self.camera and self.camera.to_dict(),
         }
 
     def __str__(self) -> str:

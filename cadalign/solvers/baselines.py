@@ -33,17 +33,13 @@ def aepnp_paper(
 
     Parameters
     ----------
-    points_3d : (n, 3) float
-        Model points, at least 6 and not in one plane.
-    rays : (n, 2) float
-        Normalised image coordinates.
+    points_3d, rays
+        As for `cadalign.solvers.aepnp`; no directions.
 
     Returns
     -------
-    rotation : (3, 3) float
-    translation : (3,) float
-    scale : (3,) float
-        (1, s_y, s_z)
+    rotation, translation, scale
+        As of `cadalign.solvers.aepnp`.
 
     Raises
     ------

@@ -39,6 +39,7 @@ _NOISE_PX = 1.0
 _STRETCH = 2.0
 _LEAST_KEYPOINTS = 4
 _RIGHT_DEG, _RIGHT_STRETCH = 10.0, 0.15
+_FAR_OFF = 0.1  # of the logarithms of stretch and distance
 _ERRORS = ("R", "stretch", "IoU")
 _FILLS = ((0.75, 0.95), (0.5, 0.75), (0.25, 0.5), (0.12, 0.25))  # of the image, by the object
 _FREE = [0, 1, 2, 3, 4, 5, 7, 8]  # of a covariance, where x is known
@@ -293,12 +294,17 @@ def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed:
         square = error @ np.linalg.solve(result.covariance[np.ix_(_FREE, _FREE)], error)
         lengths = np.linalg.norm([truth.translation, est.translation], axis=1)
         errors = np.abs([*error[6:], np.log(lengths[1] / lengths[0])])
-        found.append((errors[:2].max(), errors[2], square, wall))
-    stretch, distance, squares, walls = np.transpose(found)
+        bound = contour_bound(case.model, case.view(case.mask), truth)
+        drawn = rng.multivariate_normal(np.zeros(9), bound, size=LIMIT_DRAWS, method="eigh")
+        along = np.log(np.linalg.norm(truth.translation + drawn[:, 3:6], axis=1) / lengths[0])
+        ideal = np.maximum(np.abs(drawn[:, 7:]).max(axis=1), np.abs(along)) > _FAR_OFF
+        found.append((errors[:2].max(), errors[2], square, wall, ideal.mean()))
+    stretch, distance, squares, walls, ideals = np.transpose(found)
     return {
         "image filled": f"{fill[0]:g} to {fill[1]:g}",
         "count": len(found),
-        "beyond 10 %": int((np.maximum(stretch, distance) > 0.1).sum()),
+        "beyond 10 %": int((np.maximum(stretch, distance) > _FAR_OFF).sum()),
+        "of the bound": float(ideals.sum()),
         "beyond the 99.9 % region, %": percent(squares > chi2.ppf(0.999, len(_FREE))),
         "95 % regions hold": float((squares < chi2.ppf(0.95, len(_FREE))).mean()),
         "stretch, %": 100 * float(np.median(stretch)),

@@ -39,7 +39,9 @@ _LEAST_INFORMATION = 1e-9  # about the worst known direction of the unknowns, re
 _UNLIKELY = 60.0  # excess score of a minimum without masks that is still tried with them
 _AGREEING = 2.0  # [px], of the misfit of an exact model, above which other starts are tried
 _DISPLACED = (-2.0, -1.0, 1.0, 2.0)  # standard deviations
-_WELL_KNOWN = 0.05  # standard deviation of a logarithm of a scale
+# Standard deviations of a logarithm of a scale: below the first the rims are found from the
+# estimate without masks, above the second its misfit says little about whether they were.
+_WELL_KNOWN, _POORLY_KNOWN = 0.05, 0.25
 _LEAST_SUPPORT = 0.5  # share of the contour that must agree
 _LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
 _RELATIVE_TOLERANCE = 0.02
@@ -133,9 +135,13 @@ def fit_masks(
     best: list[_Candidate] = []
     while used:
         best = explore(used, surfaces)
-        if not convex and not is_open and (not best or _misfit(best[0].settled) > _AGREEING):
-            displaced = _explored(_displaced(first), keypoints, used, surfaces, is_wide=False)
-            best = sorted([*best, *displaced[:1]], key=lambda each: _misfit(each.settled))
+        if not convex and not is_open:
+            least = _WELL_KNOWN
+            if best and _misfit(best[0].settled) <= _AGREEING:
+                least = _POORLY_KNOWN if best[0].masked.surface.is_exact else np.inf
+            others = _displaced(first, least)
+            displaced = _explored(others, keypoints, used, surfaces, is_wide=False)
+            best = sorted([*best, *displaced], key=lambda each: _misfit(each.settled))
         hulls = [_hull_contour(each, views[each.image]) for each in used] if convex else []
         known = [each for each in hulls if each is not None]
         if known and len(known) == len(used):
@@ -179,15 +185,15 @@ def fit_masks(
     return Refined(found, summaries, warnings, tuple(residuals))
 
 
-def _displaced(start: Minimum) -> list[tuple[Minimum, State]]:
+def _displaced(start: Minimum, least: float) -> list[tuple[Minimum, State]]:
     """States of an estimate without masks along the direction of which it knows least.
 
-    Empty where all stretches are known well enough for rims to be found from there.
+    Empty where the logarithms of all stretches have a standard deviation below ``least`` there.
     """
     _, information = information_of(start.evidence, start.state)
     (step,) = weakest_steps(information, 1)
     place = Place.of(start.state)
-    if np.abs(place.moved(step).state.log_scales - start.state.log_scales).max() < _WELL_KNOWN:
+    if np.abs(place.moved(step).state.log_scales - start.state.log_scales).max() < least:
         return []
     return [(start, place.moved(sigmas * step).state) for sigmas in _DISPLACED]
 

@@ -41,15 +41,19 @@ def squared_distance(result: Result, truth: Alignment) -> float:
     return float(error @ np.linalg.solve(result.covariance[np.ix_(UNKNOWN, UNKNOWN)], error))
 
 
-def seen_from_anywhere(model: object, seed: int) -> tuple[Model, View, Alignment]:
-    """A stretched model from any direction, its keypoints with 1 px of noise, its exact mask."""
+def seen_from_anywhere(
+    model: object, seed: int, fill: tuple[float, float] = (0.7, 0.95)
+) -> tuple[Model, View, Alignment]:
+    """A stretched model from any direction, its keypoints with 1 px of noise, its exact mask.
+
+    It fills a share of the image between those of ``fill``.
+    """
     rng = np.random.default_rng(seed)
     scene = Scene(model.load_mesh())  # type: ignore[attr-defined]
     points = model.keypoints.xyz  # type: ignore[attr-defined]
     scale = np.array([1.0, *np.exp(rng.uniform(-0.6, 0.6, 2))])
-    shown = sample_view(
-        scene, points, WIDE, rng=rng, min_visible=5, scale=scale, roll=180.0, elevation=(-89, 89)
-    )
+    anywhere = {"fill": fill, "roll": 180.0, "elevation": (-89, 89)}
+    shown = sample_view(scene, points, WIDE, rng=rng, min_visible=5, scale=scale, **anywhere)
     ids, truth = np.flatnonzero(shown.visible).tolist(), shown.cam_from_model
     pixels = WIDE.project(truth.apply(points[ids])) + rng.normal(0, 1, (len(ids), 2))
     view = View(WIDE, pixels, ids=ids, mask=cast_geometry(scene, WIDE, truth).mask)
@@ -78,6 +82,16 @@ def test_keypoints_that_leave_the_distance_open_are_no_bad_start(
     assert found.mask_residuals[0] is not None
     assert found.mask_residuals[0].is_used
     assert squared_distance(found, truth) < chi2.ppf(0.99, 8)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [5, 38])
+def test_far_objects_of_open_stretch_end_within_the_stated_uncertainty(
+    real_data: Path, seed: int
+) -> None:
+    model = next(m for m in KeypointNet(real_data / "keypointnet")["bottle"] if m.mesh_path)
+    given, view, truth = seen_from_anywhere(model, seed, fill=(0.12, 0.25))
+    assert squared_distance(align(given, view), truth) < chi2.ppf(0.999, 8)
 
 
 @pytest.mark.long

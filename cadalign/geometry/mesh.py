@@ -184,9 +184,7 @@ def join(pieces: Sequence[Mesh], source: str) -> Mesh:
     return Mesh(
         vertices=np.concatenate([piece.vertices for piece in pieces]),
         faces=np.concatenate(faces),
-        vertex_colors=np.concatenate([_piece_colors(piece) for piece in pieces])
-        if colored
-        else None,
+        vertex_colors=np.concatenate([*map(_piece_colors, pieces)]) if colored else None,
         corner_uv=np.concatenate(uv) if textured else None,
         materials=tuple(material for piece in pieces for material in piece.materials),
         face_material=np.concatenate(materials),

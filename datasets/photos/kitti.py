@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,9 +26,10 @@ from cadalign.datasets.photos.kitti_keypoints import (
     car_box,
     list_cars,
     list_tracks,
-    write_cars,
+    yaw_of_car,
 )
 from cadalign.datasets.photos.photo import Photo, PhotoObject, Truth, existing
+from cadalign.datasets.photos.placed import PlacedObject, list_writer
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -41,6 +43,9 @@ _LAYOUTS = (_OBJECT, _TRACKING)
 # location 3, rotation_y; a detector's score may follow.
 _NUMBERS = 14
 _NO_FRAME = -1
+# The car's frame from a model whose y is up: left is -x, rear z, up y.
+_CAR_FROM_Y_UP = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+_MOST_TILT = 10.0  # of a written model's up from the camera's [degrees]
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,10 +247,42 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
     raise damaged("there is no line P2", path)
 
 
+def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
+    """Entry of `cars.json` with a box that stands upright before a level camera.
+
+    A model whose y is up is taken to face -z, as ShapeNet's do; one whose z is up to face -y.
+    """
+    placed.require_plain_camera("KITTI")
+    pose = placed.pose
+    is_z_up = (pose.rotation[:, 2] @ UP) > (pose.rotation[:, 1] @ UP)
+    car_from_model = np.eye(3) if is_z_up else _CAR_FROM_Y_UP
+    cam_from_car: FloatArray = pose.rotation @ car_from_model.T
+    tilt = np.degrees(np.arccos(np.clip(cam_from_car[:, 2] @ UP, -1, 1)))
+    if tilt > _MOST_TILT:
+        what = f"KITTI's boxes stand upright, but this one is tilted by {tilt:.0f} degrees"
+        raise InputError(what, where=placed.photo.name, fix="choose another form, such as bop")
+    width, length, height = np.abs(car_from_model @ placed.sides).tolist()
+    image = placed.copy_image(folder / "images" / f"{number:06d}")
+    keypoints = [
+        {"name": name, "xyz": xyz.tolist(), "uv": placed.marked[name].tolist()}
+        for name, xyz in zip(placed.names, placed.points @ car_from_model.T, strict=True)
+        if name in placed.marked
+    ]
+    return {
+        "image": image.relative_to(folder).as_posix(),
+        "K": placed.camera.matrix.tolist(),
+        "bbox": placed.bbox.tolist(),
+        "dims_hwl": [height, width, length],
+        "location_bottom_centre": (placed.center + [0.0, height / 2, 0.0]).tolist(),
+        "rotation_y": yaw_of_car(cam_from_car),
+        "keypoints": keypoints,
+    }
+
+
 FORMAT = PhotoFormat(
     "kitti",
     f"KITTI: {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}",
     has(CARS, TRACKS, *(f"{place}{kind}" for place in ("", "training/") for kind, _ in _LAYOUTS)),
     KittiCars,
-    write_cars,
+    list_writer(CARS, _written),
 )

@@ -1,4 +1,4 @@
-"""Cars of KITTI: their boxes, files of their keypoints, read and written, and their linear shape.
+"""Cars of KITTI: their boxes, files of their keypoints, and their linear shape.
 
 The files are described in docs/formats/photo_files.md.
 """
@@ -26,7 +26,7 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.placed import LEVEL_UP, PlacedObject, list_writer
+from cadalign.datasets.photos.placed import LEVEL_UP
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -59,9 +59,6 @@ UP = read_only(np.array(LEVEL_UP))
 _MEAN_CAR = np.array([1.63, 3.88, 1.53])  # width, length and height of cars in KITTI [m]
 # The car's frame from KITTI's object frame (x forward, y down, z left at rotation_y = 0).
 _OBJECT_FROM_CAR = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-# The car's frame from a model whose y is up: left is -x, rear z, up y.
-_CAR_FROM_Y_UP = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
-_MOST_TILT = 10.0  # of a written model's up from the camera's [degrees]
 _MEAN, _MODES = "meanShape_2.txt", "vectors2.txt"
 _LENGTH_SIGMAS = (0.05, 0.11, 0.08)  # of the logs of width, length, height of cars in KITTI
 _MODE_DEVIATION = 1.5  # of modes of unit norm, on a mean of about 8 units of length
@@ -296,42 +293,6 @@ def _object(
         model=CadModel("mean car", None, points, car_bounds(points.xyz)),
         bbox=np.array(pose.bbox),
     )
-
-
-def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
-    """The entry of an object, with a box that stands upright before a level camera.
-
-    A model whose y is up is taken to face -z, as ShapeNet's do; one whose z is up to face -y.
-    """
-    placed.require_plain_camera("KITTI")
-    pose = placed.pose
-    is_z_up = (pose.rotation[:, 2] @ UP) > (pose.rotation[:, 1] @ UP)
-    car_from_model = np.eye(3) if is_z_up else _CAR_FROM_Y_UP
-    cam_from_car: FloatArray = pose.rotation @ car_from_model.T
-    tilt = np.degrees(np.arccos(np.clip(cam_from_car[:, 2] @ UP, -1, 1)))
-    if tilt > _MOST_TILT:
-        what = f"KITTI's boxes stand upright, but this one is tilted by {tilt:.0f} degrees"
-        raise InputError(what, where=placed.photo.name, fix="choose another form, such as bop")
-    width, length, height = np.abs(car_from_model @ placed.sides).tolist()
-    image = placed.copy_image(folder / "images" / f"{number:06d}")
-    keypoints = [
-        {"name": name, "xyz": xyz.tolist(), "uv": placed.marked[name].tolist()}
-        for name, xyz in zip(placed.names, placed.points @ car_from_model.T, strict=True)
-        if name in placed.marked
-    ]
-    return {
-        "image": image.relative_to(folder).as_posix(),
-        "K": placed.camera.matrix.tolist(),
-        "bbox": placed.bbox.tolist(),
-        "dims_hwl": [height, width, length],
-        "location_bottom_centre": (placed.center + [0.0, height / 2, 0.0]).tolist(),
-        "rotation_y": yaw_of_car(cam_from_car),
-        "keypoints": keypoints,
-    }
-
-
-write_cars = list_writer(CARS, _written)
-"""Write objects as ``cars.json``; returns why objects were left out."""
 
 
 def car_shape(folder: Path) -> ShapeModel | None:

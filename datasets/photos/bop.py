@@ -230,10 +230,10 @@ class Bop(PhotoDataset):
     def open_poses(self, path: Path) -> PoseFile:
         """Open a CSV file of results of the BOP challenge, or one as ``scene_gt.json``."""
         if path.suffix.lower() == ".csv":
-            return _Poses(read_bop_results(path), self)
+            return _Poses(path, read_bop_results(path), self)
         if isinstance(read_json(path), list):
             raise self.other_poses(path, f"give a CSV file of results, or one as {TRUTH}")
-        return _Poses(read_scene_gt(path), self)
+        return _Poses(path, read_scene_gt(path), self)
 
     def _model(self, obj_id: int) -> tuple[CadModel | None, Symmetry]:
         """A model and its symmetries, read once while photos have the same models."""
@@ -275,19 +275,19 @@ def _common_camera(folder: Path) -> _SceneCamera | None:
 class _Poses(PoseFile):
     """BOP's poses, by the numbers of scene and image."""
 
-    def __init__(self, estimates: Estimates, dataset: Bop) -> None:
-        self.problems = estimates.problems
+    def __init__(self, path: Path, estimates: Estimates, dataset: Bop) -> None:
+        poses, self.problems = estimates
         self._own = str(int(dataset.root.name)) if dataset.root.name.isdecimal() else ""
-        scenes = {each.scene for each in estimates.poses}
+        scenes = {each.scene for each in poses}
         is_numbered = self._own or any("/" in name for name in dataset.names)
         if not is_numbered and len(scenes) > 1:
             what = f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number"
             fix = "give the data set's folder, or a file of that scene alone"
-            raise DataError(what, where=str(estimates.path), fix=fix)
+            raise DataError(what, where=str(path), fix=fix)
         # A file or a folder without a number is of the one scene there is.
         self._any_scene = not is_numbered or scenes == {""}
         self._poses: dict[tuple[str, str], list[PoseEstimate]] = defaultdict(list)
-        for each in estimates.poses:
+        for each in poses:
             self._poses["" if self._any_scene else each.scene, each.image].append(each)
 
     def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:

@@ -12,7 +12,7 @@ import io
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -67,12 +67,8 @@ class ScenePose(ForeignDocument):
 # Poses -----------------------------------------------------------------------------------------
 
 
-class Estimates(NamedTuple):
-    """The poses in a result file, and why some of its records could not be read."""
-
-    path: Path
-    poses: tuple[PoseEstimate, ...]
-    problems: tuple[DataError, ...]
+Estimates = tuple[tuple[PoseEstimate, ...], tuple[DataError, ...]]
+"""The poses in a result file, and why some of its records could not be read."""
 
 
 def object_name(number: int) -> str:
@@ -128,7 +124,7 @@ def read_bop_results(path: Path) -> Estimates:
         except (CadalignError, ValueError) as error:
             what = error.what if isinstance(error, CadalignError) else brief(error)
             problems.append(DataError(what, where=f"{path}, line {line}"))
-    return _estimates(path, poses, problems)
+    return _unless_all_bad(poses, problems)
 
 
 def read_scene_gt(path: Path) -> Estimates:
@@ -159,13 +155,13 @@ def read_scene_gt(path: Path) -> Estimates:
                 poses.append(PoseEstimate(scene, str(int(image)), *own))
         except DataError as error:
             problems.append(error)
-    return _estimates(path, poses, problems)
+    return _unless_all_bad(poses, problems)
 
 
-def _estimates(path: Path, poses: list[PoseEstimate], problems: list[DataError]) -> Estimates:
+def _unless_all_bad(poses: list[PoseEstimate], problems: list[DataError]) -> Estimates:
     if problems and not poses:
         raise problems[0]
-    return Estimates(path, tuple(poses), tuple(problems))
+    return tuple(poses), tuple(problems)
 
 
 def _pose_of_row(row: list[str]) -> PoseEstimate:

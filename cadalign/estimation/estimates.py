@@ -53,24 +53,17 @@ def pose_and_lengths(
     safe = np.where(extent > 0, extent, np.inf)
     rows[6:9, first : first + 3] = np.eye(3)
     rows[6:9, first + 3 :] = (modes / safe).T
+    # Of a measured length's residual the corners' own displacements explain a share: the weight of
+    # a length counts these, of variance ``own``, as part of its noise.
     own = (shape.spread[-2:] ** 2).sum()
-    explained = _explained_by_corners(evidence, own)
+    offsets, explained = evidence.offsets, np.zeros(3)
+    of_box = (offsets.ends == [len(shape.mean) - 2, len(shape.mean) - 1]).all(1)
+    along = np.abs(offsets.direction[of_box]).argmax(axis=1)
+    explained[along] = np.minimum(own * offsets.weight[of_box] ** 2, 1.0)
     rows[6:9] *= 1 - explained[:, None]
     covariance = np.asarray(rows @ unknowns @ rows.T)
     covariance[[6, 7, 8], [6, 7, 8]] += own * (1 - explained) / safe**2
     return covariance
-
-
-def _explained_by_corners(evidence: Evidence, own: float) -> FloatArray:
-    """Share (3,) of a measured length's residual that the corners' own displacements explain.
-
-    The weight of a length counts these, of variance ``own``, as part of its noise.
-    """
-    offsets, explained = evidence.offsets, np.zeros(3)
-    of_box = (offsets.ends == [len(evidence.shape.mean) - 2, len(evidence.shape.mean) - 1]).all(1)
-    along = np.abs(offsets.direction[of_box]).argmax(axis=1)
-    explained[along] = np.minimum(own * offsets.weight[of_box] ** 2, 1.0)
-    return explained
 
 
 def poses_of(evidence: Evidence, state: State) -> list[Alignment]:

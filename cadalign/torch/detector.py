@@ -55,7 +55,8 @@ class KeypointDetector:
         def residual(*layers: Any, inputs: int, outputs: int) -> Any:
             """Layers at half the resolution beside a skip, joined by a convolution."""
             inner = nn.Sequential(*layers, nn.Upsample(scale_factor=2, mode="bilinear"))
-            return nn.Sequential(_joined(inner), block(inputs, outputs, 1))
+            inner.register_forward_hook(lambda _, given, made: torch.cat([given[0], made], dim=1))
+            return nn.Sequential(inner, block(inputs, outputs, 1))
 
         w = width
         lowest = block(4 * w, 4 * w, 2), block(4 * w, 4 * w, 1)
@@ -104,23 +105,6 @@ class KeypointDetector:
         from copy import deepcopy
 
         return KeypointDetector(deepcopy(self.network), self.calibration)
-
-
-def _joined(inner: Any) -> Any:
-    """A module that puts what ``inner`` makes of its input beside the input."""
-
-    class SkipConnection(torch.nn.Module):
-        """Channels of an input and of what a module makes of it."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = inner
-
-        def forward(self, given: Tensor) -> Tensor:
-            """Both, side by side."""
-            return torch.cat([given, self.inner(given)], dim=1)
-
-    return SkipConnection()
 
 
 def heatmap_loss(logits: Tensor, points_2d: Tensor) -> Tensor:

@@ -14,8 +14,7 @@ Student distributions about the fit in the unknowns of `cadalign.Result.covarian
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from cadalign.errors import InputError
@@ -101,46 +100,29 @@ def posterior_loss(
     weights = present.to(points_2d) * valid[:, None].to(points_2d)
     calibration = calibrations(camera, len(points)).to(points_2d)
     pixels = torch.where(weights[..., None] > 0, points_2d, torch.zeros_like(points_2d))
-    scene = _SampledKeypoints(points, pixels, sigmas, weights, calibration, loss, loss_scale)
-    with torch.no_grad():
-        steps, log_density = _samples(scene, found, found.covariance, (samples, rounds), seed)
-    costs = scene.costs(*_moved(found, steps))
-    log_integral = torch.logsumexp(-costs / 2 + _log_haar(steps) - log_density, dim=1) - math.log(
-        steps.shape[1]
-    )
-    of_truth = scene.costs(
-        truth.rotation[:, None], truth.translation[:, None], truth.scale[:, None]
-    )[:, 0]
-    value = of_truth / 2 + log_integral
-    return torch.where(valid & torch.isfinite(value), value, torch.zeros_like(value))
 
-
-@dataclass(frozen=True, eq=False)
-class _SampledKeypoints:
-    """Keypoints of a batch, and the cost of k poses of each problem."""
-
-    points: Tensor  # (B, n, 3)
-    pixels: Tensor  # (B, n, 2)
-    sigma: Tensor  # (B, n)
-    weights: Tensor  # (B, n), 0 for what is absent
-    calibration: Tensor  # (B or 1, 4)
-    loss: str
-    loss_scale: float
-
-    def costs(self, rotation: Tensor, translation: Tensor, scale: Tensor) -> Tensor:
+    def costs(rotation: Tensor, translation: Tensor, scale: Tensor) -> Tensor:
         """-2 log likelihood (B, k) with the prior on the scales, normalised over the pixels."""
-        stretched = self.points[:, None] * scale[:, :, None]
+        stretched = points[:, None] * scale[:, :, None]
         in_camera = stretched @ rotation.transpose(-1, -2) + translation[:, :, None]
         least = _LEAST_DEPTH * translation.norm(dim=-1)[..., None]
         depths = torch.maximum(in_camera[..., 2], least)[..., None]
-        calibration = self.calibration[:, None, None]
-        pixels = in_camera[..., :2] / depths * calibration[..., :2] + calibration[..., 2:]
-        sigma = self.sigma[:, None]
-        squares = ((pixels - self.pixels[:, None]) ** 2).sum(dim=-1) / sigma**2
-        bent = _bent(squares, self.loss, self.loss_scale)
-        whole = self.weights[:, None] * (bent + 4 * torch.log(sigma))
+        focals, center = calibration[:, None, None].split(2, dim=-1)
+        projected = in_camera[..., :2] / depths * focals + center
+        each = sigmas[:, None]
+        squares = ((projected - pixels[:, None]) ** 2).sum(dim=-1) / each**2
+        bent = _bent(squares, loss, loss_scale)
+        whole = weights[:, None] * (bent + 4 * torch.log(each))
         excess = torch.relu(torch.log(scale).abs() - BOUNDING_PRIOR.width)
         return whole.sum(dim=-1) + BOUNDING_PRIOR.weight * (excess**2).sum(dim=-1)
+
+    with torch.no_grad():
+        steps, log_density = _samples(costs, found, found.covariance, (samples, rounds), seed)
+    logs = -costs(*_moved(found, steps)) / 2 + _log_haar(steps) - log_density
+    log_integral = torch.logsumexp(logs, dim=1) - math.log(steps.shape[1])
+    true = truth.rotation[:, None], truth.translation[:, None], truth.scale[:, None]
+    value = costs(*true)[:, 0] / 2 + log_integral
+    return torch.where(valid & torch.isfinite(value), value, torch.zeros_like(value))
 
 
 def _bent(squares: Tensor, loss: str, bend: float) -> Tensor:
@@ -154,7 +136,7 @@ def _bent(squares: Tensor, loss: str, bend: float) -> Tensor:
 
 
 def _samples(
-    scene: _SampledKeypoints,
+    costs: Callable[[Tensor, Tensor, Tensor], Tensor],
     found: PoseBatch,
     covariance: Tensor,
     effort: tuple[int, int],
@@ -187,7 +169,7 @@ def _samples(
         ) - math.log(len(proposals))
         steps = spread.new_zeros(*every.shape[:2], 10)
         steps[..., places] = every
-        logs = -scene.costs(*_moved(found, steps)) / 2 + _log_haar(steps) - log_density
+        logs = -costs(*_moved(found, steps)) / 2 + _log_haar(steps) - log_density
         weights = torch.softmax(logs, dim=1)
         mean = (weights[..., None] * every).sum(dim=1)
         apart = every - mean[:, None]

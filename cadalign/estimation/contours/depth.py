@@ -139,8 +139,11 @@ def _rows(
     hit, normals = hit[steep], normals[steep]
     points = origin + depth[hit, None] * directions[hit]
     measured, sigma, count = samples.depths[hit], samples.sigma, len(hit)
-    if not is_exact:
-        sigma = _sigma_of_similar(depth[hit] / measured - 1, sigma)
+    if not is_exact and count:
+        # A surface that is only similar errs alike over large parts, of which few are independent.
+        relative = depth[hit] / measured - 1
+        own = robust_deviation(relative - np.median(relative))
+        sigma = float(np.hypot(sigma, own * np.sqrt(max(count / _INDEPENDENT_PARTS, 1.0))))
     return Measured(
         *surface.rows(points, face[hit]),
         Planes(
@@ -154,14 +157,3 @@ def _rows(
             np.full(count, _LOSS_SCALE),
         ),
     )
-
-
-def _sigma_of_similar(relative: FloatArray, sigma: float) -> float:
-    """Deviation of depths over a surface that is only similar to the object's.
-
-    Its own error, which shows in the residuals (n,), is alike over large parts of the surface, of
-    which only a few are independent.
-    """
-    own = robust_deviation(relative - np.median(relative)) if len(relative) else 0.0
-    alike = max(len(relative) / _INDEPENDENT_PARTS, 1.0)
-    return float(np.hypot(sigma, own * np.sqrt(alike)))

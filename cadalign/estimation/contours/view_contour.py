@@ -367,24 +367,20 @@ def with_contours(
     where = f"views[{masked[0]}].mask"
     (surface,), _ = surfaces_of(model, evidence.shape.mean[:keypoints], where)
     posed = surface.at(evidence.shape, state)
-    poses = poses_of(evidence, state)
-    rows = [
-        _contour_rows(contour_view(n, views[n], f"views[{n}].mask"), posed, poses[n])
-        for n in masked
-    ]
-    joined = Joined.of(evidence, keypoints, rows, Place.of(state, len(rows)))
+    poses, measured = poses_of(evidence, state), []
+    for number in masked:
+        seen = contour_view(number, views[number], f"views[{number}].mask")
+        sight = Sight(posed.caster, seen.camera, poses[number])
+        rims = find_rims(sight, seen.contour, _BOUND_REACH)
+        bias = extraction_bias(sight, seen.mask, seen.contour, rims)
+        rims = without_steep(seen.contour, rims, bias)
+        offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
+        centred = np.where(rims.found, rims.offset - offset, np.nan)
+        known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
+        noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
+        agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
+        rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)
+        table = rows.table._replace(loss=np.full_like(rows.table.loss, LINEAR))
+        measured.append(rows._replace(table=table))
+    joined = Joined.of(evidence, keypoints, measured, Place.of(state, len(measured)))
     return joined.evidence, joined.state
-
-
-def _contour_rows(seen: ViewContour, posed: PosedSurface, gt: Alignment) -> Measured:
-    sight = Sight(posed.caster, seen.camera, gt)
-    rims = find_rims(sight, seen.contour, _BOUND_REACH)
-    bias = extraction_bias(sight, seen.mask, seen.contour, rims)
-    rims = without_steep(seen.contour, rims, bias)
-    offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
-    centred = np.where(rims.found, rims.offset - offset, np.nan)
-    known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
-    noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
-    agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
-    rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)
-    return rows._replace(table=rows.table._replace(loss=np.full_like(rows.table.loss, LINEAR)))

@@ -99,6 +99,9 @@ class RobustSearch:
 
         It carries the best score reached.
         """
+        options, share = self.options, 1.0  # of alignments by chance that are stretched as little
+        if not options.prior_weight and options.focal == "known" and options.stretched_axes:
+            share = share_as_moderate(best.alignment.scale, len(options.stretched_axes))
         check_support(
             [self._support(best.residuals, best.inliers)],
             self._sample_size,
@@ -107,7 +110,7 @@ class RobustSearch:
             where="points_2d",
             solutions=SOLUTIONS_OF_FOUR,
             chance=_CHANCE,
-            share=self._share_as_moderate(best.alignment),
+            share=share,
             disagreeing=disagreeing(np.linalg.norm(best.residuals, axis=1), best.inliers),
         )
 
@@ -134,13 +137,6 @@ class RobustSearch:
     def _support(self, residuals: FloatArray, inliers: BoolArray) -> Support:
         errors = np.linalg.norm(residuals[inliers], axis=1)
         return Support(errors, len(inliers), self.area)
-
-    def _share_as_moderate(self, alignment: Alignment) -> float:
-        """The share of alignments by chance that are stretched as little; 1 if unknown."""
-        options = self.options
-        if options.prior_weight or options.focal == "estimate" or not options.stretched_axes:
-            return 1.0
-        return share_as_moderate(alignment.scale, len(options.stretched_axes))
 
     @np.errstate(all="ignore")  # residuals that overflow are outliers'
     def explained(self, alignment: Alignment, residuals: FloatArray) -> Explained:

@@ -80,13 +80,6 @@ class Problems:
         )
         return replace(self, cameras=cameras)
 
-    def facing(self) -> Problems:
-        """The same problems, each seen by a camera that is turned to its keypoints."""
-        from cadalign.estimation.facing import faced  # wide lenses are rare
-
-        cameras = [faced(self.camera(b), self.points_2d[self.rows(b)]) for b in range(len(self))]
-        return replace(self, cameras=tuple(cameras))
-
     def part(self, first: int, last: int) -> Problems:
         """Problems ``first`` to ``last``, that one left out."""
         start, end = self.offsets[first], self.offsets[last]

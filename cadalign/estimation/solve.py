@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -105,14 +106,16 @@ def _solve_facing(
     problems: Problems, options: FitOptions, sigmas: Sequence[Sigma] | None
 ) -> Solutions:
     """Solve in frames that face the keypoints of wide lenses."""
-    from cadalign.estimation.facing import turned_covariance, turned_poses  # wide lenses are rare
+    # Only here: wide lenses are rare.
+    from cadalign.estimation.facing import faced, turned_covariance, turned_poses
 
-    facing = problems.facing()
-    found = solve(facing, options, sigmas)
+    every = range(len(problems))
+    cameras = [faced(problems.camera(b), problems.points_2d[problems.rows(b)]) for b in every]
+    found = solve(replace(problems, cameras=tuple(cameras)), options, sigmas)
     poses, covariances = found.poses.copy(), found.covariances
     covariances = None if covariances is None else covariances.copy()
-    for b in range(len(problems)):
-        turn = facing.camera(b).lens_from_camera
+    for b in every:
+        turn = cameras[b].lens_from_camera
         poses[b] = turned_poses(found.poses[b], turn)
         if covariances is not None:
             covariances[b] = turned_covariance(covariances[b], turn)

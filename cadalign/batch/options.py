@@ -105,8 +105,7 @@ class FitRunOptions(ManyOptions):
         result, _ = self.estimate.fit(seen, where)
         doubts = [doubt for view in seen.views if (doubt := _photo_doubt(view))]
         if doubts:
-            stated = Stated.of(result.statistics)
-            statistics = replace(stated, warnings=(*doubts, *stated.warnings))
+            statistics = Stated.of(result.statistics, warnings=(*doubts, *result.warnings))
             result = replace(result, statistics=statistics)
         return Estimated(seen, result, {}, {})
 

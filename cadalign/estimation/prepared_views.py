@@ -104,15 +104,15 @@ def align_without(
         "determine its pose"
         for number in left_out
     ]
-    stated = Stated.of(result.statistics)
-    statistics = replace(
-        stated,
+    basis = result.statistics.basis
+    statistics = Stated.of(
+        result.statistics,
         evidence=tuple(
             replace(each, view=None if each.view is None else used[each.view])
-            for each in stated.evidence
+            for each in result.evidence
         ),
-        warnings=(*(_renumbered(text, used) for text in stated.warnings), *warnings),
-        basis=stated.basis and replace(stated.basis, numbers=tuple(used)),
+        warnings=(*(_renumbered(text, used) for text in result.warnings), *warnings),
+        basis=basis and replace(basis, numbers=tuple(used)),
     )
     return replace(
         result,
@@ -222,13 +222,12 @@ def align_facing(
 
 
 def _turned(statistics: Statistics, turn: FloatArray) -> Stated:
-    stated = Stated.of(statistics)
-    own, fisher = stated.covariance, stated.fisher_covariance
-    seen = stated.points_cam_covariance
-    return replace(
-        stated,
+    own, fisher = statistics.covariance, statistics.fisher_covariance
+    seen, basis = statistics.points_cam_covariance, statistics.basis
+    return Stated.of(
+        statistics,
         covariance=None if own is None else turned_covariance(own, turn),
         fisher_covariance=None if fisher is None else turned_covariance(fisher, turn),
-        basis=stated.basis and replace(stated.basis, turn=turn),
+        basis=basis and replace(basis, turn=turn),
         points_cam_covariance=None if seen is None else turn @ seen @ turn.T,
     )

@@ -115,9 +115,10 @@ class Stated:
     basis: AnyBasis | None = None
 
     @classmethod
-    def of(cls, statistics: Statistics) -> Stated:
-        """All statements, computed now."""
-        return cls(**{name: getattr(statistics, name) for name in cls.__dataclass_fields__})
+    def of(cls, statistics: Statistics, **changes: Any) -> Stated:
+        """All statements, computed now, but for those that are changed."""
+        known = {name: getattr(statistics, name) for name in cls.__dataclass_fields__}
+        return cls(**known | changes)
 
 
 @dataclass(frozen=True, eq=False)

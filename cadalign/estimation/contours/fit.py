@@ -67,10 +67,9 @@ class Refined(NamedTuple):
 
     def noted_in(self, result: Result) -> Result:
         """The result with what is known of the masks or photos."""
-        stated = Stated.of(result.statistics)
-        basis = stated.basis
-        statistics = replace(
-            stated,
+        basis = result.statistics.basis
+        statistics = Stated.of(
+            result.statistics,
             evidence=(*result.evidence, *self.summaries),
             warnings=(*result.warnings, *self.warnings),
             basis=basis and replace(basis, photos=self.photos or basis.photos),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cadalign import Alignment, Camera, Mesh
 from cadalign.annotate.lines import Wireframe, box_lines
-from cadalign.annotate.model import ClickableModel, display_bytes
+from cadalign.annotate.model import ClickableModel, display_bytes, find_rim
 from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import simplify
@@ -87,6 +87,19 @@ def test_picked_faces_and_barycentrics_give_the_point_again(seed: int) -> None:
     assert np.linalg.norm(off_ray) / np.linalg.norm(target - origin) < 1e-4
     assert model.is_seen(origin, point.xyz)
     assert not model.is_seen(2 * model.center - origin, point.xyz)
+
+
+@pytest.mark.parametrize("x", [1.9, 2.1])
+def test_the_nearest_rim_is_found_from_either_side(x: float) -> None:
+    model = ClickableModel(Mesh(SQUARE, [[0, 1, 2], [0, 2, 3]]))
+    origin, direction = np.array([x, 1.0, 4.0]), np.array([0.0, 0.0, -1.0])
+    rim = find_rim(model.scene.caster, origin, direction, 0.1, model.diagonal)
+    assert rim is not None
+    face, point = rim
+    assert face in (0, 1)
+    np.testing.assert_allclose(point[[0, 2]], [2.0, 0.0], atol=1e-3)
+    assert point[1] == pytest.approx(1.0, abs=0.15)
+    assert find_rim(model.scene.caster, origin, direction, 0.01, model.diagonal) is None
 
 
 def test_rays_are_checked() -> None:

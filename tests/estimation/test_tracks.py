@@ -58,6 +58,24 @@ def test_motion_improves_every_quantile_and_is_covered_by_the_stated_regions() -
     assert 0.85 < np.mean(covered) < 1.0
 
 
+def test_components_of_a_shape_that_are_as_likely_widen_what_is_stated() -> None:
+    (small,) = CATEGORY.components
+    large = replace(small, mean=1.1 * small.mean)  # no photo distinguishes sizes
+    both = replace(CATEGORY, components=(replace(small, weight=0.6), replace(large, weight=0.4)))
+    views = track_of(3, frames=25).views
+    alone = align(CATEGORY, views, motion="smooth")
+    result = align(both, views, motion="smooth")
+    assert result.component == 0
+    assert alone.covariance is not None
+    assert result.covariance is not None
+    spread = [
+        float(np.sqrt(each.covariance[5, 5])) / each.alignment.translation[2]
+        for each in (alone, result)
+    ]
+    assert spread[0] < 0.03
+    assert 0.03 < spread[1] < 0.07  # of two distances that differ by a tenth
+
+
 def test_the_strength_of_the_motion_is_estimated() -> None:
     found = [
         align(CATEGORY, track.views, motion="smooth").trajectory.motion  # type: ignore[union-attr]

@@ -7,7 +7,7 @@ do not fit a robust estimate of the track are outliers where these are expected.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from time import perf_counter
 from typing import NamedTuple
@@ -24,6 +24,7 @@ from cadalign.estimation.prior import Lenses, prior_of, widened
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.search import Inits, JointProblem, Minimum, Track, find_minima, thresholds
+from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.tracks.frames import (
     Frames,
     SuccessiveErrors,
@@ -61,11 +62,12 @@ class EstimatedTrack(NamedTuple):
     """A smooth path of the likeliest component of the shape, and the problem with its noise.
 
     It has the strength of its motion and the sightings (N,) that it rests on; the ``correlation``
-    of errors in successive frames has been taken into account.
+    of errors in successive frames has been taken into account. ``minima`` are those of some frames,
+    the likeliest first.
     """
 
     problem: JointProblem
-    component: int
+    minima: Sequence[Minimum]
     evidence: Evidence
     inliers: BoolArray
     path: Path
@@ -111,7 +113,8 @@ def estimate_track(
     may_correlate: bool = True,
 ) -> EstimatedTrack:
     """All stages of an estimate; errors of successive frames ``may_correlate``."""
-    problem, first, iterations, hypotheses = _of_some(problem, frames, inits, ransac)
+    problem, minima, iterations, hypotheses = _of_some(problem, frames, inits, ransac)
+    first = minima[0]
     evidence = problem.evidence(first.evidence.shape, problem.lenses)
     path = _first_path(problem, evidence, first, frames, may_skip=ransac is not None)
     limits = None
@@ -122,14 +125,14 @@ def estimate_track(
     )
     spent += iterations
     return EstimatedTrack(
-        problem, first.component, used, inliers, path, prior, spent, hypotheses, correlation
+        problem, minima, used, inliers, path, prior, spent, hypotheses, correlation
     )
 
 
 def _of_some(
     problem: JointProblem, frames: Frames, inits: Inits, ransac: RansacOptions | None
-) -> tuple[JointProblem, Minimum, int, int]:
-    """The likeliest estimate from some frames, and the problem with its noise."""
+) -> tuple[JointProblem, Sequence[Minimum], int, int]:
+    """The minima of some frames, the likeliest first, and the problem with their noise."""
     numbers = frames.chosen(problem.prior, problem.views)
     views = [problem.views[number] for number in numbers]
     minima: Sequence[Minimum] = ()
@@ -149,7 +152,7 @@ def _of_some(
             fix="give at least 3 keypoints in one frame, and check which is which",
         )
     problem = problem._replace(noise=some.noise)
-    return problem, minima[0], iterations, hypotheses
+    return problem, minima, iterations, hypotheses
 
 
 def _first_path(
@@ -264,6 +267,33 @@ def _likeliest(
     return path, prior, spent + iterations
 
 
+def _of_other_components(best: Minimum, minima: Sequence[Minimum]) -> Iterator[Minimum]:
+    """Smooth paths near the best one with other components of the shape that are likely, too."""
+    assert best.track is not None
+    tried = {best.component}
+    for each in minima:
+        if each.component in tried or each.score > best.score - 2 * np.log(LEAST_LIKELIHOOD):
+            continue
+        tried.add(each.component)
+        evidence = best.evidence._replace(shape=each.evidence.shape)
+        state = best.state._replace(
+            log_scales=each.state.log_scales,
+            coefficients=each.state.coefficients,
+            displacements=each.state.displacements,
+        )
+        start, prior = Path(state, best.track.velocities), best.track.motion
+        cost, path, _ = refine_moving(evidence, prior, start, max_iterations=_ITERATIONS)
+        if cost < np.inf:
+            track = best.track._replace(velocities=path.velocities)
+            yield best._replace(
+                component=each.component,
+                evidence=evidence,
+                state=path.state,
+                score=each.score,
+                track=track,
+            )
+
+
 def _result(
     model: Model | ShapeModel, found: EstimatedTrack, frames: Frames, stats: FitStats
 ) -> Result:
@@ -279,10 +309,16 @@ def _result(
     if problem.lacks_sigma:
         widening = widening_of(max(unknowns, 1), max(redundancy, 1))
     track = Track(found.motion, path.velocities, redundancy, widening)
-    cost = float(covariance.costs[0])
-    kept, lenses = found.inliers, problem.lenses
-    minimum = Minimum(found.component, kept, evidence, path.state, cost, 0.0, lenses, track)
-    result = result_of_minima(model, problem, [minimum], stats)
+    best = found.minima[0]._replace(
+        inliers=found.inliers,
+        evidence=evidence,
+        state=path.state,
+        cost=float(covariance.costs[0]),
+        lenses=problem.lenses,
+        track=track,
+    )
+    others = _of_other_components(best, found.minima)
+    result = result_of_minima(model, problem, [best, *others], stats)
     wide, state = widened(evidence, path.state, problem.prior.inflation)
     covariance = moving_covariance(wide, found.motion, path._replace(state=state))
     turning, moving = found.motion.strength.tolist()

@@ -234,7 +234,7 @@ class Tracker:
 
     def _with_all_modes(self, found: EstimatedTrack) -> tuple[Evidence, Path]:
         """Evidence and path in modes that suffice for all keypoints."""
-        shape, ids = self._prior.components[found.component], self._prior.ids
+        shape, ids = self._prior.components[found.minima[0].component], self._prior.ids
         whole = View(self._recent[0].camera, np.zeros((len(ids), 2)), ids=ids)
         problem = self._problem([whole, whole], (0, 1))
         reduction = reduce_modes(problem.evidence(shape, problem.lenses))

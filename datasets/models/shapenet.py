@@ -153,7 +153,8 @@ class MeshLocator:
     def paths(self, synset: str, model_id: str) -> tuple[Path, ...]:
         """All mesh files of a model: of the given ShapeNetCore, KeypointNet's, of those below."""
         if synset not in self._listings:
-            files = (self._ply_folder / synset).glob("*.ply")
+            folder = self._ply_folder / synset
+            files = folder.glob("*.ply") if os.path.isdir(folder) else ()  # not of too long a name
             ply = {path.name.removesuffix(".ply"): path for path in files}
             given, below = (
                 [_list_models(shapenet, synset) for shapenet in places]

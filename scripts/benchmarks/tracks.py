@@ -28,7 +28,7 @@ def tracks(
     given: BenchmarkData,
     *,
     categories: tuple[str, ...] = ("chair", "car", "mug"),
-    objects: int = 12,
+    objects: int = 60,
     frames: int = 40,
     lengths: tuple[int, ...] = (100, 300, 1000, 3000),
 ) -> Tables:

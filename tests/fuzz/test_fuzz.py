@@ -73,6 +73,7 @@ def test_a_prior_beside_keypoints_that_determine_nothing_leaves_a_covariance() -
         ("PASCAL3D+ Annotations/chair_pascal/1.mat", 1008358),  # an angle of 1e300 degrees
         ("photo", 33876),  # EXIF with numbers that Pillow cannot write
         ("image tiff", 41229),  # a fraction in the place of a size
+        ("keypointnet", 51149),  # a class whose name is too long for a folder
     ],
 )
 def test_files_that_once_failed(name: str, seed: int, tmp_path: Path) -> None:

@@ -7,13 +7,12 @@ picture and, if asked to, the files for `cadalign fit` and `cadalign annotate`.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import tyro
-from common import Picture, write_row
+from common import write_row
 
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.model import ClickableModel
@@ -41,35 +40,41 @@ PHOTO_GROUND = (206, 208, 212)
 LINE = (35, 208, 255)
 
 
-@dataclass(kw_only=True)
-class AlignOtherChairArguments(Picture):
-    """Align one sample chair to a photo of another."""
+def main(
+    *,
+    out: Path = Path("docs/other_chair.png"),
+    photo_of: str = "006",
+    model: str = "000",
+    files: Path | None = None,
+    width: int = 1500,
+) -> None:
+    """Align one sample chair to a photo of another.
 
-    photo_of: str = "006"
-    """The sample chair in the photo."""
-    model: str = "000"
-    """The sample chair that is aligned to it."""
-    files: Path | None = None
-    """Folder for the photo, the observation and the model's keypoints."""
-    width: int = 1500
-    """Width of the picture in pixels."""
-
-
-def main(arguments: AlignOtherChairArguments) -> None:
-    """Render, align, print and draw."""
+    Parameters
+    ----------
+    out : Path
+        Where to write the picture.
+    photo_of : str
+        The sample chair in the photo.
+    model : str
+        The sample chair that is aligned to it.
+    files : Path, optional
+        Folder for the photo, the observation and the model's keypoints.
+    width : int
+        Width of the picture in pixels.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        root = arguments.files or Path(folder)
+        root = files or Path(folder)
         chairs = KeypointNet(write_sample_dataset(root / "sample"))
-        seen = chairs["chair", f"sample_chair_{arguments.photo_of}"]
-        model = chairs["chair", f"sample_chair_{arguments.model}"]
+        seen, own = (chairs["chair", f"sample_chair_{name}"] for name in (photo_of, model))
         photo = root / "photo.png"
-        observation = observe(seen, model, photo)
+        observation = observe(seen, own, photo)
         observation.save(root / "photo.json")
-        ModelKeypoints.of_model(model).save(root / f"{model.model_id}.keypoints.json")
+        ModelKeypoints.of_model(own).save(root / f"{own.model_id}.keypoints.json")
         result = fit(observation.points_3d, observation.points_2d, observation.camera, sigma=None)
         print(result)
 
-        scene = Scene(model.load_mesh())
+        scene = Scene(own.load_mesh())
         image = read_image(photo, CAMERA)
         aligned = draw_overlay(
             with_wireframe(image, ClickableModel(scene.mesh), result.alignment),
@@ -79,7 +84,7 @@ def main(arguments: AlignOtherChairArguments) -> None:
             reprojected=CAMERA.project(result.alignment.apply(observation.points_3d)),
             legend=False,
         )
-        write_row(arguments.out, [image, still(scene), aligned], width=arguments.width)
+        write_row(out, [image, still(scene), aligned], width=width)
 
 
 def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
@@ -120,4 +125,4 @@ def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment
 
 
 if __name__ == "__main__":
-    main(tyro.cli(AlignOtherChairArguments))
+    tyro.cli(main)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,16 +13,6 @@ from cadalign.io.images import write_image
 
 COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
 """What runs `cadalign`, wherever it is installed."""
-
-
-@dataclass
-class Picture:
-    """Arguments of the scripts that make a picture; make_overview.py writes docs/overview.png."""
-
-    out: Path = Path(
-        "docs", re.sub(r"^make_|^align_|_picture$", "", Path(sys.argv[0]).stem) + ".png"
-    )
-    """Where to write the picture."""
 
 
 def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
-from common import COMMAND, Picture
+from common import COMMAND
 from playwright.sync_api import Page
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -27,19 +26,19 @@ READY = """!!(annotator.state?.alignment.status === "done" && annotator.model.me
     && annotator.photo.picture)"""
 
 
-@dataclass(kw_only=True)
-class AnnotatorPictureArguments(Picture):
-    """Make the README's picture of the annotator."""
+def main(*, out: Path = Path("docs/annotator.png"), files: Path) -> None:
+    """Make the README's picture of the annotator.
 
-    files: Path
-    """Where `align_other_chair.py` has written its files."""
-
-
-def main(arguments: AnnotatorPictureArguments) -> None:
-    """Serve, open the page, and take its picture."""
-    observation = arguments.files / "photo.json"
+    Parameters
+    ----------
+    out : Path
+        Where to write the picture.
+    files : Path
+        Where `align_other_chair.py` has written its files.
+    """
+    observation = files / "photo.json"
     model = Observation.load(observation).model
-    command = [*COMMAND, "annotate", "--no-open", "--image", str(arguments.files / "photo.png")]
+    command = [*COMMAND, "annotate", "--no-open", "--image", str(files / "photo.png")]
     command += ["--model", str(model), "--observation", str(observation)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
@@ -49,8 +48,8 @@ def main(arguments: AnnotatorPictureArguments) -> None:
             page = browser.new_page(viewport={"width": 1280, "height": 960}, color_scheme="light")
             page.goto(url)
             wait(page)
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            page.screenshot(path=arguments.out)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            page.screenshot(path=out)
     finally:
         server.terminate()
         server.wait()
@@ -65,4 +64,4 @@ def wait(page: Page) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(AnnotatorPictureArguments))
+    tyro.cli(main)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
-from common import Picture, write_row
+from common import write_row
 
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.estimation.fit import fit
@@ -19,20 +18,20 @@ from cadalign.render import RaycastRenderer, draw_overlay
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
 
 
-@dataclass(kw_only=True)
-class OverviewArguments(Picture):
-    """Make the README's picture."""
+def main(*, out: Path = Path("docs/overview.png"), width: int = 1600) -> None:
+    """Make the README's picture.
 
-    width: int = 1600
-    """Width in pixels."""
-
-
-def main(arguments: OverviewArguments) -> None:
-    """Render, align and draw the models."""
+    Parameters
+    ----------
+    out : Path
+        Where to write the picture.
+    width : int
+        Width in pixels.
+    """
     with tempfile.TemporaryDirectory() as folder:
         dataset = KeypointNet(write_sample_dataset(Path(folder) / "sample"))
         pictures = [_overlay(dataset, *model) for model in MODELS]
-    write_row(arguments.out, pictures, width=arguments.width)
+    write_row(out, pictures, width=width)
 
 
 def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
@@ -54,4 +53,4 @@ def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(OverviewArguments))
+    tyro.cli(main)

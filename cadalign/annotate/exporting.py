@@ -15,10 +15,11 @@ from cadalign.annotate.models import OpenedModel
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.session import Session
 from cadalign.datasets.detections.coco import CocoObject, coco_document
+from cadalign.datasets.photos.photo import Photo
 from cadalign.errors import InputError
 from cadalign.estimation.outputs import object_of
 from cadalign.export import AlignedObject, export_object
-from cadalign.export.aligned_object import AnnotatedPhoto, write_photo_set
+from cadalign.export.aligned_object import photos_of, write_photo_set
 from cadalign.io.files import write_text
 
 _MARKED = 2  # COCO's flag of a keypoint that is labelled and visible
@@ -75,7 +76,7 @@ def glb_of(session: Session, number: int, *, slot: int | None = None) -> bytes:
         return export_object(Path(folder) / "object.glb", exported).read_bytes()
 
 
-def annotated_photos(session: Session) -> list[AnnotatedPhoto]:
+def annotated_photos(session: Session) -> list[Photo]:
     """The photos with an alignment that are not skipped, for data sets."""
     with session.lock:
         choice = session.choice
@@ -86,14 +87,11 @@ def annotated_photos(session: Session) -> list[AnnotatedPhoto]:
                 continue
             key = None if choice is None else choice.key_of(state.model.path)
             image = state.image().evidence
-            photo = AnnotatedPhoto(
-                _named(state, exported),
-                state.photo.path,
-                "object" if key is None else key[0],
-                image.mask,
-                None if image.up is None else np.asarray(image.up, dtype=float),
-            )
-            found.append(photo)
+            category = "object" if key is None else key[0]
+            (photo,) = photos_of(_named(state, exported), category=category, mask=image.mask)
+            path, up = state.photo.path, image.up
+            up = None if up is None else np.asarray(up, dtype=float)
+            found.append(replace(photo, name=path.name, image=path, up=up))
         return found
 
 

@@ -87,7 +87,9 @@ def evaluate(
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
         folder = RunFolder(Path(out))
         run(chosen, folder, workers=workers, dask=dask)
-        return _frame(folder)
+        done = Run.open(folder.path)
+        frame: pd.DataFrame = done.results.to_pandas()
+        return frame.assign(seconds=done.cells["seconds"])
 
 
 def simulate(sweep: str, **options: Any) -> pd.DataFrame:
@@ -144,9 +146,3 @@ def prepared(
     count = options.default_workers if workers is None else workers
     pool = workers_of(count, dask, threads=options.threads)
     return spec_named(options.experiment).plan(options, folder), pool
-
-
-def _frame(folder: RunFolder) -> pd.DataFrame:
-    run = Run.open(folder.path)
-    frame: pd.DataFrame = run.results.to_pandas()
-    return frame.assign(seconds=run.cells["seconds"])

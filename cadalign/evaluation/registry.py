@@ -37,12 +37,8 @@ RESULT_COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
 """Columns of the result table of every experiment."""
 
 
-@dataclass(frozen=True)
-class Reference:
-    """Published numbers beside a headline table, and a note on them."""
-
-    lines: tuple[Summary, ...]
-    note: str
+Reference = tuple[tuple[Summary, ...], str]
+"""Published numbers beside a headline table, and a note on them."""
 
 
 def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
@@ -91,7 +87,7 @@ class Spec:
     """Says what the methods were run on."""
     about: str = ""  # explains the pictures
     note: str = ""  # explains the numbers of the headline table
-    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: Reference((), "")
+    reference: Callable[[Sequence[Run], set[str]], Reference] = lambda *_: ((), "")
     """Published numbers for the groups of some runs."""
 
     @property

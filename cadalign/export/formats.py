@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -91,32 +92,18 @@ class Format:
     is_folder: bool = False
 
 
-def _glb(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.glb import write_glb  # with trimesh
+def _with_trimesh(name: str) -> Writer:
+    """A writer of `cadalign.export.glb`, which is loaded when it is called."""
 
-    write_glb(path, exported, frame=options.frame)
+    def write(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+        writer = getattr(import_module("cadalign.export.glb"), name)
+        writer(path, exported, frame=options.frame)
 
-
-def _usd(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_usd(path, exported, frame=options.frame)
-
-
-def _obj(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_obj_mesh(path, _mesh_in_metres(exported, options))
-
-
-def _ply(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_ply_mesh(path, _mesh_in_metres(exported, options))
+    return write
 
 
 def _mesh_in_metres(exported: AlignedObject, options: ExportOptions) -> Mesh:
     return exported.placed_mesh(options.frame).stretched(exported.metres)
-
-
-def _lines(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    from cadalign.export.glb import write_line_set  # with trimesh
-
-    write_line_set(path, exported, frame=options.frame)
 
 
 def _bop_results(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
@@ -189,18 +176,6 @@ def _nerf(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
     write_nerf(path, [replace(view, name=name) for view, name in zip(placed, names, strict=True)])
 
 
-def _colmap(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_colmap(path, _camera_views(exported, options))
-
-
-def _open3d(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_open3d(path, _camera_views(exported, options))
-
-
-def _coco(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-    write_coco_keypoints(path, photos_of(exported))
-
-
 def _camera_views(exported: AlignedObject, options: ExportOptions) -> list[CameraView]:
     views = []
     for number, view in enumerate(exported.views):
@@ -213,20 +188,50 @@ def _camera_views(exported: AlignedObject, options: ExportOptions) -> list[Camer
 
 
 FORMATS: dict[str, Format] = {
-    "glb": Format("textured model, cameras and photos, for viewers", _glb, (".glb",)),
-    "usd": Format("the same as USD", _usd, (".usdz", ".usda", ".usdc", ".usd")),
-    "obj": Format("the mesh, with materials and textures", _obj, (".obj",)),
-    "ply": Format("the mesh, with vertex colours", _ply, (".ply",)),
-    "lines": Format("box and cameras as Open3D's line set (PLY)", _lines, (".lines.ply",)),
+    "glb": Format(
+        "textured model, cameras and photos, for viewers", _with_trimesh("write_glb"), (".glb",)
+    ),
+    "usd": Format(
+        "the same as USD",
+        lambda path, exported, options: write_usd(path, exported, frame=options.frame),
+        (".usdz", ".usda", ".usdc", ".usd"),
+    ),
+    "obj": Format(
+        "the mesh, with materials and textures",
+        lambda path, *given: write_obj_mesh(path, _mesh_in_metres(*given)),
+        (".obj",),
+    ),
+    "ply": Format(
+        "the mesh, with vertex colours",
+        lambda path, *given: write_ply_mesh(path, _mesh_in_metres(*given)),
+        (".ply",),
+    ),
+    "lines": Format(
+        "box and cameras as Open3D's line set (PLY)",
+        _with_trimesh("write_line_set"),
+        (".lines.ply",),
+    ),
     "bop-results": Format(
         "BOP's result CSV, the stretched mesh beside it", _bop_results, (".csv",)
     ),
     "bop": Format("a BOP scene's folder with its models", _bop, ("scene_gt.json",), is_folder=True),
     "scan2cad": Format("Scan2CAD's JSON, the stretch as scale", _scan2cad, ("annotations.json",)),
     "nerfstudio": Format("cameras as transforms.json", _nerf, ("transforms.json",)),
-    "colmap": Format("cameras as COLMAP's text files", _colmap, is_folder=True),
-    "open3d-camera": Format("cameras as Open3D's JSON", _open3d, ("camera.json",)),
-    "coco": Format("keypoints in the photos", _coco, (".coco.json", "keypoints.json")),
+    "colmap": Format(
+        "cameras as COLMAP's text files",
+        lambda path, *given: write_colmap(path, _camera_views(*given)),
+        is_folder=True,
+    ),
+    "open3d-camera": Format(
+        "cameras as Open3D's JSON",
+        lambda path, *given: write_open3d(path, _camera_views(*given)),
+        ("camera.json",),
+    ),
+    "coco": Format(
+        "keypoints in the photos",
+        lambda path, exported, options: write_coco_keypoints(path, photos_of(exported)),
+        (".coco.json", "keypoints.json"),
+    ),
 }
 """The formats by name."""
 

@@ -13,7 +13,7 @@ camera, whose aspect ratio is that of angles, no unlit materials, and colours of
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,21 +42,8 @@ _CLAMP_TO_EDGE = 33071  # as OpenGL numbers it
 _OPAQUE = 0.999
 
 
-@dataclass(frozen=True, eq=False)
-class _Node:
-    """A mesh with its material and place in the scene."""
-
-    name: str
-    mesh: trimesh.Trimesh
-    material: dict[str, Any]
-    transform: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class _CameraNode:
-    name: str
-    camera: dict[str, Any]
-    transform: FloatArray
+_Node = tuple[str, trimesh.Trimesh, dict[str, Any], FloatArray]
+"""Name, mesh, material and place in the scene."""
 
 
 def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
@@ -76,19 +63,21 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
         depth = photo_depth(exported, number) * exported.metres
         pose = root @ exported.frame_from_cam(frame, number) @ _FLIP
         pose[:3, 3] *= exported.metres
-        cameras.append(_CameraNode(f"camera_{number}", _camera(plane, depth), pose))
+        cameras.append((_camera(plane, depth), pose))
         if plane.image is not None:
             nodes.append(_photo_node(f"photo_{number}", plane, depth, pose))
     scene = trimesh.Scene()
-    for node in nodes:
-        scene.add_geometry(
-            node.mesh, geom_name=node.name, node_name=node.name, transform=node.transform
-        )
+    for name, mesh, _, place in nodes:
+        scene.add_geometry(mesh, geom_name=name, node_name=name, transform=place)
 
     def complete(tree: dict[str, Any]) -> None:
-        set_materials(tree, {node.name: node.material for node in nodes})
+        set_materials(tree, {name: material for name, _, material, _ in nodes})
         _add_cameras(tree, cameras)
 
+    _write(path, scene, complete)
+
+
+def _write(path: Path, scene: Any, complete: Callable[[dict[str, Any]], None]) -> None:
     data = _gltf.export_glb(scene, include_normals=False, tree_postprocessor=complete)
     write_whole(path, lambda unfinished: unfinished.write_bytes(data))
 
@@ -97,7 +86,7 @@ def _model_nodes(exported: AlignedObject, root: FloatArray, frame: Frame) -> lis
     placing = root @ exported.frame_from_model(frame).cam_from_model
     placing[:3] *= exported.metres
     return [
-        _Node(f"{exported.name}_{number}", part_mesh(part), part_material(part), placing)
+        (f"{exported.name}_{number}", part_mesh(part), part_material(part), placing)
         for number, part in enumerate(parts_of(exported.require_mesh()))
     ]
 
@@ -120,15 +109,13 @@ def _textured(vertices: FloatArray, faces: Any, uv: FloatArray, texture: Any) ->
 
 
 def _photo_node(name: str, plane: PhotoPlane, depth: float, pose: FloatArray) -> _Node:
-    vertices = plane.corners * depth * OPENGL_AXES
-    uv = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    mesh = _textured(vertices, np.array([[0, 1, 2], [0, 2, 3]]), uv, plane.image)
+    mesh = _textured(*plane.rectangle(depth), plane.image)
     material = {
         "name": name,
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
         "extensions": {_UNLIT: {}},
     }
-    return _Node(name, mesh, material, pose)
+    return name, mesh, material, pose
 
 
 def part_material(part: MeshPart) -> dict[str, Any]:
@@ -188,13 +175,17 @@ def set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> Non
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), _UNLIT})
 
 
-def _add_cameras(tree: dict[str, Any], cameras: Sequence[_CameraNode]) -> None:
-    tree["cameras"] = [{"name": each.name, **each.camera} for each in cameras]
+def _add_cameras(
+    tree: dict[str, Any], cameras: Sequence[tuple[dict[str, Any], FloatArray]]
+) -> None:
+    tree["cameras"] = []
     roots = tree["scenes"][tree["scene"]]["nodes"]
-    for number, each in enumerate(cameras):
+    for number, (camera, place) in enumerate(cameras):
+        name = f"camera_{number}"
+        tree["cameras"].append({"name": name, **camera})
         roots.append(len(tree["nodes"]))
-        matrix = each.transform.T.ravel().tolist()
-        tree["nodes"].append({"name": each.name, "camera": number, "matrix": matrix})
+        matrix = place.T.ravel().tolist()
+        tree["nodes"].append({"name": name, "camera": number, "matrix": matrix})
 
 
 _BOX_COLOR = (230, 60, 50)
@@ -311,8 +302,7 @@ def write_moving_glb(path: Path, objects: Sequence[MovingObject]) -> None:
         set_materials(tree, materials)
         _animate(tree, objects)
 
-    data = _gltf.export_glb(scene, include_normals=False, tree_postprocessor=complete)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
+    _write(path, scene, complete)
 
 
 def _animate(tree: dict[str, Any], objects: Sequence[MovingObject]) -> None:

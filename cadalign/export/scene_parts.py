@@ -16,6 +16,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.export.aligned_object import AlignedObject
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.images import ByteImage
 
@@ -62,6 +63,11 @@ class PhotoPlane:
         """Corners at depth 1: top left, bottom left, bottom right, top right; (4, 3) float."""
         (left, top), (right, bottom) = self.low, self.high
         return np.array([[left, top, 1], [left, bottom, 1], [right, bottom, 1], [right, top, 1]])
+
+    def rectangle(self, depth: float) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Vertices at a depth, in glTF's axes, faces and texture coordinates."""
+        uv = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+        return self.corners * depth * OPENGL_AXES, np.array([[0, 1, 2], [0, 2, 3]]), uv
 
 
 def photo_plane(camera: Camera, image: ByteImage | None) -> PhotoPlane:

@@ -108,7 +108,9 @@ def _write_stage(path: Path, exported: AlignedObject, frame: Frame) -> None:
         _add_camera(stage, f"/scene/view_{number}/camera", plane, depth)
         if plane.image is not None:
             texture = _write_texture(path, f"photo_{number}", plane.image)
-            _add_photo(stage, f"view_{number}/photo", plane, depth, texture)
+            photo = plane.rectangle(depth)
+            surface = _Surface(f"view_{number}/photo", *photo, (0, 0, 0, 1), texture, is_photo=True)
+            _add_surface(stage, surface)
     write_whole(path, lambda unfinished: stage.GetRootLayer().Export(str(unfinished)))
 
 
@@ -133,13 +135,6 @@ def _add_camera(stage: Usd.Stage, place: str, plane: PhotoPlane, depth: float) -
     camera.GetHorizontalApertureAttr().Set(_APERTURE)
     camera.GetVerticalApertureAttr().Set(_APERTURE * down / across)
     camera.GetClippingRangeAttr().Set(Gf.Vec2f(_NEAR * depth, _FAR * depth))
-
-
-def _add_photo(stage: Usd.Stage, name: str, plane: PhotoPlane, depth: float, texture: str) -> None:
-    vertices = plane.corners * depth * OPENGL_AXES
-    uv = np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
-    _add_surface(stage, _Surface(name, vertices, faces, uv, (0, 0, 0, 1), texture, is_photo=True))
 
 
 def _add_surface(stage: Usd.Stage, surface: _Surface) -> None:

@@ -23,7 +23,6 @@ _MOST_REASONS = 200
 _REFERENCES = {LIMIT, TRUTH, "exact"}
 """Methods that know what nobody does: the bound, the object's own model, the true pose."""
 OTHER_REASONS = "other reasons"
-_PARTS = ("rows", "failures", "skipped")
 
 
 @dataclass(frozen=True)
@@ -47,15 +46,9 @@ class HeadlineRow:
         return cls(run, line.group, line.method, cells)
 
 
-@dataclass(frozen=True)
-class Failure:
-    """A reason of failures or of skipped instances, and their number."""
-
-    run: int
-    category: str
-    method: str
-    reason: str
-    count: int
+Failure = dict[str, Any]
+"""A ``reason`` of failures or of skipped instances, their ``count``, run, category and method."""
+_FAILURE = ("run", "category", "method", "reason", "count")
 
 
 @dataclass(frozen=True)
@@ -74,7 +67,9 @@ class Headline:
         """The table for the page."""
         names = ("category", "method", "cells")
         return {
-            **{each: list(map(asdict, getattr(self, each))) for each in _PARTS},
+            "rows": list(map(asdict, self.rows)),
+            "failures": self.failures,
+            "skipped": self.skipped,
             "columns": [column.column() for column in self.columns],
             "group": self.group,
             "paper": [{name: getattr(row, name) for name in names} for row in self.paper],
@@ -94,9 +89,9 @@ def headline_of(runs: Sequence[Run]) -> Headline:
         own = [runs[k] for k in places]
         of_spec = [line for k in places for line in lines[k]]
         columns |= {each.key: each for each in spec.shown_columns(of_spec, own)}
-        reference = spec.reference(own, {line.group for line in of_spec})
-        stated += reference.lines
-        notes += [spec.note, reference.note]
+        published, note = spec.reference(own, {line.group for line in of_spec})
+        stated += published
+        notes += [spec.note, note]
     shown = tuple(columns.values())
     rows, failures, skipped = [], [], []
     for index, run in enumerate(runs):
@@ -153,7 +148,8 @@ def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
     rest: Counter[tuple[str, str, str]] = Counter()
     for (category, method, _), count in counts.most_common()[_MOST_REASONS:]:
         rest[category, method, OTHER_REASONS] += count
-    return [Failure(index, *names, count) for names, count in (*listed, *rest.items())]
+    rows = ((index, *names, count) for names, count in (*listed, *rest.items()))
+    return [dict(zip(_FAILURE, row, strict=True)) for row in rows]
 
 
 # As text ------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from cadalign.evaluation.metrics.table import KEYPOINTS, RMS, Metric
 from cadalign.evaluation.plots import COLORS, Plot, Trace, compact
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.files import write_text
-from cadalign.report.headline import Failure, Headline, HeadlineRow
+from cadalign.report.headline import Headline, HeadlineRow
 from cadalign.report.page import line_dict, page_payload, render_page
 
 _TIME = Metric("time", "time", "s", log=False, better=None)
@@ -88,7 +88,10 @@ def write_track_page(
             group="shape",
             columns=_COLUMNS,
             rows=[_row(each) for each in found],
-            failures=[Failure(0, "", name, reason, 1) for name, reason in failures.items()],
+            failures=[
+                {"run": 0, "category": "", "method": name, "reason": reason, "count": 1}
+                for name, reason in failures.items()
+            ],
             note=_NOTE,
         ),
         plots=_track_plots(found),

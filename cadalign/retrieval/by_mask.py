@@ -94,11 +94,20 @@ def rank_by_mask(
         what, fix = "a mask alone does not tell the focal length", "give a calibrated camera"
         raise InputError(what, where="camera", fix=f"{fix}, or keypoints")
     inside = np.asarray(View(camera, mask=mask).mask_image) >= 0.5
-    aligned = []
-    for row in _resembling(table, outlines, inside, camera, options, exclude, workers):
-        found = _aligned(table, row, inside, camera, options)
-        if found is not None:
-            aligned.append(found)
+    rows = chosen_models(table, options.category, exclude).tolist()
+    query = outline_of_mask(inside, camera)
+    overlapping = [
+        (-float(overlaps(outline, query).max()), row)
+        for row, outline in zip(rows, outlines.of(rows, workers), strict=True)
+        if outline is not None
+    ]
+    if not overlapping:
+        what = "no model has a mesh, without which a mask alone ranks nothing"
+        fix = "build the library with meshes, or give keypoints"
+        raise InputError(what, where="library", fix=fix)
+    resembling = [row for _, row in sorted(overlapping)[:MOST_ALIGNED]]
+    tried = (_aligned(table, row, inside, camera, options) for row in resembling)
+    aligned = [found for found in tried if found is not None]
     if not aligned:
         what = "no model can be aligned with the mask"
         fix = "check the mask and the camera, or give keypoints"
@@ -112,30 +121,6 @@ def rank_by_mask(
         replace(match, log_likelihood=float(log), score=float(score))
         for (_, _, match), log, score in zip(aligned, logs, scores, strict=True)
     ][: options.top]
-
-
-def _resembling(
-    table: ModelTable,
-    outlines: OutlineStore,
-    inside: BoolArray,
-    camera: Camera,
-    options: RetrievalOptions,
-    exclude: Collection[ModelKey],
-    workers: int,
-) -> list[int]:
-    """Rows of the models whose outlines overlap most with the mask's, the best first."""
-    rows = chosen_models(table, options.category, exclude).tolist()
-    query = outline_of_mask(inside, camera)
-    found = [
-        (-float(overlaps(outline, query).max()), row)
-        for row, outline in zip(rows, outlines.of(rows, workers), strict=True)
-        if outline is not None
-    ]
-    if not found:
-        what = "no model has a mesh, without which a mask alone ranks nothing"
-        fix = "build the library with meshes, or give keypoints"
-        raise InputError(what, where="library", fix=fix)
-    return [row for _, row in sorted(found)[:MOST_ALIGNED]]
 
 
 def _aligned(

@@ -203,16 +203,15 @@ class ModelTable:
         mirrored = _numbers(self._column("labelings").flatten()) + first
         return read_only(np.concatenate([np.arange(len(self.xyz)), mirrored]))
 
-    def known_ids(self, category: str | None) -> IntArray:
-        """Semantic ids of a category's models, or of all, ascending."""
-        if category is None:
-            return self._all_ids
+    @cached_property
+    def all_ids(self) -> IntArray:
+        """Semantic ids of all models, ascending."""
+        return np.unique(self.ids)
+
+    def known_ids(self, category: str) -> IntArray:
+        """Semantic ids of a category's models, ascending."""
         rows = self.rows_of(category)
         return np.unique(self.ids[self.offsets[rows.start] : self.offsets[rows.stop]])
-
-    @cached_property
-    def _all_ids(self) -> IntArray:
-        return np.unique(self.ids)
 
     def rows_of(self, category: str) -> slice:
         """Rows of a category's models."""

@@ -174,7 +174,9 @@ def gather_candidates(
     """Gather the candidates of a query, without the models to ``exclude``."""
     threads, query = worker_count(workers), observed.query
     chosen = chosen_models(table, options.category, exclude)
-    known = table.known_ids(None if options.category is None else table.keys[int(chosen[0])][0])
+    known = table.all_ids
+    if options.category is not None:
+        known = table.known_ids(table.keys[int(chosen[0])][0])
     unknown = np.setdiff1d(query.ids, known)
     if len(unknown):
         where = "the library" if options.category is None else f"the category {options.category!r}"

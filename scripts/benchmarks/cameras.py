@@ -15,7 +15,7 @@ from benchmarks.cars import car_scenes
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.evaluation.simulation.problems import Problem, simulate_standing_boxes
+from cadalign.evaluation.simulation.problems import UNIT_BOUNDS, Problem, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.render import look_at
@@ -154,21 +154,21 @@ def _boxes(seed: int, count: int, share: tuple[str, ...], scenes: int, noise_px:
     found = defaultdict(list)
     for number in range(scenes):
         rng = instance_rng(seed, f"{number}")
-        boxes = simulate_standing_boxes(rng, objects=count, camera=_CAMERA, noise_px=noise_px)
-        how = {"bounds": boxes.BOUNDS, "stretch_sigma": _SCALE_SIGMA}
+        boxes, _ = simulate_standing_boxes(rng, objects=count, camera=_CAMERA, noise_px=noise_px)
+        how = {"bounds": UNIT_BOUNDS, "stretch_sigma": _SCALE_SIGMA}
         objects = [
             cadalign.SceneObject(
                 cadalign.Model(points_3d=each.points_3d, **how),
                 cadalign.View(_UNKNOWN, each.points_2d),
             )
-            for each in boxes.problems
+            for each in boxes
         ]
         scene = cadalign.align_scene(objects, share=share)
         off = float(np.log(scene.camera.fx / _CAMERA.fx))
-        found["bound"].append(_focal_bound(boxes.problems, share, noise_px))
+        found["bound"].append(_focal_bound(boxes, share, noise_px))
         found["focal"].append(off)
         found["held"].append(abs(off) < section.WITHIN_95 * scene.focal_std)
-        for result, each in zip(scene.results, boxes.problems, strict=True):
+        for result, each in zip(scene.results, boxes, strict=True):
             if isinstance(result, cadalign.Result):
                 est, gt = result.alignment, each.alignment
                 found["R"].append(rotation_error(est=est, gt=gt))

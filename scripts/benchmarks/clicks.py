@@ -13,9 +13,10 @@ import numpy as np
 
 from benchmarks.photo import PhotoClicks, bop_cases
 from benchmarks.section import BenchmarkData, Row, Tables, attempt, clocked, spread, summary
-from cadalign import Camera, Model, View, align
+from cadalign import Model, View, align
 from cadalign.annotate.candidates import MaskCandidates, best_click
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.metrics import rotation_error
@@ -23,7 +24,6 @@ from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval.by_mask import grab_cut
 
 _FEWEST = 3
-_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _CLICK_PX = 2.0
 _SIMILAR_DEG = 30.0
 _MARGIN = 0.05  # of a box that is dragged around an object, relative to its larger side
@@ -169,16 +169,16 @@ def _clicked(
     """Click until one alignment is left."""
     scene, scale = Scene(own.load_mesh()), np.exp([0.0, *rng.uniform(-0.3, 0.3, 2)])
     how = {"rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
-    view = sample_view(scene, own.keypoints.xyz, _CAMERA, min_visible=4, **how)
+    view = sample_view(scene, own.keypoints.xyz, KEYPOINT_CAMERA, min_visible=4, **how)
     gt = view.cam_from_model
-    pixels = _CAMERA.project(gt.apply(own.keypoints.xyz))
+    pixels = KEYPOINT_CAMERA.project(gt.apply(own.keypoints.xyz))
     places = dict(zip(own.keypoints.ids.tolist(), pixels, strict=True))
     visible = set(own.keypoints.ids[view.visible].tolist())
     ids, points = other.keypoints.ids.tolist(), other.keypoints.xyz
     model = Model(points_3d=points, ids=ids, mesh=other.load_mesh(), shape_sigma=shape_sigma)
-    mask = cast_geometry(scene, _CAMERA, gt).mask
-    wall, _, result = clocked(lambda: align(model, View(_CAMERA, mask=mask)))
-    candidates = MaskCandidates.of(model, _CAMERA, result)
+    mask = cast_geometry(scene, KEYPOINT_CAMERA, gt).mask
+    wall, _, result = clocked(lambda: align(model, View(KEYPOINT_CAMERA, mask=mask)))
+    candidates = MaskCandidates.of(model, KEYPOINT_CAMERA, result)
     predicted = candidates.predicted(ids, points)
     chances = candidates.probabilities((), np.empty((0, 3)), np.empty((0, 2)))
     first, clicked = int(np.count_nonzero(chances)), list[int]()

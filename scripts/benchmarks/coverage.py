@@ -14,6 +14,7 @@ import cadalign
 from benchmarks.section import BenchmarkData, Row, Tables, attempt, fitted, percent
 from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.shapes.parts import probability_within
@@ -23,7 +24,6 @@ _COVERED = 0.95
 _CALIBRATED_SIZES = (5, 6, 7, 8, 10, 20, 50, 100)
 _KINDS = ("fit", "sigma=None", "20 % outliers", "focal", "shape_sigma=.05", "two views")
 _REGION_SIZES = (5, 6, 8, 12, 30, 100, 200)
-_REGION_CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
 _SHAPE_SIGMA = 0.05
 _STRETCH_SIGMA = 0.2
 _SHAPE_SIGMAS = (0.01, 0.05, 0.1)
@@ -154,15 +154,15 @@ def _estimated(
         place = rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0))
         poses.append(Alignment(turn, place, np.ones(3)))
     seen = [
-        _REGION_CAMERA.project(pose.apply(object_points)) + rng.normal(0, noise_px, (points, 2))
+        KEYPOINT_CAMERA.project(pose.apply(object_points)) + rng.normal(0, noise_px, (points, 2))
         for pose in poses
     ]
     truth = Alignment(poses[0].rotation, poses[0].translation, scale)
     if kind == "two views" or differs:
-        views = [View(_REGION_CAMERA, each, sigma=noise_px) for each in seen]
+        views = [View(KEYPOINT_CAMERA, each, sigma=noise_px) for each in seen]
         own = Model(points_3d=model, shape_sigma=differs) if differs else Model(points_3d=model)
         return cadalign.align(own, views[:1] if differs else views), truth
-    camera, options = _REGION_CAMERA, dict[str, Any](sigma=noise_px)
+    camera, options = KEYPOINT_CAMERA, dict[str, Any](sigma=noise_px)
     if kind == "sigma=None":
         options = {"sigma": None}
     elif kind == "20 % outliers":
@@ -187,12 +187,12 @@ def _similar_estimate(
     turn = Rotation.random(random_state=rng).as_matrix()
     truth = Alignment(turn, rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0)), scale)
     moved = model + rng.normal(0, shape_sigma, model.shape)
-    seen = _REGION_CAMERA.project(truth.apply(moved)) + rng.normal(0, 1, (points, 2))
+    seen = KEYPOINT_CAMERA.project(truth.apply(moved)) + rng.normal(0, 1, (points, 2))
     prior: dict[str, Any] = {"stretch_sigma": _STRETCH_SIGMA} if stretch == "free" else {}
     own = Model(
         points_3d=model, shape_sigma=shape_sigma, stretch=None if prior else "none", **prior
     )
-    result = cadalign.align(own, View(_REGION_CAMERA, seen, sigma=1.0))
+    result = cadalign.align(own, View(KEYPOINT_CAMERA, seen, sigma=1.0))
     distance = np.linalg.norm(truth.translation)
     along = truth.translation / distance
     error = np.log(np.linalg.norm(result.alignment.translation) / distance)

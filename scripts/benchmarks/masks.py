@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -20,21 +19,22 @@ from benchmarks.section import (
     Tables,
     attempt,
     clocked,
+    meshed_models,
     percent,
     summary,
 )
 from cadalign import Alignment, Camera, Model, View, align
 from cadalign.arrays import FloatArray
-from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
+from cadalign.datasets import AnnotatedModel
 from cadalign.estimation.contours.measured import shift_to
 from cadalign.estimation.contours.view_contour import contour_bound
 from cadalign.evaluation.instances.evidence import DAMAGES, damaged_mask
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 
-_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _NOISE_PX = 1.0
 _STRETCH = 2.0
 _LEAST_KEYPOINTS = 4
@@ -250,26 +250,22 @@ _Meshed = tuple[AnnotatedModel, Scene]
 def _models_of(given: BenchmarkData) -> list[_Meshed]:
     """The models of the sample dataset and, where it is given, of KeypointNet, with meshes."""
     with tempfile.TemporaryDirectory() as folder:
-        sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=1))
-        models = [model for model in sample if model.mesh_path is not None]
-        if given.keypointnet is not None:
-            real = (m for m in KeypointNet(given.keypointnet) if m.mesh_path is not None)
-            models += [model for model in real if model.mesh_path.suffix == ".obj"]
-        return [(model, Scene(model.load_mesh())) for model in models]
+        sample, real = meshed_models(given, folder, per_category=1)
+        return [(model, Scene(model.load_mesh())) for model in (*sample, *real)]
 
 
 def _drawn(model: _Meshed, rng: np.random.Generator, **how: Any) -> _Case | None:
     """A view of a stretched model that shows enough keypoints, if there is one."""
     annotated, scene = model
     scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
-    seen = scene, annotated.keypoints.xyz, _CAMERA
+    seen = scene, annotated.keypoints.xyz, KEYPOINT_CAMERA
     view = None
     for least in (7, _LEAST_KEYPOINTS):
         view = view or attempt(sample_view, *seen, min_visible=least, rng=rng, scale=scale, **how)
     if view is None:
         return None
     ids = np.flatnonzero(view.visible).tolist()
-    return _Case.drawn(annotated, scene, _CAMERA, view.cam_from_model, ids, rng)
+    return _Case.drawn(annotated, scene, KEYPOINT_CAMERA, view.cam_from_model, ids, rng)
 
 
 def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed: int) -> Row:

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.section import BenchmarkData, Row, Tables, percent
-from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
+from cadalign import Model, RansacOptions, Result, View, align, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import angle_between
 from cadalign.render import look_at
 
-_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _NOISE_PX, _OUTLIERS = 1.0, 0.3
 _FEWEST, _MOST = 7, 16  # keypoints
 _STRETCH_SIGMA = 0.25  # of log scales
@@ -37,7 +37,7 @@ class SeenModel(NamedTuple):
 
     def flipped(self) -> SeenModel:
         """The same with u counted from the other side."""
-        last = _CAMERA.width - 2 * PIXEL_CENTRE
+        last = KEYPOINT_CAMERA.width - 2 * PIXEL_CENTRE
         return self._replace(points_2d=self.points_2d * [-1, 1] + [last, 0])
 
     def swapped(self) -> SeenModel:
@@ -49,7 +49,9 @@ class SeenModel(NamedTuple):
         count = len(self.points_2d)
         wrong = rng.choice(count, round(_OUTLIERS * count), replace=False)
         pixels = self.points_2d.copy()
-        pixels[wrong] = rng.uniform(0, [_CAMERA.width, _CAMERA.height], (len(wrong), 2))
+        pixels[wrong] = rng.uniform(
+            0, [KEYPOINT_CAMERA.width, KEYPOINT_CAMERA.height], (len(wrong), 2)
+        )
         return self._replace(points_2d=pixels)
 
 
@@ -132,7 +134,7 @@ def _seen(
     azimuth, elevation = rng.uniform(0, 360), rng.uniform(*_ELEVATION_DEG)
     stretched = points * np.exp([0.0, *rng.normal(0, _STRETCH_SIGMA, 2)])
     pose = look_at(azimuth=azimuth, elevation=elevation, distance=rng.uniform(*_DISTANCE))
-    pixels = _CAMERA.project(pose.apply(stretched))
+    pixels = KEYPOINT_CAMERA.project(pose.apply(stretched))
     return SeenModel(points, pixels + rng.normal(0, _NOISE_PX, pixels.shape), pose.rotation)
 
 
@@ -150,6 +152,6 @@ def _said(seen: SeenModel, shape_sigma: float) -> tuple[bool, bool, bool]:
 
 def _estimate(seen: SeenModel, shape_sigma: float) -> Result:
     if not shape_sigma:
-        return fit(seen.points_3d, seen.points_2d, _CAMERA, ransac=RansacOptions())
+        return fit(seen.points_3d, seen.points_2d, KEYPOINT_CAMERA, ransac=RansacOptions())
     model = Model(points_3d=seen.points_3d, shape_sigma=shape_sigma)
-    return align(model, View(_CAMERA, seen.points_2d), ransac=RansacOptions())
+    return align(model, View(KEYPOINT_CAMERA, seen.points_2d), ransac=RansacOptions())

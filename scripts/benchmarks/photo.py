@@ -8,7 +8,6 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,12 +20,13 @@ from benchmarks.section import (
     Tables,
     attempt,
     clocked,
+    meshed_models,
     processor_seconds,
     summary,
 )
 from cadalign import Camera, Mesh, Model, Result, View, align
 from cadalign.arrays import FloatArray
-from cadalign.datasets import AnnotatedModel, KeypointNet, load_mesh, write_sample_dataset
+from cadalign.datasets import AnnotatedModel, load_mesh
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
@@ -264,10 +264,8 @@ def _scenery(
     """Models of ShapeNet and of the sample, and real photos of a camera's size."""
     root = given.needed().parent
     with tempfile.TemporaryDirectory() as folder:
-        sample = list(KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=2)))
-        real = [m for m in KeypointNet(root / "keypointnet") if m.mesh_path is not None]
-        models = [m for m in real if m.mesh_path.suffix == ".obj"] + sample
-        scenes = [(m, Scene(m.load_mesh())) for m in models]
+        sample, real = meshed_models(given, folder, per_category=2)
+        scenes = [(m, Scene(m.load_mesh())) for m in (*real, *sample)]
     photos = sorted((root / "sfm").rglob("*.jpg")) + sorted((root / "real").rglob("rgb/*.png"))
     size = camera.width, camera.height
     behind = [cv2.resize(read_photo(p), size, interpolation=cv2.INTER_AREA) for p in photos]

@@ -16,8 +16,8 @@ import numpy as np
 
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Table, Tables
-from cadalign import Box, Camera, Library, Observation, ShapeModel
-from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
+from cadalign import Box, Library, Observation, ShapeModel
+from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import RetrievalQuery, RetrievalTask, observe_model
 from cadalign.geometry.metrics import box_iou_up_to_scale
@@ -31,7 +31,6 @@ _KEYPOINTS = 8
 _CALLS = 3
 _LEAST_SHARED = 4
 _FLAT = 1e-9
-_MASK_CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)
 _SAMPLE_CATEGORIES = 4
 
 
@@ -168,11 +167,8 @@ def mask_retrieval(
     """
     with tempfile.TemporaryDirectory() as folder:
         count = -(-max(sizes) // _SAMPLE_CATEGORIES)
-        sample = KeypointNet(write_sample_dataset(Path(folder) / "sample", per_category=count))
-        models = [model for model in sample if model.mesh_path is not None]
-        if given.keypointnet is not None:
-            real = (m for m in KeypointNet(given.keypointnet) if m.mesh_path is not None)
-            models = [*(m for m in real if m.mesh_path.suffix == ".obj"), *models]
+        sample, real = section.meshed_models(given, folder, per_category=count)
+        models = [*real, *sample]
         order = np.random.default_rng(given.seed).permutation(len(models)).tolist()
         for size in sizes:
             chosen = [models[k] for k in order[:size]]
@@ -187,7 +183,7 @@ def _queried(models: Sequence[AnnotatedModel], given: BenchmarkData, queries: in
         rng = np.random.default_rng([given.seed, 6, number])
         model = models[int(rng.integers(len(models)))]
         mask = _stretched_mask(model, rng)
-        query = partial(library.retrieve, mask=mask, camera=_MASK_CAMERA, top=MOST_ALIGNED)
+        query = partial(library.retrieve, mask=mask, camera=KEYPOINT_CAMERA, top=MOST_ALIGNED)
         wall, _, matches = section.clocked(query)
         if number == 0:
             first = wall
@@ -207,8 +203,8 @@ def _stretched_mask(model: AnnotatedModel, rng: np.random.Generator) -> np.ndarr
     scene = Scene(model.load_mesh())
     scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(2.0))])
     how: dict[str, Any] = {"scale": scale, "fill": (0.6, 0.9), "roll": 10.0, "min_visible": 0}
-    view = sample_view(scene, model.keypoints.xyz, _MASK_CAMERA, rng=rng, **how)
-    return np.asarray(cast_geometry(scene, _MASK_CAMERA, view.cam_from_model).mask)
+    view = sample_view(scene, model.keypoints.xyz, KEYPOINT_CAMERA, rng=rng, **how)
+    return np.asarray(cast_geometry(scene, KEYPOINT_CAMERA, view.cam_from_model).mask)
 
 
 def unseen_retrieval(

@@ -16,7 +16,7 @@ import tyro
 from common import COMMAND
 
 import cadalign
-from cadalign.datasets import KeypointNet
+from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import CadalignError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
@@ -117,6 +117,18 @@ def fitted(problem: Problem, **options: Any) -> cadalign.Result | None:
     """The fit of a simulated problem; None where it is refused."""
     given = problem.points_3d, problem.points_2d, problem.camera
     return attempt(cadalign.fit, *given, **options)
+
+
+def meshed_models(
+    given: BenchmarkData, folder: str, *, per_category: int
+) -> tuple[list[AnnotatedModel], list[AnnotatedModel]]:
+    """Models with meshes: the sample data set's, written to a folder, and ShapeNet's if given."""
+    root = write_sample_dataset(Path(folder) / "sample", per_category=per_category)
+    sample, real = (
+        [] if place is None else [m for m in KeypointNet(place) if m.mesh_path is not None]
+        for place in (root, given.keypointnet)
+    )
+    return sample, [model for model in real if model.mesh_path.suffix == ".obj"]
 
 
 def learned_shape(dataset: KeypointNet, category: str) -> cadalign.ShapeModel:

@@ -19,9 +19,10 @@ from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.exporting import annotated_photos
 from cadalign.annotate.session import Session
 from cadalign.cli import main
+from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import CadalignError
-from cadalign.export.aligned_object import FORMS, AnnotatedPhoto, write_photo_set
+from cadalign.export.aligned_object import FORMS, write_photo_set
 from cadalign.io.images import read_photo
 from cadalign.render import cast_geometry
 
@@ -55,11 +56,12 @@ def annotated(case: Case) -> Session:
     return session
 
 
-def with_pose(photo: AnnotatedPhoto, **changed: np.ndarray) -> AnnotatedPhoto:
+def with_pose(photo: Photo, **changed: np.ndarray) -> Photo:
     """The photo with another rotation or stretch of the object."""
-    (view,) = photo.exported.views
-    view = replace(view, cam_from_model=replace(view.cam_from_model, **changed))
-    return replace(photo, exported=replace(photo.exported, views=(view,)))
+    (found,) = photo.objects
+    pose = replace(found.truth.cam_from_model, **changed)
+    truth = replace(found.truth, cam_from_model=pose)
+    return replace(photo, objects=(replace(found, truth=truth),))
 
 
 @pytest.mark.parametrize("form", FORMS)

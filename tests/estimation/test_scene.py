@@ -23,7 +23,7 @@ from cadalign import (
 )
 from cadalign.cli import main
 from cadalign.errors import InputError
-from cadalign.evaluation.simulation.problems import StandingBoxes, simulate_standing_boxes
+from cadalign.evaluation.simulation.problems import UNIT_BOUNDS, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
 from cadalign.io.observation import Observation
 
@@ -37,18 +37,18 @@ class Simulated:
 
     def __init__(self, seed: int, count: int, noise: float = 1.0, points: int = 10) -> None:
         rng = np.random.default_rng(seed)
-        boxes = simulate_standing_boxes(
+        boxes, up = simulate_standing_boxes(
             rng, objects=count, camera=CAMERA, camera_height=HEIGHT, points=points, noise_px=noise
         )
-        self.up = boxes.up
-        self.points = [each.points_3d for each in boxes.problems]
-        self.poses = [each.alignment for each in boxes.problems]
-        self.pixels = [each.points_2d for each in boxes.problems]
+        self.up = up
+        self.points = [each.points_3d for each in boxes]
+        self.poses = [each.alignment for each in boxes]
+        self.pixels = [each.points_2d for each in boxes]
 
     def objects(self, camera: Camera, *, sized: int = 0, **evidence: Any) -> list[SceneObject]:
         return [
             SceneObject(
-                Model(points_3d=points, bounds=StandingBoxes.BOUNDS, stretch_sigma=0.3),
+                Model(points_3d=points, bounds=UNIT_BOUNDS, stretch_sigma=0.3),
                 View(camera, pixels, **evidence),
                 size=Size(width=1.0) if number < sized else None,
             )

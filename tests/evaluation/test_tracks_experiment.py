@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import cadalign
 from cadalign import Result, ShapeModel, View
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.tracks import METHODS, SPEC, TracksOptions
-from cadalign.evaluation.instances.tracks import SimulatedVideo, TrackEstimate, track_errors
+from cadalign.evaluation.instances.tracks import TrackEstimate, simulated_video, track_errors
 from cadalign.evaluation.runs.folder import RunFolder
 
 SYNSET = "03001627"
@@ -120,9 +121,9 @@ def test_a_killed_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> N
 
 
 def test_videos_follow_from_seed_and_name() -> None:
-    task = SimulatedVideo("chair", "a", BASE, np.arange(8))
-    (views, truth), (again, same) = (task.video(TracksOptions(frames=5)) for _ in range(2))
-    other, _ = task.video(TracksOptions(frames=5, seed=1))
+    made = partial(simulated_video, names=("chair", "a"), xyz=BASE, ids=np.arange(8))
+    (views, truth), (again, same) = (made(TracksOptions(frames=5)) for _ in range(2))
+    other, _ = made(TracksOptions(frames=5, seed=1))
     for one, two in zip(views, again, strict=True):
         np.testing.assert_array_equal(np.asarray(one.points_2d), np.asarray(two.points_2d))
     np.testing.assert_array_equal(truth, same)

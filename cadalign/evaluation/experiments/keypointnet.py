@@ -304,14 +304,14 @@ PERCENT_NOTE = (
 def reference(runs: Sequence[Run], groups: set[str]) -> Reference:
     """The paper's numbers on the same categories; all of them are about 1 px of noise."""
     if 1.0 not in {run.noise_px for run in runs}:
-        return Reference((), "")
+        return (), ""
     keys = (*(metric.key for metric in TABLE[1:5]), metrics.KEYPOINTS.key)
     stated = tuple(
         Summary(name, {"category": name, "method": STATED}, dict(zip(keys, row, strict=True)))
         for name, row in PAPER_TABLE.items()
         if name in groups
     )
-    return Reference(stated, f"{PERCENT_NOTE} Its models and views are others." if stated else "")
+    return stated, f"{PERCENT_NOTE} Its models and views are others." if stated else ""
 
 
 ON_INSTANCES: dict[str, Any] = {

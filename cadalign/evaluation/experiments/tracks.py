@@ -162,8 +162,10 @@ def plan(options: TracksOptions, folder: RunFolder) -> Plan[TrackTask]:
         folder.make()
         place = folder.path / "sample_dataset"
         root = write_sample_dataset(place, per_category=_SAMPLE, keep=True)
-    make = recorded_videos if (root / "car_tracks.json").is_file() else simulated_videos
-    tasks, benchmark, data = make(root, options, folder)
+    is_recorded = (root / "car_tracks.json").is_file()
+    tasks, benchmark, data = (
+        recorded_videos(root, options) if is_recorded else simulated_videos(root, options, folder)
+    )
     return benchmark.plan(options, tasks, chunk=1, data=data)
 
 

@@ -132,8 +132,7 @@ _STATISTICS = {
         for name in ("rotation", "stretch")
         for percent in (68, 95)
     },
-    "keypoints_within_68": mean("keypoints_within_68"),
-    "keypoints_within_95": mean("keypoints_within_95"),
+    **{name: mean(name) for name in ("keypoints_within_68", "keypoints_within_95")},
     "milliseconds": milliseconds,
 }
 

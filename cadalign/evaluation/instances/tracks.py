@@ -64,70 +64,60 @@ class TrackTask:
 
     category: str
     model_id: str
+    made: Callable[[TracksOptions], tuple[Sequence[View], FloatArray]]
+    """Makes the views, and the true poses (P, 12) of the object's axes and its box's centre."""
 
     @property
     def names(self) -> Row:
         """The cells that name a row."""
         return {"category": self.category, "model_id": self.model_id, "view": 0}
 
-    def video(self, options: TracksOptions) -> tuple[Sequence[View], FloatArray]:
-        """The views, and the true poses (P, 12) of the object's axes and its box's centre."""
-        raise NotImplementedError
+
+def simulated_video(
+    options: TracksOptions, *, names: tuple[str, str], xyz: FloatArray, ids: IntArray
+) -> tuple[Sequence[View], FloatArray]:
+    """A video of an object of a data set; see `TrackTask`."""
+    rng = instance_rng(options.seed, *names, "video")
+    track = simulate_track(
+        rng,
+        xyz,
+        ids.tolist(),
+        frames=options.frames,
+        noise_px=options.noise_px,
+        visible=options.visible,
+        rate=options.rate or _RATE,
+    )
+    if options.correlation:
+        how = {"noise_px": options.noise_px, "correlation": options.correlation}
+        track = with_correlated_errors(track, rng, **how)
+    if options.flipped or options.outliers:
+        how = {"flipped": options.flipped, "outliers": options.outliers}
+        track = with_mistakes(track, rng, **how)
+    views = [replace(view, sigma=options.sigma) for view in track.views]
+    middle = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
+    return views, np.array([pose_of(each, middle) for each in track.poses])
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedVideo(TrackTask):
-    """A video of an object of a data set."""
-
-    xyz: FloatArray
-    ids: IntArray
-
-    def video(self, options: TracksOptions) -> tuple[Sequence[View], FloatArray]:
-        rng = instance_rng(options.seed, self.category, self.model_id, "video")
-        track = simulate_track(
-            rng,
-            self.xyz,
-            self.ids.tolist(),
-            frames=options.frames,
-            noise_px=options.noise_px,
-            visible=options.visible,
-            rate=options.rate or _RATE,
-        )
-        if options.correlation:
-            how = {"noise_px": options.noise_px, "correlation": options.correlation}
-            track = with_correlated_errors(track, rng, **how)
-        if options.flipped or options.outliers:
-            how = {"flipped": options.flipped, "outliers": options.outliers}
-            track = with_mistakes(track, rng, **how)
-        views = [replace(view, sigma=options.sigma) for view in track.views]
-        middle = (self.xyz.min(axis=0) + self.xyz.max(axis=0)) / 2
-        return views, np.array([pose_of(each, middle) for each in track.poses])
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedVideo(TrackTask):
-    """A track of a car."""
-
-    frames: tuple[KeypointFrame, ...]
-
-    def video(self, options: TracksOptions) -> tuple[Sequence[View], FloatArray]:
-        views, truth = [], []
-        rate = options.rate or _KITTI_RATE
-        for each in self.frames:
-            photo = each.photo(SIZE)
-            (car,) = photo.objects
-            assert car.keypoints is not None
-            assert car.truth.box is not None
-            assert photo.camera is not None
-            known = car.keypoints.scores
-            shown = car.keypoints.visible if known is None else known >= HIDDEN
-            rows = np.flatnonzero(shown)
-            ids = [car.keypoints.names[row] for row in rows]
-            pixels, time = car.keypoints.points_2d[rows], each.entry["frame"] / rate
-            views.append(View(photo.camera, pixels, ids=ids, sigma=options.sigma, time=time))
-            box = car.truth.box
-            truth.append(np.concatenate([box.rotation.ravel(), box.center]))
-        return views, np.array(truth)
+def recorded_video(
+    options: TracksOptions, *, frames: Sequence[KeypointFrame]
+) -> tuple[Sequence[View], FloatArray]:
+    """A track of a car; see `TrackTask`."""
+    views, truth = [], []
+    rate = options.rate or _KITTI_RATE
+    for each in frames:
+        photo = each.photo(SIZE)
+        (car,) = photo.objects
+        assert car.keypoints is not None
+        assert car.truth.box is not None
+        assert photo.camera is not None
+        known = car.keypoints.scores
+        rows = np.flatnonzero(car.keypoints.visible if known is None else known >= HIDDEN)
+        ids = [car.keypoints.names[row] for row in rows]
+        pixels, time = car.keypoints.points_2d[rows], each.entry["frame"] / rate
+        views.append(View(photo.camera, pixels, ids=ids, sigma=options.sigma, time=time))
+        box = car.truth.box
+        truth.append(np.concatenate([box.rotation.ravel(), box.center]))
+    return views, np.array(truth)
 
 
 def pose_of(alignment: Alignment, middle: FloatArray) -> FloatArray:
@@ -237,7 +227,7 @@ class TrackVideos(Setting):
     has_yaw: bool  # they are KITTI's cars
 
     def case(self, task: TrackTask) -> Case:
-        views, truth = task.video(self.options)
+        views, truth = task.made(self.options)
         count = float(np.mean([len(view.keypoint_ids) for view in views]))
         facts = {"frames": len(views), "keypoints": count}
         ransac = RansacOptions() if self.options.is_robust else None
@@ -318,19 +308,20 @@ def simulated_videos(root: Path, options: TracksOptions, folder: RunFolder) -> V
     if not objects.ids():
         raise DataError(f"no objects in the split {options.split}", where=str(root))
     learned = learn(dataset, objects.categories, split=options.train, folder=folder)
-    tasks = []
+    tasks, parts = [], list[Any]()
     for category in objects.categories:
         shape = learned.shape(category)
         for model in list(objects[category])[: options.max_models]:
-            known = model.keypoints
+            known, names = model.keypoints, (category, model.model_id)
             has = np.isin(known.ids, shape.ids)
-            tasks.append(SimulatedVideo(category, model.model_id, known.xyz[has], known.ids[has]))
-    parts = [part for each in tasks for part in (each.model_id, each.xyz, each.ids)]
+            own: dict[str, Any] = {"xyz": known.xyz[has], "ids": known.ids[has]}
+            tasks.append(TrackTask(*names, partial(simulated_video, names=names, **own)))
+            parts += [model.model_id, *own.values()]
     setting = TrackVideos(learned.shape, options, has_yaw=False)
     return tasks, _benchmark(setting), fingerprint(learned.fingerprint(), *parts)
 
 
-def recorded_videos(root: Path, options: TracksOptions, folder: RunFolder) -> Videos:
+def recorded_videos(root: Path, options: TracksOptions) -> Videos:
     """The tracks of a folder of KITTI's cars."""
     tracks: dict[tuple[int, int], list[KeypointFrame]] = defaultdict(list)
     for each in list_tracks(root / TRACKS):
@@ -339,7 +330,7 @@ def recorded_videos(root: Path, options: TracksOptions, folder: RunFolder) -> Vi
         assert each.track is not None
         tracks[each.track.sequence, each.track.track].append(each)
     tasks = [
-        RecordedVideo("Car", f"{sequence:04d}/{track}", tuple(frames))
+        TrackTask("Car", f"{sequence:04d}/{track}", partial(recorded_video, frames=frames))
         for (sequence, track), frames in list(tracks.items())[: options.max_models]
     ]
     car_shape_of(root, "Car")  # or it is said here that there is none

@@ -70,7 +70,9 @@ class KeypointTasks(Tasks[KeypointTask]):
         ]
         if not self.keys:
             raise DataError("there are no models to evaluate", where=str(dataset.root))
-        self._first = lru_cache(maxsize=4)(self._first_view)
+        self._first = lru_cache(maxsize=4)(
+            lambda key: KeypointTask.of_model(dataset, *key, visibility=options.visibility)
+        )
 
     def __len__(self) -> int:
         return len(self.keys) * self._views
@@ -78,11 +80,8 @@ class KeypointTasks(Tasks[KeypointTask]):
     def task(self, index: int) -> KeypointTask:
         """A view of a model."""
         place, view = divmod(index, self._views)
-        first = self._first(place)
+        first = self._first(self.keys[place])
         return first if view == 0 else replace(first, view=view)
-
-    def _first_view(self, place: int) -> KeypointTask:
-        return KeypointTask.of_model(self.dataset, *self.keys[place], visibility=self._visibility)
 
     def fingerprint(self) -> str:
         """Hash of the annotations: a run must not go on with others."""

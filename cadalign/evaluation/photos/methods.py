@@ -36,7 +36,7 @@ from cadalign.evaluation.photos.protocols import (
     Protocol,
     parts_of,
 )
-from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
+from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of, spread_points
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -142,7 +142,7 @@ def _simulated(
     if not camera.focal_known:
         raise LeftOutError("there are no keypoints, nor a focal length to simulate them with")
     if cad.has_mesh:
-        model = cad.spread_points(options.simulated_points)
+        model = spread_points(cad, options.simulated_points)
         seen = visible_keypoints(cad.scene, model.xyz, camera, gt)
         if target.found.mask_path is not None and seen.any():
             seen[seen] = _in_mask(

@@ -62,7 +62,9 @@ def execute(
         _sweep(folder.path)
         if not folder.is_finished:
             _do_chunks(plan, folder, workers, on_progress)
-            _assemble(plan.experiment, folder, -(-total // plan.chunk_size))
+            for table, columns in _tables(plan.experiment, folder).items():
+                parts = (folder.part(table, k) for k in range(-(-total // plan.chunk_size)))
+                write_tables(table, columns, map(read_table, parts))
         on_progress(Progress(total, total))
         shutil.rmtree(folder.parts, ignore_errors=True)
 
@@ -117,12 +119,6 @@ def _is_done(experiment: Experiment[Any], folder: RunFolder, index: int) -> bool
             logger.warning("%s: missing or damaged; its tasks are done again", part)
             return False
     return True
-
-
-def _assemble(experiment: Experiment[Any], folder: RunFolder, chunks: int) -> None:
-    for table, columns in _tables(experiment, folder).items():
-        parts = (folder.part(table, index) for index in range(chunks))
-        write_tables(table, columns, map(read_table, parts))
 
 
 def _tables(experiment: Experiment[Any], folder: RunFolder) -> dict[Path, Columns]:

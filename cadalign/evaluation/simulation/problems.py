@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -72,17 +71,8 @@ def simulate_problem(
     return Problem(points_3d, points_2d, camera, alignment, outliers)
 
 
-@dataclass(frozen=True, eq=False)
-class StandingBoxes:
-    """Objects of a unit cube's bounds, stretched, that stand on the ground in one image.
-
-    ``problems`` has each by itself, ``up`` (3,) is the direction against gravity in the camera.
-    """
-
-    BOUNDS: ClassVar[FloatArray] = np.array([[-0.5] * 3, [0.5] * 3])
-
-    problems: tuple[Problem, ...]
-    up: FloatArray
+UNIT_BOUNDS: FloatArray = np.array([[-0.5] * 3, [0.5] * 3])
+"""Lowest and highest coordinates of a unit cube."""
 
 
 def simulate_standing_boxes(
@@ -93,15 +83,18 @@ def simulate_standing_boxes(
     camera_height: float = 1.6,
     points: int = 10,
     noise_px: float = 1.0,
-) -> StandingBoxes:
+) -> tuple[list[Problem], FloatArray]:
     """Draw objects that stand on the ground, 3 to 5 ahead of a camera that looks down at them.
+
+    They have a unit cube's bounds, stretched. Returns the problem of each, and the direction (3,)
+    against gravity in the camera.
 
     Examples
     --------
     >>> camera = Camera(640, 480, 700, 700, 319.5, 239.5)
-    >>> boxes = simulate_standing_boxes(np.random.default_rng(0), objects=2, camera=camera)
-    >>> lowest = [each.alignment.apply(boxes.BOUNDS)[0] for each in boxes.problems]
-    >>> np.round([-boxes.up @ corner for corner in lowest], 6).tolist()
+    >>> boxes, up = simulate_standing_boxes(np.random.default_rng(0), objects=2, camera=camera)
+    >>> lowest = [each.alignment.apply(UNIT_BOUNDS)[0] for each in boxes]
+    >>> np.round([-up @ corner for corner in lowest], 6).tolist()
     [1.6, 1.6]
     """
     tilt = rotation_from_vector(np.array([rng.uniform(0.17, 0.5), 0.0, 0.0]))
@@ -120,7 +113,7 @@ def simulate_standing_boxes(
         if camera.contains(pixels).all():
             pixels = pixels + noise_px * rng.normal(size=pixels.shape)
             problems.append(Problem(model, pixels, camera, pose, None))
-    return StandingBoxes(tuple(problems), up)
+    return problems, up
 
 
 def random_rotation(rng: np.random.Generator) -> FloatArray:

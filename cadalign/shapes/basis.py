@@ -10,7 +10,14 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError
-from cadalign.shapes.parts import AXES, BOX_ROWS, KeypointId, Reflection, ShapeComponent
+from cadalign.shapes.parts import (
+    AXES,
+    BOX_ROWS,
+    KeypointId,
+    Reflection,
+    ShapeComponent,
+    checked_box,
+)
 
 # Rounding leaves eigenvalues this far below zero, relative to the largest.
 _NEGATIVE = 1e-8
@@ -32,7 +39,8 @@ def component_of_basis(
     if (sigmas < 0).any():
         row = int(np.flatnonzero(sigmas < 0)[0])
         raise InputError(f"deviations[{row}] is negative ({sigmas[row]:g})", where="deviations")
-    rows = np.vstack([points, _box(box, points)])
+    spanned = np.array([points.min(axis=0), points.max(axis=0)])
+    rows = np.vstack([points, spanned if box is None else checked_box(box, "box")])
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
     extended += _size_modes(rows, size_sigma)
@@ -45,7 +53,6 @@ def component_of_covariance(
     *,
     weight: float = 1.0,
     modes: int | None = None,
-    where: str = "covariance",
 ) -> ShapeComponent:
     """Make a component from a covariance: its largest eigenvectors are the modes.
 
@@ -53,14 +60,15 @@ def component_of_covariance(
     variance are taken. The variance that they leave is spread evenly over the coordinates. Raises
     InputError if the covariance is not finite, symmetric and positive semi-definite.
     """
-    matrix = as_floats(covariance, name=where, shape=(mean.size, mean.size))
+    matrix = as_floats(covariance, name="covariance", shape=(mean.size, mean.size))
     largest = np.abs(matrix).max()
     if np.abs(matrix - matrix.T).max() > 1e-6 * largest:
-        raise InputError("not symmetric", where=where)
+        raise InputError("not symmetric", where="covariance")
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     if values[0] < -_NEGATIVE * max(values[-1], 0.0) or values[-1] < 0:
         raise InputError(
-            f"not positive semi-definite: its least eigenvalue is {values[0]:.3g}", where=where
+            f"not positive semi-definite: its least eigenvalue is {values[0]:.3g}",
+            where="covariance",
         )
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     count = int((values > 1e-15 * values[0]).sum())
@@ -81,16 +89,6 @@ def _directions(modes: npt.ArrayLike, count: int) -> FloatArray:
         flat = as_floats(modes, name="modes", shape=(None, 3 * count))
         return flat.reshape(len(flat), count, 3)
     return as_floats(modes, name="modes", shape=(None, count, 3))
-
-
-def _box(box: npt.ArrayLike | None, points: FloatArray) -> FloatArray:
-    if box is None:
-        return np.array([points.min(axis=0), points.max(axis=0)])
-    corners = as_floats(box, name="box", shape=(2, 3))
-    if (corners[0] > corners[1]).any():
-        what = f"the least corner {corners[0].tolist()} exceeds {corners[1].tolist()}"
-        raise InputError(what, where="box")
-    return corners
 
 
 def _corners(points: FloatArray, mode: FloatArray, corners: FloatArray) -> FloatArray:

@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, as_floats, as_points, read_only
+from cadalign.arrays import FloatArray, as_points, read_only
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.mesh import Mesh
-from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids
+from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids, checked_box
 
 logger = logging.getLogger("cadalign")
 
@@ -50,10 +50,7 @@ class Example:
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "points_3d", read_only(points))
         if self.bounds is not None:
-            bounds = as_floats(self.bounds, name=f"{where}, bounds", shape=(2, 3))
-            if (bounds[0] > bounds[1]).any():
-                what = f"the least corner {bounds[0].tolist()} exceeds {bounds[1].tolist()}"
-                raise InputError(what, where=f"{where}, bounds")
+            bounds = checked_box(self.bounds, f"{where}, bounds")
             object.__setattr__(self, "bounds", read_only(bounds))
 
 

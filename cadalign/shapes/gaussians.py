@@ -32,16 +32,9 @@ class Gaussians(NamedTuple):
         return Gaussians(self.weights, self.means, self.covariances + noise)
 
 
-class Prior(NamedTuple):
-    """Prior on the covariances.
-
-    They are drawn towards ``covariance`` (d, d), which counts as ``strength`` vectors; no direction
-    falls below the standard deviation ``floor``.
-    """
-
-    covariance: FloatArray
-    strength: float
-    floor: float
+Prior = tuple[FloatArray, float, float]
+"""What covariances are drawn towards (d, d), the number of vectors that it counts as, and the
+standard deviation that no direction falls below."""
 
 
 class Pattern(NamedTuple):
@@ -92,9 +85,9 @@ class Vectors:
         """Mean squared distance of the entries from their means."""
         return float(np.nanmean((self.values - self.mean) ** 2))
 
-    def completed(self, model: Gaussians, number: int = 0) -> FloatArray:
-        """The vectors with their expected missing entries under a component, (N, d) float."""
-        return _expect(self, np.zeros(len(self.values)), model, number)[0]
+    def completed(self, model: Gaussians) -> FloatArray:
+        """The vectors with their expected missing entries under the first component, (N, d)."""
+        return _expect(self, np.zeros(len(self.values)), model, 0)[0]
 
 
 def log_likelihoods(values: FloatArray, model: Gaussians) -> FloatArray:
@@ -107,7 +100,7 @@ def learn_gaussian(vectors: Vectors, *, strength: float, floor: float, rounds: i
     """Learn one Gaussian; its covariance is drawn towards that of independent, equal entries."""
     width = (vectors.variance + floor**2) * np.eye(vectors.values.shape[1])
     start = Gaussians(np.ones(1), vectors.mean[None], width[None])
-    model, prior = start, Prior(width, strength, floor)
+    model, prior = start, (width, strength, floor)
     shares = vectors.weights[:, None]
     for _ in range(rounds):
         model = _maximise(vectors, shares, model, prior)
@@ -143,7 +136,7 @@ def learn_mixture(
             responsibilities = np.exp(densities)
         within = np.einsum("g,gij->ij", model.weights, model.covariances)
         shares = vectors.weights[:, None] * responsibilities
-        model = _maximise(vectors, shares, model, Prior(within, strength, floor))
+        model = _maximise(vectors, shares, model, (within, strength, floor))
     return model
 
 
@@ -184,15 +177,16 @@ def _expect(
 def _maximise(vectors: Vectors, shares: FloatArray, model: Gaussians, prior: Prior) -> Gaussians:
     """One round: the mixture that makes the completed vectors most likely."""
     means, covariances = [], []
+    towards, strength, floor = prior
     for number, share in enumerate(shares.T):
         completed, spread = _expect(vectors, share, model, number)
         mean = share @ completed + _UNSEEN * model.means[number]
         mean /= share.sum() + _UNSEEN
         offsets = completed - mean
         scatter = offsets.T @ (share[:, None] * offsets) + spread
-        scatter += (prior.strength + _UNSEEN) * prior.covariance
-        covariance = scatter / (share.sum() + prior.strength + _UNSEEN)
-        covariance[np.diag_indices_from(covariance)] += prior.floor**2
+        scatter += (strength + _UNSEEN) * towards
+        covariance = scatter / (share.sum() + strength + _UNSEEN)
+        covariance[np.diag_indices_from(covariance)] += floor**2
         means.append(mean)
         covariances.append(covariance)
     totals = shares.sum(axis=0) + _UNSEEN

@@ -282,6 +282,15 @@ def check_axis(axis: object, where: str) -> None:
         raise InputError(f"{axis!r} is not one of 'x', 'y', 'z'", where=where)
 
 
+def checked_box(box: npt.ArrayLike, where: str) -> FloatArray:
+    """The least and the greatest corner of a box (2, 3); InputError if it is upside down."""
+    corners = as_floats(box, name=where, shape=(2, 3))
+    if (corners[0] > corners[1]).any():
+        what = f"the least corner {corners[0].tolist()} exceeds {corners[1].tolist()}"
+        raise InputError(what, where=where)
+    return corners
+
+
 def check_ids(ids: Sequence[KeypointId], where: str) -> tuple[KeypointId, ...]:
     """Check a list of keypoints' ids or names: whole numbers or texts, not both, none twice."""
     found: list[KeypointId] = []

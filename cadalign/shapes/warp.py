@@ -19,6 +19,7 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.shapes.parts import checked_box
 
 # Lengths relative to the diagonal of mesh and keypoints.
 _ROUNDING = 0.02  # of the kernel's tip, at most
@@ -70,7 +71,7 @@ def warp_mesh(
     if not len(places):
         raise InputError("no keypoints", where="source")
     if bounds is not None:
-        corners = _checked_bounds(bounds)
+        corners = checked_box(bounds, "bounds")
         warp = linear_warp(mesh.vertices, mesh.bounds, places)
         return replace(mesh, vertices=warp.apply(targets, corners))
     diagonal = _diagonal(mesh.bounds, places)
@@ -181,14 +182,6 @@ def _stretch_of_keypoints(
     stretch = ((offsets * moved).sum(axis=0) + weight * equal) / ((offsets**2).sum(axis=0) + weight)
     stretch = np.maximum(stretch, _LEAST_STRETCH * equal)
     return lambda points: (points - centre) * stretch + to
-
-
-def _checked_bounds(bounds: npt.ArrayLike) -> FloatArray:
-    corners = as_floats(bounds, name="bounds", shape=(2, 3))
-    if (corners[1] < corners[0]).any():
-        what = f"the least corner {corners[0].tolist()} exceeds {corners[1].tolist()}"
-        raise InputError(what, where="bounds")
-    return corners
 
 
 def _corners(low: FloatArray, high: FloatArray, margin: float) -> FloatArray:

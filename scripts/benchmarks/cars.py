@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 import cadalign
-from benchmarks.section import BenchmarkData, Row, Tables, attempt, percent, spread
+from benchmarks import section
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray
 from cadalign.datasets import ImageKeypoints
 from cadalign.datasets import open as open_data
@@ -91,13 +92,13 @@ def noise_of_detector(given: BenchmarkData) -> Tables:
     rows = []
     for name, fields in ways.items():
         found = [
-            attempt(_yaw_of_view, model, *each)
+            section.attempt(_yaw_of_view, model, *each)
             for each in zip(seen, placed, fields, strict=True)
             if (each[0].scores > 0).sum() >= _LEAST_KEYPOINTS
         ]
         errors, held = np.array([each for each in found if each is not None]).T
-        row = {"noise": name, "cars": len(errors), "yaw, deg": spread(errors)}
-        rows.append(row | {"95 % regions hold, %": percent(held)})
+        row = {"noise": name, "cars": len(errors), "yaw, deg": section.spread(errors)}
+        rows.append(row | {"95 % regions hold, %": section.percent(held)})
     yield "Yaw of cars", rows
 
 
@@ -187,7 +188,7 @@ def _detections_row(name: str, cars: list[_Car], web: Path, options: dict[str, A
             errors.append((yaw, abs(depth / box.center[2] - 1)))
     yaws, depths = np.array(errors).T
     row = {"cadalign fit": name, "cars aligned": f"{len(yaws)} of {len(cars)}"}
-    row |= {"yaw, deg": spread(yaws), "depth, %": 100 * float(np.median(depths))}
+    row |= {"yaw, deg": section.spread(yaws), "depth, %": 100 * float(np.median(depths))}
     if "shape" not in options:  # that of cars is not theirs
         photos = cadalign.fit_many(web, **options)
         row["web photos aligned"] = f"{int(photos.solved.sum())} of {len(photos)}"
@@ -219,7 +220,7 @@ def car_tracks(folder: Path) -> Iterator[Row]:
         yield {
             "way": way,
             "frames": len(yaw),
-            "yaw, deg": spread(yaw),
+            "yaw, deg": section.spread(yaw),
             "depth, %": float(np.median(depth)),
             "jitter, deg": float(np.concatenate(jitters).std()),
         }
@@ -273,7 +274,7 @@ def car_scenes(folder: Path, sigma: float) -> list[Row]:
                         found[name][column].append(error)
     return [
         {"method": name, "cars": len(columns["yaw deg"])}
-        | {column: spread(errors) for column, errors in columns.items()}
+        | {column: section.spread(errors) for column, errors in columns.items()}
         for name, columns in found.items()
     ]
 

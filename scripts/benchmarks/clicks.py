@@ -11,8 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks import section
 from benchmarks.photo import PhotoClicks, bop_cases
-from benchmarks.section import BenchmarkData, Row, Tables, attempt, clocked, spread, summary
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Model, View, align
 from cadalign.annotate.candidates import MaskCandidates, best_click
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
@@ -79,7 +80,7 @@ def clicks(given: BenchmarkData, *, draws: int = 3, most: int = 12, within: floa
 def _needed(clicks: PhotoClicks, method: Estimator, least: int, most: int, within: float) -> int:
     enough = most + 1
     for count in (*range(most, _FEWEST - 1, -1), 0):
-        est = attempt(method, clicks.first(count)) if count >= least else None
+        est = section.attempt(method, clicks.first(count)) if count >= least else None
         if est is None or rotation_error(est=est, gt=clicks.true_for(est)) >= within:
             break
         enough = count
@@ -114,11 +115,11 @@ def outline_methods(given: BenchmarkData, *, draws: int = 5) -> Tables:
             clicks = case.clicked(rng, stretched=False)
             first = rotation_error(est=_by_clicks(clicks), gt=clicks.truth)
             for name, method in methods.items():
-                wall, _, est = clocked(partial(method, clicks))
+                wall, _, est = section.clocked(partial(method, clicks))
                 error = rotation_error(est=est, gt=clicks.truth)
                 row = {"R": error, "better": error < first, "seconds": wall}
                 found[f"{case.group}, {name}"].append(row)
-    rows = [{"photos": name, **summary(each)} for name, each in found.items()]
+    rows = [{"photos": name, **section.summary(each)} for name, each in found.items()]
     yield "rough clicks refined, rigid models: medians", rows
 
 
@@ -177,7 +178,7 @@ def _clicked(
     ids, points = other.keypoints.ids.tolist(), other.keypoints.xyz
     model = Model(points_3d=points, ids=ids, mesh=other.load_mesh(), shape_sigma=shape_sigma)
     mask = cast_geometry(scene, KEYPOINT_CAMERA, gt).mask
-    wall, _, result = clocked(lambda: align(model, View(KEYPOINT_CAMERA, mask=mask)))
+    wall, _, result = section.clocked(lambda: align(model, View(KEYPOINT_CAMERA, mask=mask)))
     candidates = MaskCandidates.of(model, KEYPOINT_CAMERA, result)
     predicted = candidates.predicted(ids, points)
     chances = candidates.probabilities((), np.empty((0, 3)), np.empty((0, 2)))
@@ -219,7 +220,7 @@ def _told(name: str, rows: list[Row]) -> Row:
         "right first": np.mean([row["first"] for row in rows]),
         "right among": np.mean([row["among"] for row in rows]),
         "several": len(several),
-        "clicks": spread(clicks) if clicks else None,
+        "clicks": section.spread(clicks) if clicks else None,
         "one left": len(clicks),
         "none left": sum(row["refused"] for row in several),
         "right left": sum(row["right"] for row in several),

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 import cadalign
-from benchmarks.section import BenchmarkData, Row, Tables, attempt, fitted, percent
+from benchmarks import section
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -63,13 +64,13 @@ def _regions(seed: int, noise_px: float, region_problems: int) -> Iterator[Row]:
             reached = []
             for number in range(region_problems):
                 rng = np.random.default_rng([seed, points, number])
-                found = attempt(_estimated, rng, kind, points, noise_px)
+                found = section.attempt(_estimated, rng, kind, points, noise_px)
                 if found is not None:
                     reached.append(_regions_reached(*found))
             row: Row = {"estimate": kind, "keypoints": points, "results": len(reached)}
             if reached:  # not all were refused
                 for name, levels in zip(_REGIONS, np.transpose(reached), strict=True):
-                    shares = (percent(levels <= share) for share in (0.68, 0.95))
+                    shares = (section.percent(levels <= share) for share in (0.68, 0.95))
                     row[name] = ", ".join(f"{share:.0f}" for share in shares)
             yield row
 
@@ -81,11 +82,11 @@ def _similar(seed: int, region_problems: int) -> Iterator[Row]:
                 found = []
                 for number in range(region_problems):
                     rng = np.random.default_rng([seed, points, number])
-                    similar = attempt(_similar_estimate, rng, shape_sigma, stretch, points)
+                    similar = section.attempt(_similar_estimate, rng, shape_sigma, stretch, points)
                     if similar is not None:
                         found.append(similar)
                 bias, stated, turn, level = np.array(found).T
-                within = ", ".join(f"{percent(level <= p):.0f}" for p in (0.68, 0.95))
+                within = ", ".join(f"{section.percent(level <= p):.0f}" for p in (0.68, 0.95))
                 yield {
                     "stretch": stretch,
                     "shape_sigma": shape_sigma,
@@ -111,7 +112,7 @@ def _coverage(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
             ]
             names = ("inverse Fisher %", "stated %", "no alternative %")
             row = {"sigma": str(sigma), "loss": loss, "keypoints": points}
-            yield row | dict(zip(names, map(percent, np.transpose(held)), strict=True))
+            yield row | dict(zip(names, map(section.percent, np.transpose(held)), strict=True))
 
 
 def _warnings(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
@@ -136,7 +137,7 @@ def _fits(
     """Problems with their fits; those that are refused are left out."""
     for number in range(problems):
         problem = draw(np.random.default_rng([seed, number]))
-        result = fitted(problem, **options)
+        result = section.fitted(problem, **options)
         if result is not None:
             yield problem, result
 

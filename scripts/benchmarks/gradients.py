@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables, figure, medians_in_turns
+from benchmarks import section
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
@@ -22,7 +23,7 @@ def _torch() -> Any:
     try:
         import torch
     except ImportError:
-        raise NotGivenError("pip install -e '.[torch]'") from None
+        raise section.NotGivenError("pip install -e '.[torch]'") from None
     return torch
 
 
@@ -86,10 +87,10 @@ def torch_layer(
         return time.perf_counter() - begun
 
     timed = {name: partial(seconds_of, way) for name, way in ways.items()}
-    found = medians_in_turns(timed, repeats)
+    found = section.medians_in_turns(timed, repeats)
     name = f"{problems} fits of {points} points with gradients"
     ratio = found["layer"] / found["unrolled"]
-    row = figure(name, 1e3 * found["layer"], "ms", ratio, "unrolled Gauss-Newton")
+    row = section.figure(name, 1e3 * found["layer"], "ms", ratio, "unrolled Gauss-Newton")
     others = {f"{each}, ms": 1e3 * found[each] for each in ways if each != "layer"}
     yield "PyTorch", [row | others]
 

@@ -12,17 +12,8 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.section import (
-    LIMIT_DRAWS,
-    BenchmarkData,
-    Row,
-    Tables,
-    attempt,
-    clocked,
-    meshed_models,
-    percent,
-    summary,
-)
+from benchmarks import section
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Camera, Model, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel
@@ -84,9 +75,9 @@ def masks(
 def _measure(cases: list[_Case], kind: str, seed: int) -> Row:
     alone, joint, bounds, bottles, further = [], [], [], [], []
     for case, mask, rng in _damaged(cases, kind, seed):
-        without = attempt(align, case.model, case.view(None))
+        without = section.attempt(align, case.model, case.view(None))
         view = case.view(mask)
-        wall, _, result = clocked(partial(attempt, align, case.model, view))
+        wall, _, result = section.clocked(partial(section.attempt, align, case.model, view))
         if without is None or result is None:
             print(kind, case.annotated.model_id, "is refused")
             continue
@@ -159,7 +150,7 @@ def _alone(cases: list[_Case], kind: str, seed: int) -> Row:
     for case, mask, _ in _damaged(cases, kind, seed):
         model = Model(mesh=case.scene.mesh, symmetry=case.annotated.symmetry)
         view = View(case.camera, mask=mask)
-        wall, _, result = clocked(partial(attempt, align, model, view))
+        wall, _, result = section.clocked(partial(section.attempt, align, model, view))
         if result is None:
             print(kind, case.annotated.model_id, "is refused")
             found.append({"first": False, "among five": False, "seconds": np.nan})
@@ -167,7 +158,7 @@ def _alone(cases: list[_Case], kind: str, seed: int) -> Row:
         poses = [result.alignment, *(each.alignment for each in result.alternatives[:4])]
         right = [case.is_right(pose) for pose in poses]
         found.append({"first": right[0], "among five": any(right), "seconds": wall})
-    return {"mask": kind, **summary(found)}
+    return {"mask": kind, **section.summary(found)}
 
 
 @dataclass(frozen=True)
@@ -226,7 +217,7 @@ class _Case:
 
     def ideal_errors(self, bound: FloatArray, rng: np.random.Generator) -> list[list[float]]:
         """`errors` of an ideal estimator, of every draw."""
-        drawn = rng.multivariate_normal(np.zeros(9), bound, size=LIMIT_DRAWS, method="eigh")
+        drawn = rng.multivariate_normal(np.zeros(9), bound, size=section.LIMIT_DRAWS, method="eigh")
         truth, found = self.truth, []
         for turn, shift, logs in zip(drawn[:, :3], drawn[:, 3:6], drawn[:, 6:], strict=True):
             rotation = rotation_from_vector(turn) @ truth.rotation
@@ -250,7 +241,7 @@ _Meshed = tuple[AnnotatedModel, Scene]
 def _models_of(given: BenchmarkData) -> list[_Meshed]:
     """The models of the sample dataset and, where it is given, of KeypointNet, with meshes."""
     with tempfile.TemporaryDirectory() as folder:
-        sample, real = meshed_models(given, folder, per_category=1)
+        sample, real = section.meshed_models(given, folder, per_category=1)
         return [(model, Scene(model.load_mesh())) for model in (*sample, *real)]
 
 
@@ -261,7 +252,9 @@ def _drawn(model: _Meshed, rng: np.random.Generator, **how: Any) -> _Case | None
     seen = scene, annotated.keypoints.xyz, KEYPOINT_CAMERA
     view = None
     for least in (7, _LEAST_KEYPOINTS):
-        view = view or attempt(sample_view, *seen, min_visible=least, rng=rng, scale=scale, **how)
+        view = view or section.attempt(
+            sample_view, *seen, min_visible=least, rng=rng, scale=scale, **how
+        )
     if view is None:
         return None
     ids = np.flatnonzero(view.visible).tolist()
@@ -277,7 +270,7 @@ def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed:
         case = _drawn(models[number % len(models)], rng, **how)
         if case is None:
             continue
-        wall, _, result = clocked(partial(align, case.model, case.view(case.mask)))
+        wall, _, result = section.clocked(partial(align, case.model, case.view(case.mask)))
         est, truth = result.alignment, case.truth
         # The logarithm of the distance: it rises with the stretches where the size is open.
         error = np.concatenate(
@@ -301,7 +294,7 @@ def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed:
         "count": len(found),
         "beyond 10 %": int((np.maximum(stretch, distance) > _FAR_OFF).sum()),
         "of the bound": float(ideals.sum()),
-        "beyond the 99.9 % region, %": percent(squares > chi2.ppf(0.999, len(_FREE))),
+        "beyond the 99.9 % region, %": section.percent(squares > chi2.ppf(0.999, len(_FREE))),
         "95 % regions hold": float((squares < chi2.ppf(0.95, len(_FREE))).mean()),
         "stretch, %": 100 * float(np.median(stretch)),
         "distance, %": 100 * float(np.median(distance)),

@@ -14,16 +14,8 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.section import (
-    BenchmarkData,
-    Row,
-    Tables,
-    attempt,
-    clocked,
-    meshed_models,
-    processor_seconds,
-    summary,
-)
+from benchmarks import section
+from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, Mesh, Model, Result, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, load_mesh
@@ -72,7 +64,7 @@ def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> T
                 clicks = case.clicked(rng, stretched=stretched)
                 rows[f"{case.group} {case.kind}"].append(_compared(clicks))
         title = "an unknown stretch" if stretched else "a rigid model"
-        table = [{"photos": name, **summary(found)} for name, found in rows.items()]
+        table = [{"photos": name, **section.summary(found)} for name, found in rows.items()]
         yield f"photos beside rough clicks, {title}: medians", table
 
 
@@ -95,23 +87,23 @@ def photo_times(given: BenchmarkData, *, composites: int = 12, frames: int = 40)
         for stretched in (False, True):
             rng = np.random.default_rng([given.seed, 7, number])
             clicks = case.clicked(rng, stretched=stretched)
-            first = processor_seconds(clicks.aligned)
+            first = section.processor_seconds(clicks.aligned)
             row, second = _compared(clicks), -first
-            second += processor_seconds(partial(clicks.aligned, image=case.pixels))
+            second += section.processor_seconds(partial(clicks.aligned, image=case.pixels))
             kept = {name: row[name] for name in ("R clicks", "R photo", "seconds")}
             rows["stretched" if stretched else "rigid"].append(kept | {"processor": second})
     table = []
     for name, found in rows.items():
         late = float(np.percentile([row["processor"] for row in found], 90))
-        table.append({"model": name, **summary(found), "processor, 90 %": late})
+        table.append({"model": name, **section.summary(found), "processor, 90 %": late})
     yield "photos of 2 megapixels beside six clicks: medians", table
     clips = list(_clip_rows(given, frames)) if frames else []
     yield "a track by photos of 640 x 480 px", clips
 
 
 def _compared(clicks: PhotoClicks) -> Row:
-    first, _, alone = clocked(clicks.aligned)
-    second, _, joint = clocked(partial(clicks.aligned, image=clicks.case.pixels))
+    first, _, alone = section.clocked(clicks.aligned)
+    second, _, joint = section.clocked(partial(clicks.aligned, image=clicks.case.pixels))
     before, after = clicks.errors(alone), clicks.errors(joint)
     row: Row = {}
     for error, *values in zip(("R", "t", "stretch"), before, after, strict=True):
@@ -264,7 +256,7 @@ def _scenery(
     """Models of ShapeNet and of the sample, and real photos of a camera's size."""
     root = given.needed().parent
     with tempfile.TemporaryDirectory() as folder:
-        sample, real = meshed_models(given, folder, per_category=2)
+        sample, real = section.meshed_models(given, folder, per_category=2)
         scenes = [(m, Scene(m.load_mesh())) for m in (*real, *sample)]
     photos = sorted((root / "sfm").rglob("*.jpg")) + sorted((root / "real").rglob("rgb/*.png"))
     size = camera.width, camera.height
@@ -279,7 +271,7 @@ def _composites(given: BenchmarkData, count: int, camera: Camera = _CAMERA) -> I
         rng = np.random.default_rng([given.seed, number])
         model, scene = scenes[number % len(scenes)]
         how: dict[str, Any] = {"min_visible": 0, "fill": (0.4, 0.8), "roll": 15.0}
-        view = attempt(sample_view, scene, model.keypoints.xyz, camera, rng=rng, **how)
+        view = section.attempt(sample_view, scene, model.keypoints.xyz, camera, rng=rng, **how)
         if view is None:
             continue
         pixels = behind[rng.integers(len(behind))]
@@ -323,7 +315,9 @@ def _clip_rows(given: BenchmarkData, frames: int) -> Iterator[Row]:
             truth = Alignment(turn @ truth.rotation, place, np.ones(3))
             drawn = RaycastRenderer().render(scene, _CAMERA, truth, samples=4).composite(pixels)
             photo = View(_CAMERA, image=_blurred(drawn, rng))
-            _, busy, result = clocked(partial(attempt, align, own, photo, init=last))
+            _, busy, result = section.clocked(
+                partial(section.attempt, align, own, photo, init=last)
+            )
             last = truth if result is None else result.alignment
             nearest = nearest_truth(est=last, gt=truth, symmetry=model.symmetry)
             error = rotation_error(est=last, gt=nearest)

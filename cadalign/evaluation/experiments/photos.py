@@ -26,19 +26,7 @@ from cadalign.evaluation.metrics.sets import medians_of, score_columns, shares_o
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.outcome import FAILED, LEFT_OUT, OK, UNREADABLE
-from cadalign.evaluation.photos.protocols import (
-    DEPTH,
-    GRAVITY,
-    MASK,
-    RIGID,
-    SETS,
-    SIMULATED,
-    KeypointOptions,
-    check_method,
-    default_methods,
-    is_own,
-    protocol_of,
-)
+from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
@@ -61,13 +49,13 @@ if TYPE_CHECKING:
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),
-    *(("rms_px", float), *score_columns(SETS)),
+    *(("rms_px", float), *score_columns(protocols.SETS)),
 )
 """Columns of the result table; see docs/formats/runs.md."""
 
 
 @dataclass(frozen=True)
-class PhotosOptions(FunctionOptions, KeypointOptions):
+class PhotosOptions(FunctionOptions, protocols.KeypointOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
     The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
@@ -107,12 +95,16 @@ class PhotosOptions(FunctionOptions, KeypointOptions):
             raise InputError(f"{self.similar_sigma} is not positive", where="similar_sigma")
         self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
         for name in self.methods:
-            if is_own(name) or not is_registered(name):
-                check_method(name)
+            if protocols.is_own(name) or not is_registered(name):
+                protocols.check_method(name)
 
 
 MEAN = "mean of categories"
-GALLERY = (*(metric for each in SETS for metric in each.medians), metrics.RMS, *BOP.shares)
+GALLERY = (
+    *(metric for each in protocols.SETS for metric in each.medians),
+    metrics.RMS,
+    *BOP.shares,
+)
 """Errors of single objects."""
 # The data sets' own first.
 _OWN_FIRST = (SCAN2CAD, KITTI, BOP, VIEWPOINT, NINE_DOF)
@@ -143,12 +135,12 @@ def summarize_cells(
 
 def _categories(cells: Cells) -> npt.NDArray[np.object_]:
     """The rows' categories, those of objects with simulated keypoints marked."""
-    categories, is_simulated = cells["category"], cells["source"] == SIMULATED
+    categories, is_simulated = cells["category"], cells["source"] == protocols.SIMULATED
     known_otherwise = set(categories[(cells["status"] != LEFT_OUT) & ~is_simulated].tolist())
     only = set(categories[is_simulated].tolist()) - known_otherwise
     marked = is_simulated | np.isin(categories.astype(str), sorted(only))
     names = [
-        f"{name}, {SIMULATED}" if mark else name
+        f"{name}, {protocols.SIMULATED}" if mark else name
         for name, mark in zip(categories.tolist(), marked.tolist(), strict=True)
     ]
     return np.array(names, dtype=object)
@@ -156,7 +148,7 @@ def _categories(cells: Cells) -> npt.NDArray[np.object_]:
 
 def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """The summaries for the console: the columns that the data set has."""
-    sets = protocol_of(str(run.config.get("kind"))).metrics
+    sets = protocols.protocol_of(str(run.config.get("kind"))).metrics
     columns = (
         *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT),
         *(column for each in sets for column in each.console),
@@ -164,8 +156,8 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         *run.metrics,
     )
     shown = [c for c in columns if not all(np.isnan(each[c.key]) for each in summaries)]
-    has_simulated = any(SIMULATED in each.group for each in summaries)
-    more = f"; {SIMULATED}: keypoints projected with the true pose, with noise"
+    has_simulated = any(protocols.SIMULATED in each.group for each in summaries)
+    more = f"; {protocols.SIMULATED}: keypoints projected with the true pose, with noise"
     return ConsoleTable.of(
         "Medians and shares per category and method",
         summaries,
@@ -186,8 +178,8 @@ def _summarize(category: str, method: str, cells: Cells) -> Summary:
         "failed": int((rated["status"] == FAILED).sum()),
         metrics.LEFT_OUT.key: int(left_out.sum()),
         "keypoints": mean_of(solved["keypoints"]),
-        **medians_of(SETS, solved, metrics.RMS),
-        **shares_of(SETS, rated, solved),
+        **medians_of(protocols.SETS, solved, metrics.RMS),
+        **shares_of(protocols.SETS, rated, solved),
         "milliseconds": milliseconds(solved),
     }
     return Summary(category, {"category": category, "method": method}, values)
@@ -228,11 +220,11 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     from cadalign.evaluation.shape_files import shapes_fingerprint, shapes_of
 
     dataset = opened(options.root)
-    protocol = protocol_of(dataset.kind)
+    protocol = protocols.protocol_of(dataset.kind)
     shapes = shapes_of(options.shape, dataset.root)
     if not options.methods:
-        methods = default_methods(
-            with_evidence=tuple(dict.fromkeys((RIGID, protocol.best))),
+        methods = protocols.default_methods(
+            with_evidence=tuple(dict.fromkeys((protocols.RIGID, protocol.best))),
             evidence=_evidence(dataset),
             has_shape=bool(shapes),
         )
@@ -258,9 +250,9 @@ def _evidence(dataset: PhotoDataset) -> set[str]:
         except DataError:
             continue
         has = {
-            MASK: any(each.mask_path is not None for each in photo.objects),
-            DEPTH: photo.depth is not None,
-            GRAVITY: photo.up is not None,
+            protocols.MASK: any(each.mask_path is not None for each in photo.objects),
+            protocols.DEPTH: photo.depth is not None,
+            protocols.GRAVITY: photo.up is not None,
         }
         found |= {name for name, is_there in has.items() if is_there}
     return found
@@ -269,7 +261,7 @@ def _evidence(dataset: PhotoDataset) -> set[str]:
 def _describe(run: Run) -> str:
     status, source = run.cells["status"], run.cells["source"]
     objects = len({*run.cells["model_id"][status != LEFT_OUT].tolist()})
-    simulated = len({*run.cells["model_id"][source == SIMULATED].tolist()})
+    simulated = len({*run.cells["model_id"][source == protocols.SIMULATED].tolist()})
     text = f"on {objects:,} objects in photos of {run.dataset} ({run.config.get('kind')})"
     if not simulated:
         return text

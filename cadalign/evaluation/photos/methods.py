@@ -20,22 +20,8 @@ from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.methods.method import SHAPE
 from cadalign.evaluation.outcome import LeftOutError
-from cadalign.evaluation.photos.protocols import (
-    DEPTH,
-    EPNP,
-    GRAVITY,
-    IMAGE,
-    MASK,
-    PRIOR,
-    RIGID,
-    SIMILAR,
-    SIMULATED,
-    STRETCHED,
-    TRUTH,
-    KeypointOptions,
-    Protocol,
-    parts_of,
-)
+from cadalign.evaluation.photos import protocols
+from cadalign.evaluation.photos.protocols import KeypointOptions, Protocol
 from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of, spread_points
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -47,7 +33,9 @@ from cadalign.shapes.model import ShapeModel
 
 ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
-_OUTLINED = frozenset({MASK, IMAGE})  # evidence about the model's outline, which needs a mesh
+_OUTLINED = frozenset(
+    {protocols.MASK, protocols.IMAGE}
+)  # evidence about the model's outline, which needs a mesh
 _RIM = 2  # width of a mask's rim [px]
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
@@ -91,7 +79,7 @@ def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> 
         source = ANNOTATED if marks.scores is None else DETECTED
         names, pixels = _marked(target.found, model, options.min_score)
     else:
-        source = SIMULATED
+        source = protocols.SIMULATED
         model, names, pixels = _simulated(target, camera, cad, model, options)
     if len(names) < options.min_keypoints:
         raise LeftOutError(f"{len(names)} keypoints are fewer than {options.min_keypoints}")
@@ -169,7 +157,7 @@ def _in_mask(mask: BoolArray, pixels: FloatArray) -> BoolArray:
 
 def _sigma(target: PhotoTarget, protocol: Protocol, options: KeypointOptions, source: str) -> float:
     """The standard deviation of keypoints [px] that methods are given."""
-    if source == SIMULATED:
+    if source == protocols.SIMULATED:
         return max(options.simulated_noise_px, _LEAST_PX)
     if options.sigma is not None:
         return options.sigma
@@ -217,13 +205,13 @@ def estimate_object(
     LeftOutError if the object lacks what the method needs; and CadalignError if there is no
     estimate.
     """
-    base, evidence = parts_of(method)
-    if base == TRUTH:
+    base, evidence = protocols.parts_of(method)
+    if base == protocols.TRUTH:
         gt, box = sighting.target.gt, sighting.target.gt_box
         if gt is None or box is None:
             raise LeftOutError("the true pose is not known")
         return PhotoEstimate(gt, box)
-    if base == EPNP:
+    if base == protocols.EPNP:
         points = sighting.points_3d * sighting.width
         found = fit(points, sighting.points_2d, sighting.camera, method="epnp")
         return estimate_of_model(found.alignment, sighting)
@@ -239,23 +227,23 @@ def with_all_evidence(sighting: Sighting) -> tuple[Model, list[View]]:
     target = sighting.target
     has_mesh = target.cad is not None and target.cad.has_mesh
     kinds = {
-        MASK: has_mesh and target.found.mask_path is not None,
-        DEPTH: target.photo.depth is not None,
-        GRAVITY: target.photo.up is not None,
+        protocols.MASK: has_mesh and target.found.mask_path is not None,
+        protocols.DEPTH: target.photo.depth is not None,
+        protocols.GRAVITY: target.photo.up is not None,
     }
     evidence = [kind for kind, is_there in kinds.items() if is_there]
-    model = _model(STRETCHED, sighting, 0.0, with_mesh=has_mesh)
+    model = _model(protocols.STRETCHED, sighting, 0.0, with_mesh=has_mesh)
     return model, [_view(sighting, evidence)]
 
 
 def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bool) -> Model:
     width, bounds = sighting.width, sighting.bounds * sighting.width
     kind: dict[str, Any] = {}
-    if base == RIGID:
+    if base == protocols.RIGID:
         kind = {"stretch": "none"}
-    elif base == PRIOR:
+    elif base == protocols.PRIOR:
         kind = {"stretch_sigma": SIMILAR_SCALE_SIGMA}
-    elif base == SIMILAR:
+    elif base == protocols.SIMILAR:
         diagonal = float(np.linalg.norm(np.ptp(bounds, axis=0)))
         kind = {"shape_sigma": similar_sigma * diagonal}
     if with_mesh:
@@ -276,19 +264,19 @@ def _model(base: str, sighting: Sighting, similar_sigma: float, *, with_mesh: bo
 def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(None)) -> View:
     photo, found = sighting.target.photo, sighting.target.found
     given: dict[str, Any] = {}
-    if MASK in evidence:
+    if protocols.MASK in evidence:
         if found.mask_path is None:
             raise LeftOutError("the object has no mask")
         given["mask"] = found.read_mask()
-    if DEPTH in evidence:
+    if protocols.DEPTH in evidence:
         if photo.depth is None:
             raise LeftOutError("the photo has no depth")
         given["depth"] = photo.depth.read()
-    if GRAVITY in evidence:
+    if protocols.GRAVITY in evidence:
         if photo.up is None:
             raise LeftOutError("the direction of gravity is not known")
         given |= {"up": photo.up, "up_sigma_deg": _UP_SIGMA_DEG}
-    if IMAGE in evidence:
+    if protocols.IMAGE in evidence:
         if photo.image is None:
             raise LeftOutError("the image is not there")
         given["image"] = photo.read_image()
@@ -316,7 +304,7 @@ def _of_shape(
         raise LeftOutError(f"there is no shape model of {category}")
     if _OUTLINED & frozenset(evidence):
         raise LeftOutError("a shape model has no mesh for the mask")
-    if GRAVITY in evidence and shape.up_axis is None:
+    if protocols.GRAVITY in evidence and shape.up_axis is None:
         raise LeftOutError("the shape model has no up axis for gravity")
     known = np.isin(sighting.names, [str(name) for name in shape.ids])
     if not known.any():

@@ -12,6 +12,7 @@ import numpy as np
 from cadalign.cli.common import make_folder
 from cadalign.errors import InputError
 from cadalign.io.documents import written_path
+from cadalign.io.files import finite, write_text
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
@@ -59,8 +60,6 @@ class FittedFile:
 
         The ``overlays`` go to ``overlay``, those of further views beside it.
         """
-        from cadalign.io.files import write_text
-
         make_folder(out)
         write_text(out / "fit.json", self.text(out))
         paths = _write_pictures(out / "overlay.png", self.pictures)
@@ -194,7 +193,7 @@ def list_contributions(result: Result) -> dict[str, Any]:
                 "kind": piece.kind,
                 "view": piece.view,
                 "name": piece.name,
-                "std_without": _finite(asdict(piece.without)),
+                "std_without": finite(asdict(piece.without)),
             }
             for piece in pieces
         ]
@@ -216,11 +215,3 @@ def _cells(std: Uncertainty) -> tuple[str, ...]:
 
 def _text(value: float, unit: str) -> str:
     return f"{value:.2g}{unit}" if np.isfinite(value) else "unknown"
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _finite(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(each) for each in value]
-    return value if np.isfinite(value) else None

@@ -37,11 +37,8 @@ _KINDS = {
 }
 
 
-class _Differ(NamedTuple):
-    """Differences of a category's models: standard deviations of keypoints and of log stretches."""
-
-    shape: float
-    stretch: float
+_Differ = tuple[float, float]
+"""How a category's models differ: standard deviations of keypoints and of log stretches."""
 
 
 class _Case(NamedTuple):
@@ -131,9 +128,10 @@ def _right(
     stretch = np.exp(np.append(0.0, rng.normal(0, _STRETCH_SIGMA, 2)))
     own = Model(points_3d=points / stretch, ids=ids)
     yield "own", _Case(own, ids, points, seen.points_2d, seen.gt)
-    how: dict[str, Any] = {"shape_sigma": differ.shape, "stretch_sigma": differ.stretch}
-    stretch = np.exp(np.append(0.0, rng.normal(0, differ.stretch, 2)))
-    object_points = (points + rng.normal(0, differ.shape, points.shape)) * stretch
+    by_shape, by_stretch = differ
+    how: dict[str, Any] = {"shape_sigma": by_shape, "stretch_sigma": by_stretch}
+    stretch = np.exp(np.append(0.0, rng.normal(0, by_stretch, 2)))
+    object_points = (points + rng.normal(0, by_shape, points.shape)) * stretch
     gt, noise = seen.gt, rng.normal(0, noise_px, seen.points_2d.shape)
     while not KEYPOINT_CAMERA.contains(
         KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
@@ -190,7 +188,7 @@ def models_differ(dataset: KeypointNet, category: str) -> _Differ:
         rest = b / np.where(thick, stretch, 1.0) - a
         squares += float((rest**2).sum())
         equations += rest.size - 3 - int(thick.sum())
-    return _Differ(float(np.sqrt(squares / equations)), float(np.std(logs)) if logs else 0.2)
+    return float(np.sqrt(squares / equations)), float(np.std(logs)) if logs else 0.2
 
 
 def _wrong(

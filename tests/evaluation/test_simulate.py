@@ -17,7 +17,6 @@ from cadalign.evaluation.experiments.simulation import (
     SWEEPS,
     SweepOptions,
     SweepProblems,
-    SweepTask,
     sweep_benchmark,
     sweep_tasks,
 )
@@ -69,8 +68,8 @@ def test_a_problem_does_not_depend_on_its_neighbours() -> None:
 
 def test_another_seed_gives_other_problems() -> None:
     kind = SweepOptions("points", values=(8,)).kind
-    first = SweepProblems(kind, 0).problem(SweepTask(8.0, 0))
-    other = SweepProblems(kind, 1).problem(SweepTask(8.0, 0))
+    first = SweepProblems(kind, 0).problem((8.0, 0))
+    other = SweepProblems(kind, 1).problem((8.0, 0))
     assert not np.array_equal(first.points_2d, other.points_2d)
 
 

@@ -128,11 +128,6 @@ _STATISTICS = {
 }
 
 
-def summarize(run: Run) -> list[Summary]:
-    """A summary for every category and method, and for all categories together."""
-    return by_category_and_method(run, _STATISTICS, count_skipped=True)
-
-
 def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """The summaries for the console."""
     shown = (
@@ -192,7 +187,7 @@ SPEC = Spec(
     plan=plan,
     results=COLUMNS,
     columns=HEADLINE,
-    summarize=summarize,
+    summarize=lambda run: by_category_and_method(run, _STATISTICS, count_skipped=True),
     table=console_table,
     plots=plots,
     topic="evidence beyond keypoints",

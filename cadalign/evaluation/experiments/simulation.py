@@ -181,17 +181,13 @@ COLUMNS: Columns = (
 )
 
 
-@dataclass(frozen=True)
-class SweepTask:
-    """One random problem; ``value`` is that of the quantity that is varied."""
-
-    value: float
-    run: int
+SweepTask = tuple[float, int]
+"""One random problem: the value of the quantity that is varied, and the problem's number."""
 
 
 def sweep_tasks(kind: SweepKind) -> list[SweepTask]:
     """All problems of a sweep, value by value."""
-    return [SweepTask(value, run) for value in kind.values for run in range(kind.runs)]
+    return [(value, run) for value in kind.values for run in range(kind.runs)]
 
 
 @dataclass(frozen=True)
@@ -207,7 +203,7 @@ class SweepProblems(Setting):
 
     def warm_up(self) -> Sequence[SweepTask]:
         """A task whose evaluation compiles the solvers."""
-        return [SweepTask(self.kind.values[0], 0)]
+        return [(self.kind.values[0], 0)]
 
     def case(self, task: SweepTask) -> Case:
         instance = self.problem(task), self._setting(task)["noise_px"] or 1.0
@@ -238,16 +234,17 @@ class SweepProblems(Setting):
 
     def problem(self, task: SweepTask) -> Problem:
         """The problem of a task."""
-        rng = instance_rng(self.seed, self.kind.name, repr(float(task.value)), str(task.run))
+        value, run = task
+        rng = instance_rng(self.seed, self.kind.name, repr(float(value)), str(run))
         return simulate_problem(rng, **self._setting(task))
 
     def _setting(self, task: SweepTask) -> Row:
         held = {name: getattr(self.kind, name) for name in ("points", "noise_px", "outlier_share")}
-        setting = {**held, self.kind.column: task.value}
+        setting = {**held, self.kind.column: task[0]}
         return {**setting, "points": int(setting["points"])}
 
     def _names(self, task: SweepTask) -> Row:
-        return {**self._setting(task), "run": task.run}
+        return {**self._setting(task), "run": task[1]}
 
 
 def sweep_benchmark(kind: SweepKind, seed: int, metrics: Sequence[str] = ()) -> Benchmark:

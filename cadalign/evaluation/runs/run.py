@@ -93,7 +93,7 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
     starts = range(0, len(tasks), size)
     missing = [k for k in range(len(starts)) if not _is_done(experiment, folder, k)]
     done = len(tasks) - sum(min(size, len(tasks) - starts[index]) for index in missing)
-    progress_file = _ProgressFile(folder.progress, len(tasks), done)
+    note = _progress_file(folder.progress, len(tasks), done)
     on_progress(Progress(done, len(tasks)))
     if not missing:
         return
@@ -104,9 +104,9 @@ def _do_chunks(plan: Plan[T], folder: RunFolder, workers: Workers, on_progress: 
             part = folder.part(table, index)
             write_rows(part, columns, rows.get(table, found.rows))
         done += len(some)
-        progress_file.note(done)
+        note(done, False)
         on_progress(Progress(done, len(tasks)))
-    progress_file.note(done, last=True)
+    note(done, True)
 
 
 def _is_done(experiment: Experiment[Any], folder: RunFolder, index: int) -> bool:
@@ -130,31 +130,30 @@ def _tables(experiment: Experiment[Any], folder: RunFolder) -> dict[Path, Column
     return {**tables, folder.results: experiment.columns}
 
 
-class _ProgressFile:
-    """Keeps ``progress.json``."""
+def _progress_file(file: Path, total: int, done_before: int) -> Callable[[int, bool], None]:
+    """A function that writes ``progress.json``, unless it has just done so and is not the last."""
+    start, written = time.time(), 0.0
 
-    def __init__(self, file: Path, total: int, done: int) -> None:
-        self._file, self._total, self._done_before = file, total, done
-        self._start, self._written = time.time(), 0.0
-
-    def note(self, done: int, *, last: bool = False) -> None:
-        """Write the progress, if it was not written just now."""
+    def note(done: int, is_last: bool) -> None:
+        nonlocal written
         now = time.time()
-        if not last and now - self._written < _PROGRESS_EVERY:
+        if not is_last and now - written < _PROGRESS_EVERY:
             return
-        self._written = now
+        written = now
         write_json(
-            self._file,
+            file,
             {
                 "tasks_done": done,
-                "tasks": self._total,
-                "tasks_done_before": self._done_before,
-                "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self._start)),
-                "seconds": round(now - self._start, 3),
+                "tasks": total,
+                "tasks_done_before": done_before,
+                "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(start)),
+                "seconds": round(now - start, 3),
                 "host": platform.node(),
                 "process": os.getpid(),
             },
         )
+
+    return note
 
 
 def _sweep(path: Path) -> None:

@@ -12,7 +12,7 @@ from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.estimation.align import align
 from cadalign.evaluation.api import evaluate
-from cadalign.evaluation.experiments.evidence import METHODS, EvidenceRunOptions, summarize
+from cadalign.evaluation.experiments.evidence import METHODS, SPEC, EvidenceRunOptions
 from cadalign.evaluation.instances.evidence import (
     BOUNDS,
     ObjectScene,
@@ -103,7 +103,7 @@ def test_run_resumes_and_reports(root: Path, tmp_path: Path) -> None:
     assert (out / "results.parquet").read_bytes() == before
     assert "Evidence beyond keypoints" in (out / "report.html").read_text()
     assert sorted(path.suffix for path in (out / "figures").iterdir())
-    summaries = summarize(Run.open(out))
+    summaries = SPEC.summarize(Run.open(out))
     of_all = {each.method: each for each in summaries if each.group == "all"}
     assert set(of_all) == set(QUICK)
     assert of_all["keypoints"]["instances"] == 2

@@ -5,15 +5,195 @@ Killed, it goes on where it was when it is started again with the same arguments
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import tyro
 
+from cadalign.datasets import write_sample_dataset
 from cadalign.errors import CadalignError
-from cadalign.evaluation.experiments.paper import PaperPlan, reproduce_paper
+from cadalign.evaluation.api import run
+from cadalign.evaluation.experiments.keypointnet import (
+    PAPER_TABLE,
+    PERCENT_NOTE,
+    STATED,
+    TABLE,
+    KeypointNetOptions,
+)
+from cadalign.evaluation.experiments.keypointnet import SPEC as KEYPOINTNET
+from cadalign.evaluation.experiments.simulation import SPEC as SIMULATION
+from cadalign.evaluation.experiments.simulation import SWEEPS, SweepOptions
+from cadalign.evaluation.methods.method import LIMIT
+from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.options import ExperimentOptions, RunOptions
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.summary import ALL, Summary, csv_text
+from cadalign.io.files import made_folder, write_text, writing
+from cadalign.web import asset, fill
+
+_TITLE = "The AEPnP paper's tables and figures"
+_METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperPlan(RunOptions):
+    """Runs for the paper's tables and figures."""
+
+    out: Path = Path("paper")
+    """Folder to write to."""
+    root: Path | None = None
+    """Dataset in KeypointNet's layout, besides the sample dataset."""
+    quick: bool = False
+    """Few problems: about two minutes."""
+    seed: int = ExperimentOptions.seed
+    """Seed of everything random."""
+
+
+Announce = Callable[[str], Callable[[Progress], object]]
+
+
+def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda _: None) -> Path:
+    """Run everything, or what is left of it; returns ``report.md``, beside figures and tables.
+
+    ``index.html`` is the same as a page. ``announce`` gets the name of the next run, and returns
+    the function that gets its progress.
+    """
+    made_folder(plan.out / "figures")
+    sections = [f"# {_TITLE}\n", _settings(plan)]
+    sections += [_table_section(plan, announce)]
+    for name in SWEEPS:
+        sections.append(_sweep_section(plan, name, announce))
+    report = plan.out / "report.md"
+    text = "\n".join(sections)
+    write_text(report, text)
+    write_text(plan.out / "index.html", _page(text))
+    return report
+
+
+def _page(text: str) -> str:
+    from markdown_it import MarkdownIt
+
+    body = MarkdownIt("commonmark").enable("table").render(text)
+    return fill("paper.html", title=_TITLE, style=asset("report.css"), body=body)
+
+
+def _settings(plan: PaperPlan) -> str:
+    quick = " This is the quick pass, with few problems: numbers are rough." if plan.quick else ""
+    return (
+        f"Seed {plan.seed}.{quick} Every run's own folder, with all rows, its configuration and "
+        "more figures, lies beside this file. Lines are medians, bands quartiles; the dashed line "
+        "is the Cramer-Rao bound, the least error that any unbiased method can have.\n"
+    )
+
+
+def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
+    runs = max(SWEEPS[name].runs // 25, 20) if plan.quick else None
+    options = SweepOptions(name, runs=runs, seed=plan.seed)
+    kind = options.kind
+    folder = RunFolder(plan.out / f"simulate_{name}")
+    run(
+        options,
+        folder,
+        workers=None if kind.is_timed else plan.workers,
+        dask=None if kind.is_timed else plan.dask,
+        on_progress=announce(f"simulation: {name}"),
+    )
+    summaries = SIMULATION.write(Run.open(folder.path))
+    keys = list(dict.fromkeys(summary["metric"] for summary in summaries))
+    pictures = [f"{name}_{key}" for key in keys[: 1 if kind.is_timed else None]]
+    for picture in pictures:
+        for ending in ("png", "pdf"):
+            _copy(folder.figures / f"{picture}.{ending}", plan.out / "figures")
+    shown = [summary for summary in summaries if summary["metric"] == keys[0]]
+    rows = [
+        [f"{value:g}", *(f"{s['median']:.3g}" for s in shown if s["value"] == value)]
+        for value in kind.values
+    ]
+    table = _markdown(["", *kind.methods], rows, words=0)
+    images = "\n".join(f"![{picture}](figures/{picture}.png)" for picture in pictures)
+    return (
+        f"## Simulation: {name}\n\n{images}\n\n"
+        f"Median {keys[0]} by {kind.column}; the paper states no numbers, only the figure.\n\n"
+        f"{table}\n"
+    )
+
+
+def _table_section(plan: PaperPlan, announce: Announce) -> str:
+    """Evaluate on the sample dataset, and on the dataset that is given; write Table 1."""
+    sample = write_sample_dataset(plan.out / "sample_dataset", per_category=12)
+    roots = {"sample": (sample, 2 if plan.quick else 40)}
+    if plan.root is not None:
+        roots["keypointnet"] = (plan.root, 1 if plan.quick else 10)
+    rows: list[list[str]] = []
+    sections = []
+    for name, (root, views) in roots.items():
+        folder = RunFolder(plan.out / f"evaluate_{name}")
+        run(
+            KeypointNetOptions(root, views_per_model=views, seed=plan.seed),
+            folder,
+            workers=plan.workers,
+            dask=plan.dask,
+            on_progress=announce(f"keypoints: {name}"),
+        )
+        summaries = KEYPOINTNET.write(Run.open(folder.path))
+        for metric in _METRICS:
+            for ending in ("png", "pdf"):
+                source = folder.figures / f"categories_{metric.key}.{ending}"
+                _copy(source, plan.out / "figures", f"{name}_{source.name}")
+        table = _table_rows(summaries)
+        rows += [[name, *row] for row in table]
+        sections.append(
+            f"### {_DATASETS[name]}\n\n{_markdown(_HEAD, table, words=2)}\n\n"
+            f"![rotation errors](figures/{name}_categories_rotation_error_deg.png)\n"
+        )
+    write_text(plan.out / "table1.csv", csv_text([["dataset", *_HEAD], *rows]))
+    body = "\n".join(sections)
+    return f"## Table 1: sparse keypoints, 1 px noise\n\n{PERCENT_NOTE}\n\n{body}"
+
+
+_DATASETS = {
+    "sample": "The sample dataset (parametric models, visibility by rays)",
+    "keypointnet": "The dataset given (visibility by rays where there is a mesh, else by the hull)",
+}
+_HEAD = ("category", "method", "keypoints", "R [deg]", "t", "s1 (y) [%]", "s2 (z) [%]", "R / limit")
+
+
+def _table_rows(summaries: Sequence[Summary]) -> list[list[str]]:
+    """The rows of Table 1: our medians, and the paper's beneath where it states them."""
+    rows = []
+    categories = dict.fromkeys(summary.group for summary in summaries)
+    for category in sorted(categories, key=lambda name: name != ALL):
+        of_category = [summary for summary in summaries if summary.group == category]
+        for summary in of_category:
+            ratio = metrics.OVER_BOUND.text(summary["over_limit"])
+            name = "Cramer-Rao bound" if summary.method == LIMIT else summary.method
+            texts = [column.text(summary[column.key]) for column in TABLE[:5]]
+            rows.append([category, name, *texts, ratio])
+        if category in PAPER_TABLE:
+            # With the digits that the paper prints.
+            rotation, translation, scale_y, scale_z, keypoints = PAPER_TABLE[category]
+            errors = f"{rotation:.3f}", f"{translation:.3f}"
+            scales = f"{100 * scale_y:.1f}", f"{100 * scale_z:.1f}"
+            rows.append([category, STATED, f"{keypoints:.0f}", *errors, *scales, ""])
+    return rows
+
+
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int) -> str:
+    """A table whose first columns, so many, hold words, and the others numbers."""
+    marks = [":---"] * words + ["---:"] * (len(head) - words)
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, marks, *rows))
+
+
+def _copy(source: Path, folder: Path, name: str | None = None) -> None:
+    target = folder / (name or source.name)
+    with writing(target):
+        shutil.copyfile(source, target)
 
 
 def main() -> int:

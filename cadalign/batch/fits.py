@@ -24,11 +24,11 @@ from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
-from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Chunk, Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
+from cadalign.evaluation.runs.work import OK
 from cadalign.io.files import write_whole
 from cadalign.io.input_kinds import DetectorOptions
 from cadalign.io.observation import Observation, ObservationChanges

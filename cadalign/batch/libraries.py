@@ -21,11 +21,10 @@ from typing import Any, NamedTuple
 from cadalign.batch.fits import pool_of
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError
-from cadalign.evaluation.outcome import FAILED, OK
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import OnProgress, execute
 from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups
-from cadalign.evaluation.runs.work import Plan, Rows, fingerprint
+from cadalign.evaluation.runs.work import FAILED, OK, Plan, Rows, fingerprint
 from cadalign.retrieval import Library
 from cadalign.retrieval.models import ModelTable, read_annotated, row_of
 

@@ -22,8 +22,15 @@ from cadalign.evaluation.metrics.registry import (
     metrics_config,
 )
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.outcome import FAILED, Outcome, reason_of, status_of
-from cadalign.evaluation.runs.work import AbortError, Plan, Rows
+from cadalign.evaluation.runs.work import (
+    FAILED,
+    AbortError,
+    Outcome,
+    Plan,
+    Rows,
+    reason_of,
+    status_of,
+)
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Columns, Row

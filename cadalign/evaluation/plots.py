@@ -18,7 +18,7 @@ from cadalign.arrays import FloatArray
 from cadalign.evaluation.methods.method import LIMIT, fit_methods
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import HIGH, Metric
-from cadalign.evaluation.outcome import OK
+from cadalign.evaluation.runs.work import OK
 from cadalign.evaluation.summary import Quartiles, known
 from cadalign.io.files import write_whole
 

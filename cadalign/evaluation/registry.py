@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any
 from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.outcome import FAILED, SKIPPED
 from cadalign.evaluation.plots import Plot, draw_plots
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import FAILED, SKIPPED, Plan
 from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
 

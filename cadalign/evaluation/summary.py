@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
-from cadalign.evaluation.outcome import OK, SKIPPED
+from cadalign.evaluation.runs.work import OK, SKIPPED
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.opened import Cells, Run

@@ -82,14 +82,11 @@ class Format:
         Writes a path, an object and the options.
     endings : tuple of str
         Endings of file names that mean this format; a whole name where it has no dot in front.
-    is_folder : bool
-        The path is a folder.
     """
 
     about: str
     write: Writer
     endings: tuple[str, ...] = ()
-    is_folder: bool = False
 
 
 def _with_trimesh(name: str) -> Writer:
@@ -214,13 +211,12 @@ FORMATS: dict[str, Format] = {
     "bop-results": Format(
         "BOP's result CSV, the stretched mesh beside it", _bop_results, (".csv",)
     ),
-    "bop": Format("a BOP scene's folder with its models", _bop, ("scene_gt.json",), is_folder=True),
+    "bop": Format("a BOP scene's folder with its models", _bop, ("scene_gt.json",)),
     "scan2cad": Format("Scan2CAD's JSON, the stretch as scale", _scan2cad, ("annotations.json",)),
     "nerfstudio": Format("cameras as transforms.json", _nerf, ("transforms.json",)),
     "colmap": Format(
         "cameras as COLMAP's text files",
         lambda path, *given: write_colmap(path, _camera_views(*given)),
-        is_folder=True,
     ),
     "open3d-camera": Format(
         "cameras as Open3D's JSON",

@@ -21,10 +21,10 @@ import pyarrow.compute as pc
 from cadalign.errors import DataError, quote
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_stem
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.outcome import LEFT_OUT, OK, SKIPPED
 from cadalign.evaluation.plots import compact
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.work import LEFT_OUT, OK, SKIPPED
 from cadalign.io.files import dense_json, read_bytes, reading, write_text, write_whole, writing
 
 InstanceName = tuple[str, str, int]

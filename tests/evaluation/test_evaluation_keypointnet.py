@@ -24,8 +24,8 @@ from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.pictures import draw_instance
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.instances.views import COLUMNS, KeypointTasks, keypointnet_benchmark
-from cadalign.evaluation.outcome import FAILED, OK, SKIPPED
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.evaluation.runs.work import FAILED, OK, SKIPPED
 from cadalign.evaluation.summary import Summary, summary_csv
 from cadalign.geometry.alignment import Alignment
 from cadalign.report import headline_text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import re
 import subprocess
 import sys
@@ -12,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from cadalign.evaluation.experiments.keypointnet import PAPER_TABLE
-from cadalign.evaluation.experiments.paper import PaperPlan, reproduce_paper
 from cadalign.evaluation.experiments.simulation import SWEEPS, SweepKind
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "reproduce_paper.py"
@@ -30,15 +30,16 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
         monkeypatch.setitem(SWEEPS, name, kind)
     for name in ("outliers", "runtime"):
         monkeypatch.delitem(SWEEPS, name)
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    script = importlib.import_module(SCRIPT.stem)
     said: list[str] = []
 
     def announce(what: str):  # type: ignore[no-untyped-def]
         said.append(what)
         return lambda progress: None
 
-    report = reproduce_paper(
-        PaperPlan(out=tmp_path, quick=True, workers=0), announce=announce
-    ).read_text()
+    plan = script.PaperPlan(out=tmp_path, quick=True, workers=0)
+    report = script.reproduce_paper(plan, announce=announce).read_text()
     assert said == ["keypoints: sample", "simulation: noise", "simulation: points"]
     assert "fractions" in report
     for picture in ("noise_rotation_error_deg", "points_scale_z_error"):

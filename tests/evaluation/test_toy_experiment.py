@@ -21,14 +21,13 @@ from cadalign.evaluation import registry
 from cadalign.evaluation.api import run
 from cadalign.evaluation.metrics import CATEGORY, FAILED, INSTANCES, Metric
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.registry import Spec, register
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Columns
-from cadalign.evaluation.runs.work import Plan, Rows
+from cadalign.evaluation.runs.work import Outcome, Plan, Rows
 from cadalign.evaluation.summary import medians
 from cadalign.report import headline_text, write_report
 from cadalign.seeding import instance_rng

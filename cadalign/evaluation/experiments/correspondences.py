@@ -17,10 +17,9 @@ from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions
-from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import OK, Plan
 from cadalign.evaluation.summary import (
     Conclusion,
     ConsoleTable,

@@ -16,10 +16,9 @@ from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE, Metric
 from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
-from cadalign.evaluation.outcome import OK, SKIPPED
 from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
 from cadalign.evaluation.registry import Reference, Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import OK, SKIPPED, Plan
 from cadalign.evaluation.summary import (
     ALL,
     ConsoleTable,

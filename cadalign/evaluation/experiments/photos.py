@@ -25,11 +25,10 @@ from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import medians_of, score_columns, shares_of
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
 from cadalign.evaluation.options import FunctionOptions
-from cadalign.evaluation.outcome import FAILED, LEFT_OUT, OK, UNREADABLE
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import FAILED, LEFT_OUT, OK, UNREADABLE, Plan
 from cadalign.evaluation.summary import (
     ALL,
     Conclusion,

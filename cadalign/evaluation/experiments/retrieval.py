@@ -16,10 +16,9 @@ from cadalign.errors import InputError
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import QUERIES, Metric
 from cadalign.evaluation.options import ModelOptions
-from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import OK, Plan
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of
 
 if TYPE_CHECKING:

@@ -22,10 +22,9 @@ from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions
-from cadalign.evaluation.outcome import OK
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import OK, Plan
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
 from cadalign.geometry.alignment import Alignment

@@ -17,8 +17,8 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.summary import Uncertainty
-from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import Outcome
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 

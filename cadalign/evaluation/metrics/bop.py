@@ -242,7 +242,6 @@ def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Ro
 
 
 BOP = MetricSet(
-    "bop",
     _measure,
     columns=(MSSD.key, MSPD.key, "mssd_recall", "mspd_recall", "vsd_recall"),
     medians=(MSSD, MSPD),

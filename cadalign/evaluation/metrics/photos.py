@@ -47,7 +47,6 @@ def _measure_viewpoint(target: PhotoTarget, est: Alignment, gt: Alignment, box: 
 
 
 VIEWPOINT = MetricSet(
-    "viewpoint",
     _measure_viewpoint,
     columns=(ROTATION.key,),
     medians=(ROTATION,),
@@ -138,7 +137,6 @@ def _is_within(cells: Cells, *, limits: tuple[float, float]) -> BoolArray:
 
 
 NINE_DOF = MetricSet(
-    "nine_dof",
     _measure_nine_dof,
     columns=(TRANSLATION.key, metrics.BOX_IOU.key, metrics.BOX_IOU_UP_TO_SCALE.key),
     medians=(TRANSLATION, metrics.BOX_IOU, metrics.BOX_IOU_UP_TO_SCALE),
@@ -245,7 +243,6 @@ def _measure_kitti(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box)
 
 
 KITTI = MetricSet(
-    "kitti",
     _measure_kitti,
     columns=(YAW.key, "depth_error", DEPTH.key, IOU_3D.key, IOU_BEV.key),
     medians=(YAW, DEPTH, IOU_3D, IOU_BEV),

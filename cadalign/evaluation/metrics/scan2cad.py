@@ -194,7 +194,6 @@ def _measure(target: PhotoTarget, est: Alignment, gt: Alignment, box: Box) -> Ro
 
 
 SCAN2CAD = MetricSet(
-    "scan2cad",
     _measure,
     columns=(TRANSLATION.key, SCALE.key, ALIGNED.key, ALIGNED_AXES.key),
     medians=(TRANSLATION, SCALE),

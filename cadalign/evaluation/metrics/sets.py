@@ -14,7 +14,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.outcome import FAILED
+from cadalign.evaluation.runs.work import FAILED
 from cadalign.evaluation.summary import known, median_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -40,7 +40,6 @@ class Rate:
 class MetricSet:
     """Metrics of a protocol."""
 
-    name: str
     measure: Callable[[PhotoTarget, Alignment, Alignment, Box], Row]
     """Errors by column, some of which may be None: of an object, an estimate of the data set's
     model, the true one, and the estimated box."""

@@ -21,13 +21,13 @@ from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method
 from cadalign.evaluation.metrics.bop import mssd
 from cadalign.evaluation.metrics.sets import score_alignment
-from cadalign.evaluation.outcome import LeftOutError, Outcome
 from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
 from cadalign.evaluation.photos.objects import draw_sighting, sighting_record
 from cadalign.evaluation.photos.protocols import protocol_of
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import LeftOutError, Outcome
 from cadalign.evaluation.summary import Summary
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

@@ -19,10 +19,10 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.methods.method import SHAPE
-from cadalign.evaluation.outcome import LeftOutError
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.photos.protocols import KeypointOptions, Protocol
 from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of, spread_points
+from cadalign.evaluation.runs.work import LeftOutError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

@@ -36,7 +36,6 @@ from cadalign.evaluation.instances.record import (
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.sets import score_alignment
-from cadalign.evaluation.outcome import Outcome
 from cadalign.evaluation.photos.methods import (
     PhotoEstimate,
     Sighting,
@@ -49,6 +48,7 @@ from cadalign.evaluation.photos.protocols import TRUTH, is_own, protocol_of
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import Outcome
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera

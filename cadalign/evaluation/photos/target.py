@@ -17,9 +17,8 @@ from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoOb
 from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import Case, Tasks
 from cadalign.evaluation.instances.record import box_alignment
-from cadalign.evaluation.outcome import UNREADABLE, LeftOutError
 from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import fingerprint
+from cadalign.evaluation.runs.work import UNREADABLE, LeftOutError, fingerprint
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

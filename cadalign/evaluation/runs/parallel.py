@@ -31,8 +31,7 @@ from contextlib import contextmanager
 from typing import Any, TypeVar, cast
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.evaluation.outcome import reason_of
-from cadalign.evaluation.runs.work import AbortError, Experiment, Rows
+from cadalign.evaluation.runs.work import AbortError, Experiment, Rows, reason_of
 from cadalign.io.files import printable
 
 T = TypeVar("T")

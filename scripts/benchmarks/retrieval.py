@@ -19,13 +19,16 @@ from benchmarks.section import BenchmarkData, Row, Table, Tables
 from cadalign import Box, Library, Observation, ShapeModel
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.instances.queries import RetrievalQuery, RetrievalTask, observe_model
+from cadalign.evaluation.instances.queries import (
+    RetrievalQuery,
+    RetrievalTask,
+    observe_model,
+    same_shapes,
+)
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval import LibraryModel, Match
-from cadalign.retrieval.absence import SAME_SHAPE, shape_distance
 from cadalign.retrieval.by_mask import MOST_ALIGNED
-from cadalign.retrieval.models import ModelKey
 
 _KEYPOINTS = 8
 _CALLS = 3
@@ -268,7 +271,7 @@ def _rankings(
             top=1,
             category=category,
             sigma=noise_px,
-            exclude=_alike(library, (category, seen.task.model_id)),
+            exclude=same_shapes(library, (category, seen.task.model_id)),
             workers=1,
         )
         for name, options in _ranking_options(shape).items():
@@ -292,18 +295,6 @@ def _ranking_options(shape: ShapeModel) -> dict[str, dict[str, Any]]:
         found[f"fit, shape_sigma{suffix}"] = {"shape_sigma": 0.02, **stretch}
         found[f"shape{suffix}"] = {"shape": shape, **stretch}
     return found
-
-
-def _alike(library: Library, key: ModelKey) -> list[ModelKey]:
-    """A model and those that are the same after a stretch."""
-    own = library[key]
-    ids = np.sort(own.ids)
-    same = (
-        model.key
-        for model in library
-        if np.array_equal(np.sort(model.ids), ids) and shape_distance(model, own) <= SAME_SHAPE
-    )
-    return [key, *same]
 
 
 def _first_iou(matches: list[Match] | None, gt: Box) -> float:

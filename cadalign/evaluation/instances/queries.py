@@ -155,12 +155,13 @@ class RetrievalQueries(Setting):
         return [Case(task.names(protocol), _NO_MATCH) for protocol in self.options.protocols]
 
     def _cases(self, task: RetrievalTask) -> list[Case]:
-        gt, cases = _opened(self.library)[task.category, task.model_id], self.failed(task)
+        library, cases = _opened(self.library), self.failed(task)
+        gt = library[task.category, task.model_id]
         try:
             query = observe_model(gt, task, seed=self.options.seed)
         except DegenerateError as error:
             return [replace(case, error=error, status=NO_VIEW) for case in cases]
-        seen = task, query, gt, same_shapes(self.library, gt.key)
+        seen = task, query, gt, same_shapes(library, gt.key)
         return [
             replace(case, instance=RetrievalInstance(*seen, protocol))
             for case, protocol in zip(cases, self.options.protocols, strict=True)
@@ -215,25 +216,22 @@ def _retrieve(
     )
 
 
+_opened = lru_cache(maxsize=2)(Library.open)
+
+
 @lru_cache(maxsize=64)
-def same_shapes(library: str, key: ModelKey) -> frozenset[ModelKey]:
-    """The models of a library's file that count as the given one, itself among them."""
-    groups = _by_keypoints(library)
-    gt = _opened(library)[key]
-    keys, xyz = groups[gt.category, tuple(gt.ids.tolist())]
+def same_shapes(library: Library, key: ModelKey) -> frozenset[ModelKey]:
+    """The models of a library that count as the given one, itself among them."""
+    gt = library[key]
+    keys, xyz = _by_keypoints(library)[gt.category, tuple(gt.ids.tolist())]
     near = distances(xyz, gt.xyz) <= SAME_SHAPE
     return frozenset([key, *(keys[k] for k in np.flatnonzero(near).tolist())])
 
 
 @lru_cache(maxsize=2)
-def _opened(library: str) -> Library:
-    return Library.open(library)
-
-
-@lru_cache(maxsize=2)
-def _by_keypoints(library: str) -> dict[Any, tuple[list[ModelKey], FloatArray]]:
+def _by_keypoints(library: Library) -> dict[Any, tuple[list[ModelKey], FloatArray]]:
     groups: dict[Any, list[LibraryModel]] = {}
-    for model in _opened(library):
+    for model in library:
         groups.setdefault((model.category, tuple(model.ids.tolist())), []).append(model)
     return {
         ids: ([model.key for model in models], np.array([model.xyz for model in models]))

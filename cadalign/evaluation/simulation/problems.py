@@ -9,7 +9,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.rotations import rotation_from_quat_wxyz, rotation_from_vector
 
 SIMULATION_CAMERA = Camera(width=640, height=480, fx=150.0, fy=150.0, cx=319.5, cy=239.5)
 """The paper's virtual camera."""
@@ -118,11 +118,4 @@ def simulate_standing_boxes(
 
 def random_rotation(rng: np.random.Generator) -> FloatArray:
     """A rotation matrix (3, 3), uniform over all rotations."""
-    w, x, y, z = (q := rng.standard_normal(4)) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return rotation_from_quat_wxyz(rng.standard_normal(4))

@@ -80,17 +80,19 @@ def test_what_is_written_is_read_back(annotated: Session, tmp_path: Path, form: 
     assert not read.problems
     (found,) = read.objects
 
-    given = photo.to_photo()
-    placed = PlacedObject(given, given.objects[0])
+    placed = PlacedObject(photo, photo.objects[0])
     camera = placed.camera
     assert read.camera is not None
     for name in ("width", "height", "fx", "fy", "cx", "cy"):
         assert getattr(read.camera, name) == pytest.approx(getattr(camera, name), abs=1e-9)
     assert isinstance(read.image, Path)
+    assert isinstance(photo.image, Path)
     np.testing.assert_array_equal(read_photo(read.image), read_photo(photo.image))
 
-    pose = photo.exported.views[0].cam_from_model
-    bounds = photo.exported.bounds
+    pose = placed.found.truth.cam_from_model
+    bounds = placed.model.bounds
+    assert pose is not None
+    assert bounds is not None
     corners = np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T
     unit = 1000.0 if form == "bop" else 1.0
     if form == "kitti":  # which has yaw alone
@@ -110,7 +112,7 @@ def test_what_is_written_is_read_back(annotated: Session, tmp_path: Path, form: 
         )
         assert found.model is not None
         mesh = found.model.load_mesh()
-        own = photo.exported.require_mesh()
+        own = placed.model.load_mesh()
         np.testing.assert_array_equal(mesh.faces, own.faces)
         stretched = own.vertices * scale * unit if form in RIGID else own.vertices
         np.testing.assert_allclose(mesh.vertices, stretched, rtol=1e-6, atol=1e-6 * unit)
@@ -127,8 +129,9 @@ def test_what_is_written_is_read_back(annotated: Session, tmp_path: Path, form: 
             np.testing.assert_allclose(seen[name], marked[own_name], atol=1e-6)
     if form in HAVE_MASKS:
         assert found.mask_path is not None
-        assert photo.mask is not None
-        np.testing.assert_array_equal(read_photo(found.mask_path), read_photo(photo.mask))
+        mask = placed.found.mask_path
+        assert mask is not None
+        np.testing.assert_array_equal(read_photo(found.mask_path), read_photo(mask))
 
 
 def test_command_and_page_write_the_same(

@@ -21,7 +21,7 @@ from cadalign.evaluation.instances.record import box_alignment
 from cadalign.evaluation.methods.method import SHAPE
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.photos.protocols import KeypointOptions, Protocol
-from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of, spread_points
+from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of
 from cadalign.evaluation.runs.work import LeftOutError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -33,9 +33,8 @@ from cadalign.shapes.model import ShapeModel
 
 ANNOTATED, DETECTED = "annotated", "detected"
 _LEAST_PX = 0.5  # a standard deviation that keypoints are given at least
-_OUTLINED = frozenset(
-    {protocols.MASK, protocols.IMAGE}
-)  # evidence about the model's outline, which needs a mesh
+# Evidence about the model's outline, which needs a mesh.
+_OUTLINED = frozenset({protocols.MASK, protocols.IMAGE})
 _RIM = 2  # width of a mask's rim [px]
 _FOCAL_PRIOR = 0.2  # of the logs of scales, while the focal length is estimated
 
@@ -130,7 +129,7 @@ def _simulated(
     if not camera.focal_known:
         raise LeftOutError("there are no keypoints, nor a focal length to simulate them with")
     if cad.has_mesh:
-        model = spread_points(cad, options.simulated_points)
+        model = cad.spread_points(options.simulated_points)
         seen = visible_keypoints(cad.scene, model.xyz, camera, gt)
         if target.found.mask_path is not None and seen.any():
             seen[seen] = _in_mask(

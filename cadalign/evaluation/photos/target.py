@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -80,10 +80,10 @@ class Cad:
     model_id: str
     model: CadModel = field(compare=False, repr=False)  # where it is read from
 
-    @cached_property
+    @property
     def scene(self) -> Scene:
         """The mesh; raises DataError if there is none, or it cannot be read."""
-        return Scene(self.model.load_mesh())
+        return _scene(self)
 
     @property
     def has_mesh(self) -> bool:
@@ -105,32 +105,30 @@ class Cad:
             None if points is None else np.array([points.xyz.min(axis=0), points.xyz.max(axis=0)])
         )
 
-    @cached_property
+    @property
     def diameter(self) -> float:
         """The largest distance of two points: the data set's, or that of the mesh's vertices."""
         if self.model.diameter is not None:
             return self.model.diameter
-        return float(pdist(farthest_points(self.hull_vertices, _MOST_OF_HULL)).max())
+        return _diameter(self)
 
-    @cached_property
+    @property
     def hull_vertices(self) -> FloatArray:
         """The vertices (n, 3) of the mesh's convex hull; of a flat mesh all of them."""
-        vertices = self.scene.used_vertices
-        try:
-            return np.asarray(vertices[ConvexHull(vertices).vertices])
-        except QhullError:
-            return vertices
+        return _hull(self)
+
+    def spread_points(self, count: int) -> NamedPoints:
+        """Farthest-point samples of the mesh's surface, named by their numbers."""
+        return _spread(self, count)
 
 
 @lru_cache(maxsize=_KEPT)
-def _kept(cad: Cad) -> Cad:
-    """The model that is kept with its mesh, of all that are equal."""
-    return cad
+def _scene(cad: Cad) -> Scene:
+    return Scene(cad.model.load_mesh())
 
 
 @lru_cache(maxsize=_KEPT)
-def spread_points(cad: Cad, count: int) -> NamedPoints:
-    """Farthest-point samples of a mesh's surface, named by their numbers."""
+def _spread(cad: Cad, count: int) -> NamedPoints:
     points = np.vstack([cad.scene.used_vertices, _surface_points(cad.scene.mesh)])
     xyz = farthest_points(points, count)
     return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
@@ -146,6 +144,21 @@ def _surface_points(mesh: Mesh) -> FloatArray:
     faces = rng.choice(len(areas), _ON_SURFACE, p=areas / areas.sum())
     weights = rng.dirichlet(np.ones(3), _ON_SURFACE)
     return np.asarray(np.einsum("nk,nkd->nd", weights, mesh.triangles[faces]))
+
+
+@lru_cache(maxsize=_KEPT)
+def _hull(cad: Cad) -> FloatArray:
+    vertices = cad.scene.used_vertices
+    try:
+        return np.asarray(vertices[ConvexHull(vertices).vertices])
+    except QhullError:
+        return vertices
+
+
+@lru_cache(maxsize=_KEPT)
+def _diameter(cad: Cad) -> float:
+    points = farthest_points(cad.hull_vertices, _MOST_OF_HULL)
+    return float(pdist(points).max())
 
 
 def farthest_points(points: FloatArray, count: int) -> FloatArray:
@@ -181,7 +194,7 @@ class PhotoTarget:
     def cad(self) -> Cad | None:
         """The CAD model."""
         model = self.found.model
-        return None if model is None else _kept(Cad(self.root, model.model_id, model))
+        return None if model is None else Cad(self.root, model.model_id, model)
 
     @property
     def bounds(self) -> FloatArray | None:

@@ -284,7 +284,7 @@ def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed:
         lengths = np.linalg.norm([truth.translation, est.translation], axis=1)
         errors = np.abs([*error[6:], np.log(lengths[1] / lengths[0])])
         bound = contour_bound(case.model, case.view(case.mask), truth)
-        drawn = rng.multivariate_normal(np.zeros(9), bound, size=LIMIT_DRAWS, method="eigh")
+        drawn = rng.multivariate_normal(np.zeros(9), bound, size=section.LIMIT_DRAWS, method="eigh")
         along = np.log(np.linalg.norm(truth.translation + drawn[:, 3:6], axis=1) / lengths[0])
         ideal = np.maximum(np.abs(drawn[:, 7:]).max(axis=1), np.abs(along)) > _FAR_OFF
         found.append((errors[:2].max(), errors[2], square, wall, ideal.mean()))

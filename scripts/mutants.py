@@ -251,21 +251,22 @@ def tests_of(mutant: Mutant, arguments: Arguments) -> dict[str, list[str]]:
     if not covering:
         rooms = (f"{room}/", "tests/estimation/") if room == "tests/solvers" else (f"{room}/",)
         covering = [name for names in lines.values() for name in names if name.startswith(rooms)]
-    every = [name for names in lines.values() for name in names]
+    every = {name for names in lines.values() for name in names}
     inside = beginning_with([name for name in covering if name.startswith(f"{room}/")], every)
     outside = beginning_with([name for name in covering if not name.startswith(f"{room}/")], every)
     groups = {"room": inside, "others": outside}
     return {name: [*quick, *tests[: arguments.most]] for name, tests in groups.items() if tests}
 
 
-def beginning_with(covering: list[str], every: list[str]) -> list[str]:
-    """The covering tests, then the others of their files.
+def beginning_with(covering: list[str], every: set[str]) -> list[str]:
+    """The covering tests, then the others of their files, those of most of them first.
 
     What a fixture runs that several tests share is in the data of the first of them alone.
     """
-    files = {name.split("::")[0] for name in covering}
-    others = {name for name in every if name.split("::")[0] in files} - set(covering)
-    return in_turns(covering) + in_turns(sorted(others))
+    files = Counter(name.split("::")[0] for name in set(covering))
+    others = sorted(every.difference(covering))
+    further = [name for file, _ in files.most_common() for name in others if name.startswith(file)]
+    return in_turns(covering) + further
 
 
 def in_turns(names: list[str]) -> list[str]:

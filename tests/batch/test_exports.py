@@ -92,6 +92,16 @@ def test_cameras_stand_around_the_object(run: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(rotations["000007.png"], results.rotation[2], atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["nerf/transforms.json", "cameras.json"])
+def test_nerfstudio_cameras_are_one_file_in_a_folder_or_by_its_name(
+    run: Path, tmp_path: Path, name: str
+) -> None:
+    path = tmp_path / name
+    export_run(run, path if path.stem == "cameras" else path.parent, format="nerfstudio")
+    frames = json.loads(path.read_text())["frames"]
+    assert len(frames) == 3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["kitti", "bop", "pix3d", "scan2cad", "objectron"])
 def test_data_sets_are_read_back(run: Path, tmp_path: Path, form: str) -> None:

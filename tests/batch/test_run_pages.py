@@ -12,6 +12,7 @@ from support.pages import Opened, cut_off, embedded_payload, watched
 
 import cadalign
 from cadalign import Alignment, Camera, Observation
+from cadalign.batch.pictures import _cropped
 from cadalign.batch.spec import SPEC, FitRun
 from cadalign.datasets import write_sample_dataset
 from cadalign.errors import InputError
@@ -97,3 +98,13 @@ def test_runs_without_instances_are_for_a_page_of_their_own(
     cadalign.simulate(sweep="points", runs=1, values=(10,), out=tmp_path / "sim", workers=0)
     with pytest.raises(InputError, match=r"sim is a run of .*, plain one of fit; write a report"):
         write_report([runs["plain"], tmp_path / "sim"], tmp_path / "r.html")
+
+
+def test_thumbnails_show_the_middle_of_the_object() -> None:
+    photo = np.zeros((480, 640, 3), dtype=np.uint8)
+    photo[300:340, 400:460] = 200
+    thumb = _cropped(photo, np.array([[390.0, 290.0], [470.0, 350.0]]))
+    rows, columns = np.nonzero(thumb[:, :, 0] > 100)
+    middle = np.array(thumb.shape[:2]) / 2
+    np.testing.assert_allclose([rows.mean(), columns.mean()], middle, atol=2)
+    assert 0.1 < len(rows) / thumb[:, :, 0].size < 0.7

@@ -229,7 +229,7 @@ def car_tracks(folder: Path) -> Iterator[Row]:
 def _view(frame: dict[str, Any], names: list[str], matrix: list[list[float]]) -> cadalign.View:
     (fx, _, cx), (_, fy, cy), _ = matrix
     shown = np.flatnonzero(np.array(frame["score"]) >= HIDDEN)
-    camera = cadalign.Camera(*SIZE, fx, fy, cx + 0.5, cy + 0.5)
+    camera = cadalign.Camera(*SIZE, fx, fy, cx, cy)
     pixels, ids = np.array(frame["uv"])[shown], [names[row] for row in shown]
     return cadalign.View(camera, pixels, ids=ids, sigma=_SIGMA, time=frame["frame"] / _RATE)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -131,7 +131,7 @@ def result_of(
                 text
                 for number, view in enumerate(views)
                 for text in outside_image(
-                    cast(FloatArray, view.points_2d),
+                    view.pixels,
                     view.camera,
                     agree=not warnings,
                     where=f"views[{number}]: " if len(views) > 1 else "",
@@ -157,7 +157,7 @@ def result_of(
     )
     of_views = []
     for number, view in enumerate(views):
-        rows, observed = prior.rows_of(view.keypoint_ids, "ids"), cast(FloatArray, view.points_2d)
+        rows, observed = prior.rows_of(view.keypoint_ids, "ids"), view.pixels
         camera, alignment = best.cameras[number], best.poses[number]
         of_views.append(
             ViewResult(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 
@@ -81,7 +80,7 @@ def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:
     # Another image size leaves much open, so that other evidence which is wrong would pass for it.
     is_one = len({(view.camera.width, view.camera.height) for view in problem.views}) == 1
     if is_one and not has_more:
-        pixels = np.concatenate([cast(FloatArray, view.points_2d) for view in problem.views])
+        pixels = np.concatenate([view.pixels for view in problem.views])
         sizes = other_sizes(pixels, problem.views[0].camera)
     found = find_in_all(best.score, count, explain, sizes)
     if found is None:
@@ -114,8 +113,7 @@ def _without(
         for shape in problem.prior.components
     )
     views = [
-        replace(each, points_2d=mistake.undo_2d(cast(FloatArray, each.points_2d), each.camera))
-        for each in problem.views
+        replace(each, points_2d=mistake.undo_2d(each.pixels, each.camera)) for each in problem.views
     ]
     prior = replace(problem.prior, components=components)
     unknown = [None] * len(views)  # starts are of the data as given

@@ -112,7 +112,7 @@ def _sightings(
 ) -> Sightings:
     tables = []
     for number, (rows, view, camera) in enumerate(zip(names, views, cameras, strict=True)):
-        pixels, count = cast(FloatArray, view.points_2d), len(rows)
+        pixels, count = view.pixels, len(rows)
         rays = rays_of(np.require(pixels, requirements="W"), camera, clips=True)
         sigma = noise if view.sigma is None else view.sigma
         tables.append(
@@ -169,7 +169,7 @@ def _sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[Vie
         if view.depth_image is None:
             continue
         relative = float(cast(float, view.depth_sigma))
-        found = sample_depth(view.depth_image, cast(FloatArray, view.points_2d), sigma=relative)
+        found = sample_depth(view.depth_image, view.pixels, sigma=relative)
         known = np.isfinite(found)
         point, depth = np.array(rows[number], dtype=np.int64)[known], found[known]
         count = len(point)

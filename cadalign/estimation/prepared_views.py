@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 
@@ -92,7 +91,7 @@ def align_without(
         camera = _camera_of(view, estimated)
         pose = _explaining(prior, view, camera, result)
         rows = prior.rows_of(view.keypoint_ids, f"views[{number}].ids")
-        observed = cast(FloatArray, view.points_2d)
+        observed = view.pixels
         residuals = camera.project(pose.apply(result.points_3d[rows])) - observed
         kept, unknown = np.zeros(len(rows), dtype=bool), Stated(None)
         of_views[number] = ViewResult(
@@ -172,7 +171,7 @@ def facing_view(view: View, number: int = 0) -> View:
         if getattr(view, name) is not None:
             fix = "leave it away, or undistort the photo to a pinhole's"
             raise InputError(what, where=f"views[{number}].{name}", fix=fix)
-    camera, rig = faced(view.camera, cast(FloatArray, view.points_2d)), view.cam_from_rig
+    camera, rig = faced(view.camera, view.pixels), view.cam_from_rig
     if rig is not None:
         turn = np.eye(4)
         turn[:3, :3] = camera.lens_from_camera.T
@@ -194,7 +193,7 @@ def align_facing(
     views = [facing_view(view, number) for number, view in enumerate(given)]
     for view in views:
         if view.camera.is_wide and not may_surround:
-            rays_ahead(cast(FloatArray, view.points_2d), view.camera)
+            rays_ahead(view.pixels, view.camera)
     if views[0].cam_from_rig is None:  # a start in the rig's frame stays
         inits = [
             None if init is None else turned_alignment(init, view.camera.lens_from_camera.T)

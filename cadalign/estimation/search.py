@@ -256,9 +256,7 @@ def outlier_areas(views: Sequence[View], max_reproj_error: float) -> FloatArray:
     """Areas [px^2] over which the outliers of each view are scattered; 1 without keypoints."""
     return np.array(
         [
-            area_of(cast(FloatArray, view.points_2d), view.camera, max_reproj_error)
-            if len(view.keypoint_ids)
-            else 1.0
+            area_of(view.pixels, view.camera, max_reproj_error) if len(view.keypoint_ids) else 1.0
             for view in views
         ]
     )

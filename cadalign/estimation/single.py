@@ -92,7 +92,7 @@ def align_plain(
     chosen = vars(options) | {name: getattr(model, name) for name in shape}
     found = fit(
         points[rows],
-        cast(FloatArray, view.points_2d),
+        view.pixels,
         view.camera,
         **{**chosen, "sigma": view.sigma},
         ransac=ransac,
@@ -125,7 +125,7 @@ def align_single(
     rows = prior.rows_of(view.keypoint_ids, "views[0].ids")
     weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))
-    seen = seen_keypoints(view, cast(FloatArray, view.points_2d), rows, options)
+    seen = seen_keypoints(view, view.pixels, rows, options)
     minima, hypotheses = search_view(mixture, seen, _given(init))
     count, iterations = minima.counts.tolist()
     if not count:
@@ -208,7 +208,7 @@ def _mistake_in(
     score: float,
 ) -> str | None:
     """Name the mistake without which the keypoints fit the shape, below that score."""
-    given = cast(FloatArray, view.points_2d)
+    given = view.pixels
 
     def explain(mistake: Mistake) -> Explained | None:
         if mistake.mirrored:  # not a learned shape: its models share one frame

@@ -178,6 +178,11 @@ class View(DeclaredEvidence):
         return cast("tuple[Hashable, ...]", self.ids)
 
     @property
+    def pixels(self) -> FloatArray:
+        """The keypoints (n, 2) [px]; see ``points_2d``."""
+        return cast(FloatArray, self.points_2d)
+
+    @property
     def depth_image(self) -> FloatArray | None:
         """The depth image (h, w), NaN where unknown; None where ``depth`` is none."""
         is_image = self.depth is not None and np.ndim(cast(FloatArray, self.depth)) == 2

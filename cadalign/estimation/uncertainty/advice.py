@@ -198,7 +198,7 @@ def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
         depth = np.append(cast(FloatArray, depth), np.nan)
     return replace(
         _without_scale(view),
-        points_2d=np.vstack([cast(FloatArray, view.points_2d), place]),
+        points_2d=np.vstack([view.pixels, place]),
         ids=(*view.keypoint_ids, name),
         sigma=_with_mean(sigma, count, is_one=np.ndim(sigma) == 0),
         scores=None,

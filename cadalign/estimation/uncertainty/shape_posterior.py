@@ -14,7 +14,7 @@ Nadarajah, "Multivariate t distributions and their applications", 2004).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -144,7 +144,7 @@ def _linearised(
     kept = result.inliers
     ids = tuple(name for name, inlier in zip(view.keypoint_ids, kept, strict=True) if inlier)
     names = prior_of(result.model).rows_of(ids, "view.ids")
-    pixels = np.require(cast(FloatArray, view.points_2d), requirements="W")
+    pixels = np.require(view.pixels, requirements="W")
     camera = faced(view.camera, pixels)
     rays = rays_of(pixels, camera)
     weights = np.broadcast_to(whitening_of(view.sigma, rays, camera), (len(rays), 3))[kept]

@@ -194,17 +194,11 @@ def _describe(run: Run) -> str:
     return f"on {run.total:,} observations of {listed}"
 
 
-class FitSpec(Spec):
-    """The specification, whose runs are `FitRun`."""
-
-    def open(self, path: Path, name: str | None = None) -> Run:
-        return FitRun.open(path, name)
-
-
-SPEC = FitSpec(
+SPEC = Spec(
     options=FitRunOptions,
     plan=plan_run,
     results=TABLE_COLUMNS,
+    run=FitRun,
     columns=_HEADLINE,
     summarize=summarize_by({}),
     plots=_plots,

@@ -63,6 +63,8 @@ class Spec:
     """Makes summaries of a run, finished or not; see `cadalign.evaluation.summary`."""
     results: Columns = RESULT_COLUMNS
     """Columns that the result table of a run must have to be summarized."""
+    run: type[Run] | None = None
+    """The class of its runs; by default `cadalign.evaluation.runs.opened.Run`."""
     lines: Callable[[Summaries], Summaries] = list
     """Makes lines of the headline table from summaries; by default a line of each."""
     table: Callable[[Run, Summaries], ConsoleTable] | None = None
@@ -98,7 +100,7 @@ class Spec:
         """Read a run of the experiment, ``name`` being its name beside others."""
         from cadalign.evaluation.runs.opened import Run
 
-        return Run.open(path, name, columns=self.results)
+        return (self.run or Run).open(path, name, columns=self.results)
 
     def title_of(self, runs: Sequence[Run]) -> str:
         """A few words that name runs of one kind, such as ``alignment on keypointnet``."""

@@ -119,6 +119,13 @@ class SymmetryGroup:
         """True if there is no motion but the identity."""
         return self.axis is None and not self.is_free and len(self.rotations) == 1
 
+    def __str__(self) -> str:
+        if self.is_free:
+            return "sphere"
+        if self.axis is not None:
+            return "circle"
+        return "none" if self.is_trivial else f"{len(self.rotations)} rotations"
+
     def canonical(
         self,
         alignment: Alignment,
@@ -154,6 +161,23 @@ class SymmetryGroup:
     def nearest(self, alignment: Alignment, rotation: FloatArray, *, tolerance: float) -> Equal:
         """The one of all equal alignments whose rotation is nearest to a given one."""
         return self.canonical(alignment, reference=rotation, tolerance=tolerance)
+
+    def nearest_turned(self, alignment: Alignment, rotation: FloatArray) -> Alignment:
+        """The alignment nearest to a rotation of all that the group makes of the placed object.
+
+        These motions take the stretched object to itself, not the model: x -> R (c + G (S x - c)) +
+        t with the alignment's R, S, t. That is an alignment of the rotation R G and the same scale.
+        """
+        if self.is_trivial:
+            return alignment
+        axes = _NO_AXES if self.axis is None else self.axis[None]
+        axes = np.eye(3) if self.is_free else axes
+        turns = [_nearest(alignment, (each, axes), (rotation,)) for each in self.rotations]
+        relative = alignment.rotation.T @ rotation
+        best = turns[int(np.argmax([float(np.sum(turn * relative)) for turn in turns]))]
+        shift = alignment.rotation @ (self.center - best @ self.center)
+        turned = alignment.rotation @ best
+        return Alignment(turned, alignment.translation + shift, alignment.scale, is_valid=True)
 
     def count(self, alignment: Alignment, held: tuple[bool, bool, bool]) -> int | None:
         """Number of alignments that are equal to one; None for any number."""

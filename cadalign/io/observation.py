@@ -19,6 +19,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
 from cadalign.io.files import write_json
@@ -243,6 +244,4 @@ class ObservationChanges:
 def _read_camera(
     path: Path, size: tuple[int, int] | None, pixel_origin: PixelOrigin | None
 ) -> Camera:
-    from cadalign.io.camera_file import read_camera
-
     return read_camera(path, size=size, pixel_origin=pixel_origin)

@@ -24,6 +24,7 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.keypoints import Symmetries
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
+from cadalign.geometry.symmetry_group import SymmetryGroup
 
 _TOLERANCE = 0.03  # of the keypoints' extent: how well people place equivalent keypoints
 _OF_WAY = 0.2  # the same, of how far the rotation takes a keypoint
@@ -33,29 +34,24 @@ _AXIS_TOLERANCE_DEG = 10.0
 
 def annotated_symmetry(xyz: FloatArray, symmetries: Symmetries) -> Symmetry:
     """The symmetry of a model with the keypoints (k, 3), by the module's rule."""
-    center, rotations, axis = rotations_of(xyz, symmetries)
+    group = symmetry_group(xyz, symmetries)
+    center, rotations, axis = group.center, group.rotations, group.axis
     motions = np.tile(np.eye(4), (len(rotations) - 1, 1, 1))
     motions[:, :3, :3] = rotations[1:]
     motions[:, :3, 3] = center - rotations[1:] @ center
     return Symmetry(motions, () if axis is None else (SymmetryAxis(axis, center),))
 
 
-def rotations_of(
-    xyz: FloatArray, symmetries: Symmetries
-) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Find the rotations that map a model's keypoints (k, 3) onto itself, by the module's rule.
-
-    They are a point (3,), rotations (g, 3, 3) about it, the identity first, and an axis (3,) of any
-    angle.
-    """
-    trivial = np.zeros(3), np.eye(3)[None], None
+def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
+    """The rotations that map a model's keypoints (k, 3) onto itself, by the module's rule."""
+    trivial = SymmetryGroup(np.zeros(3), np.eye(3)[None])
     if not symmetries.reflections and not symmetries.rotations:
         return trivial
     tolerance = _TOLERANCE * float(np.linalg.norm(np.ptp(xyz, axis=0)))
     revolution = _axis_of_revolution(xyz, symmetries, tolerance)
     if revolution is not None:
         center, axis = revolution
-        return center, np.eye(3)[None], axis
+        return SymmetryGroup(center, np.eye(3)[None], axis)
     from cadalign.datasets.models.rotated_onto import rotations_onto_themselves  # compiled
 
     center, equivalent = xyz.mean(axis=0), _equivalent(len(xyz), symmetries)
@@ -64,7 +60,7 @@ def rotations_of(
     kept = rotations_onto_themselves(shifted, equivalent, _candidates(), *most)
     if not kept.any():
         return trivial
-    return center, np.concatenate([np.eye(3)[None], _candidates()[kept]]), None
+    return SymmetryGroup(center, np.concatenate([np.eye(3)[None], _candidates()[kept]]))
 
 
 def _axis_of_revolution(

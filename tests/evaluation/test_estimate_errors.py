@@ -8,14 +8,15 @@ import pytest
 from cadalign import metrics
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance, InstanceSymmetry
+from cadalign.evaluation.instances.instance import HULL, KEYPOINT_CAMERA, Instance
 from cadalign.evaluation.metrics.errors import estimate_errors
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.symmetry_group import SymmetryGroup
 
-NO_SYMMETRY = InstanceSymmetry(np.zeros(3), np.eye(3)[None])
-HALF_TURN = InstanceSymmetry(np.zeros(3), np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0])]))
+NO_SYMMETRY = SymmetryGroup(np.zeros(3), np.eye(3)[None])
+HALF_TURN = SymmetryGroup(np.zeros(3), np.array([np.eye(3), np.diag([-1.0, 1.0, -1.0])]))
 
 
 def alignment(rng: np.random.Generator) -> Alignment:
@@ -46,7 +47,7 @@ def test_errors_of_many_are_those_of_each_bit_for_bit() -> None:
     symmetries = [NO_SYMMETRY, HALF_TURN] * 32 + [NO_SYMMETRY]
     rows = estimate_errors(estimates, instances, symmetries)
     for est, each, symmetry, row in zip(estimates, instances, symmetries, rows, strict=True):
-        truths = {"": each.gt, "sym_": symmetry.nearest_truth(est=est, gt=each.gt)}
+        truths = {"": each.gt, "sym_": symmetry.nearest_turned(each.gt, est.rotation)}
         for prefix, gt in truths.items():
             boxes = {"est": Box.from_model(each.bounds, est), "gt": Box.from_model(each.bounds, gt)}
             expected = {

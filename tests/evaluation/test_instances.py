@@ -12,7 +12,6 @@ from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view, s
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     Instance,
-    InstanceSymmetry,
     KeypointTask,
     make_hull_instances,
 )
@@ -23,6 +22,7 @@ from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.metrics import rotation_error
+from cadalign.geometry.symmetry_group import SymmetryGroup
 
 CUBE = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1.0, 1) for z in (-1.0, 1)]) / 4
 
@@ -106,7 +106,7 @@ def task(model_id: str = "a", view: int = 0) -> KeypointTask:
         view=view,
         hull=KeypointHull(cloud()),
         ids=np.arange(14),
-        symmetry=InstanceSymmetry(np.zeros(3), np.eye(3)[None]),
+        symmetry=SymmetryGroup(np.zeros(3), np.eye(3)[None]),
         model=None,
     )
 

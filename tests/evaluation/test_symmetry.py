@@ -10,11 +10,12 @@ import pytest
 from cadalign import Alignment
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
+from cadalign.datasets.models.annotated_symmetry import symmetry_group
 from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
-from cadalign.evaluation.instances.instance import InstanceSymmetry, symmetry_group
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.metrics import rotation_error, translation_error
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.symmetry_group import SymmetryGroup
 
 Y = np.array([0.0, 1.0, 0.0])
 SQUARE = np.array([[1.0, 0, 1], [1, 0, -1], [-1, 0, -1], [-1, 0, 1]])
@@ -40,8 +41,8 @@ def table() -> tuple[FloatArray, Symmetries]:
     return xyz, Symmetries(reflections=ring + upper)
 
 
-def errors(group: InstanceSymmetry, est: Alignment, gt: Alignment) -> tuple[float, float]:
-    truth = group.nearest_truth(est=est, gt=gt)
+def errors(group: SymmetryGroup, est: Alignment, gt: Alignment) -> tuple[float, float]:
+    truth = group.nearest_turned(gt, est.rotation)
     return rotation_error(est=est, gt=truth), translation_error(est=est, gt=truth)
 
 
@@ -50,7 +51,7 @@ def some_truth(seed: int = 0) -> Alignment:
     return Alignment(random_rotation(rng), [0.3, -0.2, 4.0], [1.0, 0.6, 1.7])
 
 
-def turned(gt: Alignment, group: InstanceSymmetry, rotation: FloatArray) -> Alignment:
+def turned(gt: Alignment, group: SymmetryGroup, rotation: FloatArray) -> Alignment:
     """The alignment of the object turned about the group's centre."""
     shift = gt.rotation @ (group.center - rotation @ group.center)
     return Alignment(gt.rotation @ rotation, gt.translation + shift, gt.scale)
@@ -145,7 +146,7 @@ def test_a_model_without_annotated_symmetries_has_none() -> None:
     group = symmetry_group(xyz, Symmetries())
     gt = some_truth()
     assert group.is_trivial
-    assert group.nearest_truth(est=some_truth(1), gt=gt) is gt
+    assert group.nearest_turned(gt, some_truth(1).rotation) is gt
 
 
 def test_thin_models_are_not_symmetric_by_the_tolerance() -> None:

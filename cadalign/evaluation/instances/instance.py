@@ -15,15 +15,14 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
-from cadalign.datasets.models.annotated_symmetry import rotations_of
-from cadalign.datasets.models.keypoints import Symmetries
+from cadalign.datasets.models.annotated_symmetry import symmetry_group
 from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
-from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.symmetry_group import SymmetryGroup
 from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
@@ -42,67 +41,7 @@ HULL = "hull"
 """Visibility by the rule of `cadalign.evaluation.instances.hull`, without a mesh."""
 
 
-@dataclass(frozen=True, eq=False)
-class InstanceSymmetry:
-    """Rotations about one point that map an object onto itself."""
-
-    center: FloatArray  # (3,), the point [model units]
-    rotations: FloatArray  # (g, 3, 3), single rotations; the first is the identity
-    axis: FloatArray | None = None
-    """(3,), any rotation about this axis, of length 1, through the point is a symmetry as well."""
-
-    @property
-    def is_trivial(self) -> bool:
-        """True where the identity is the only symmetry."""
-        return self.axis is None and len(self.rotations) == 1
-
-    def __str__(self) -> str:
-        if self.axis is not None:
-            return "circle"
-        return "none" if self.is_trivial else f"{len(self.rotations)} rotations"
-
-    def nearest_truth(self, *, est: Alignment, gt: Alignment) -> Alignment:
-        """The truth, among those that look the same, whose rotation is nearest to the estimate's.
-
-        The symmetries are the object's, so they act on the model after the stretch that makes the
-        object of it: x -> R (c + G (S x - c)) + t with the truth's R, S, t. That is again an
-        alignment, of the rotation R G and the same scale S, which is why a stretched model's
-        truth may be turned without shearing it. An estimate that looks like the truth has zero
-        error; one with wrong scales about a right axis keeps the error of its scales.
-
-        The best angle about an axis a follows in closed form: with N = G' R_gt' R_est the trace
-        of Rot(a, angle)' N is A cos(angle) + B sin(angle) + a'N a, where A = tr N - a'N a and
-        B = a . (N_32 - N_23, N_13 - N_31, N_21 - N_12).
-        """
-        if self.is_trivial:
-            return gt
-        relative = gt.rotation.T @ est.rotation
-        candidates = [self._turned(rotation, relative) for rotation in self.rotations]
-        traces = [float(np.sum(candidate * relative)) for candidate in candidates]
-        best = candidates[int(np.argmax(traces))]
-        return Alignment(
-            gt.rotation @ best,
-            gt.translation + gt.rotation @ (self.center - best @ self.center),
-            gt.scale,
-            is_valid=True,
-        )
-
-    def _turned(self, rotation: FloatArray, relative: FloatArray) -> FloatArray:
-        if self.axis is None:
-            return rotation
-        n = rotation.T @ relative
-        along = float(self.axis @ n @ self.axis)
-        turn = np.array([n[2, 1] - n[1, 2], n[0, 2] - n[2, 0], n[1, 0] - n[0, 1]])
-        angle = np.arctan2(float(self.axis @ turn), float(np.trace(n)) - along)
-        return np.asarray(rotation @ rotation_from_vector(self.axis * float(angle)))
-
-
-def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> InstanceSymmetry:
-    """The rotations that map a model with the keypoints (k, 3) onto itself."""
-    return InstanceSymmetry(*rotations_of(xyz, symmetries))
-
-
-NO_SYMMETRY = InstanceSymmetry(np.zeros(3), np.eye(3)[None])
+NO_SYMMETRY = SymmetryGroup(np.zeros(3), np.eye(3)[None])
 NO_KEYPOINTS = KeypointHull(np.empty((0, 3)))
 
 
@@ -116,7 +55,7 @@ class KeypointTask:
     hull: KeypointHull = NO_KEYPOINTS
     """Keypoints (k, 3), and what views without a mesh need to know of them."""
     ids: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    symmetry: InstanceSymmetry = NO_SYMMETRY
+    symmetry: SymmetryGroup = NO_SYMMETRY
     model: AnnotatedModel | None = None
     """The model with its mesh; None where it is evaluated on its keypoints alone."""
     problem: str = ""  # reason why the model cannot be evaluated; empty otherwise

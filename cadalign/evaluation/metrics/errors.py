@@ -34,9 +34,10 @@ from cadalign.geometry.metrics import (
     translation_errors_up_to_scale,
 )
 from cadalign.geometry.rotations import angles_between, vector_from_rotation
+from cadalign.geometry.symmetry_group import SymmetryGroup
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.instances.instance import Instance, InstanceSymmetry
+    from cadalign.evaluation.instances.instance import Instance
     from cadalign.evaluation.runs.tables import Row
 
 _FLIPPED_DEG = 90.0
@@ -73,7 +74,7 @@ def overlap_up_to_scale(*, est: Box, gt: Box) -> float | None:
 def estimate_errors(
     estimates: Sequence[Alignment],
     instances: Sequence[Instance],
-    symmetries: Sequence[InstanceSymmetry],
+    symmetries: Sequence[SymmetryGroup],
 ) -> list[Row | InputError]:
     """Errors of an estimate of each instance; the reason where one is not finite.
 
@@ -98,7 +99,7 @@ def estimate_errors(
     turned = [k for k, symmetry in enumerate(symmetries) if not symmetry.is_trivial]
     if turned:
         nearest = [
-            symmetries[k].nearest_truth(est=estimates[k], gt=instances[k].gt) for k in turned
+            symmetries[k].nearest_turned(instances[k].gt, estimates[k].rotation) for k in turned
         ]
         some = Alignments(*(array[turned] for array in est))
         aware = _pose_errors(some, Alignments.of(nearest), bounds[turned], diagonals[turned])

@@ -237,7 +237,7 @@ class ObjectShape:
                 squares += part.weight * (own + (np.ptp(part.mean[-2:], axis=0) - lengths) ** 2)
         else:
             lengths = np.ptp(np.asarray(model.bounds), axis=0)
-            options = model.fit_options(1.0)
+            options = model.fit_options()
             free = np.isin(list("xyz"), list(options.stretched_axes))
             prior = options.stretch_sigma or 0.0
             squares = 2 * float(self.sigma or 0.0) ** 2 + np.where(free, prior * lengths, 0.0) ** 2

@@ -103,16 +103,14 @@ class Model:
         if self.symmetry is not None:
             check_symmetry(self.symmetry)
         check_axis(self.up_axis)
-        self.fit_options(1.0)
+        self.fit_options()
 
-    def fit_options(self, sigma: float) -> FitOptions:
+    def fit_options(self) -> FitOptions:
         """The options of the plain fit to this model."""
         prior = self.stretch_sigma
         if prior is None and self.shape_sigma is not None:
             prior = SIMILAR_SCALE_SIGMA
-        return FitOptions(
-            sigma=sigma, stretch=self.stretch, stretch_sigma=prior, known_axis=self.known_axis
-        )
+        return FitOptions(stretch=self.stretch, stretch_sigma=prior, known_axis=self.known_axis)
 
 
 def is_exact_model(model: object) -> bool:

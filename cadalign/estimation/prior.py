@@ -96,7 +96,7 @@ def _of_model(model: Model) -> ShapePrior:
     points = cast(FloatArray, model.points_3d)
     mean = np.concatenate([points, cast(FloatArray, model.bounds)])
     spread = np.full(len(mean), model.shape_sigma or 0.0)
-    options = model.fit_options(1.0)
+    options = model.fit_options()
     free = np.array([float(axis in options.stretched_axes) for axis in "xyz"])
     bound = _NO_BOUND if options.prior_weight else options.scale_prior
     scales = ScalePriors(free, np.diag(free * options.prior_weight), bound)

@@ -153,26 +153,6 @@ def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: 
                 gradient[k] += total
 
 
-@borrowing
-def keypoint_cost(keypoints: KeypointEvidence, pose: FloatArray) -> float:
-    """The keypoints' cost; infinite if a point lies behind the camera."""
-    points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
-    scalars = scalars_of(pose)
-    loss, loss_scale = keypoints.loss, keypoints.loss_scale
-    each = whitening.shape[0] > 1
-    weights = (whitening[0, 0], whitening[0, 1], whitening[0, 2])
-    cost = 0.0
-    for i in range(points.shape[0]):
-        point = (points[i, 0], points[i, 1], points[i, 2])
-        if each:
-            weights = (whitening[i, 0], whitening[i, 1], whitening[i, 2])
-        ru, rv, depth = _residual(scalars, point, rays[i, 0], rays[i, 1], weights)
-        if not depth > 0:
-            return np.inf
-        cost += loss_and_root(loss, loss_scale, ru * ru + rv * rv)[0]
-    return cost
-
-
 @inlined
 def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
     """Squared whitened residual of keypoint i; infinite behind the camera."""
@@ -182,6 +162,17 @@ def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
     point = (points[i, 0], points[i, 1], points[i, 2])
     ru, rv, depth = _residual(pose, point, rays[i, 0], rays[i, 1], weights)
     return ru * ru + rv * rv if depth > 0 else np.inf
+
+
+@borrowing
+def keypoint_cost(keypoints: KeypointEvidence, pose: FloatArray) -> float:
+    """The keypoints' cost; infinite if a point lies behind the camera."""
+    scalars = scalars_of(pose)
+    cost = 0.0
+    for i in range(keypoints.points.shape[0]):
+        square = squared_error(keypoints, scalars, i)
+        cost += loss_and_root(keypoints.loss, keypoints.loss_scale, square)[0]
+    return cost
 
 
 @kernel

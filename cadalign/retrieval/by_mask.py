@@ -18,6 +18,7 @@ import logging
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -106,8 +107,9 @@ def rank_by_mask(
         fix = "build the library with meshes, or give keypoints"
         raise InputError(what, where="library", fix=fix)
     resembling = [row for _, row in sorted(overlapping)[:MOST_ALIGNED]]
-    tried = (_aligned(table, row, inside, camera, options) for row in resembling)
-    aligned = [found for found in tried if found is not None]
+    align_row = partial(_aligned, table, inside=inside, camera=camera, options=options)
+    with ThreadPoolExecutor(worker_count(workers)) as pool:
+        aligned = [found for found in pool.map(align_row, resembling) if found is not None]
     if not aligned:
         what = "no model can be aligned with the mask"
         fix = "check the mask and the camera, or give keypoints"

@@ -50,6 +50,9 @@ def test_the_stretched_model_is_found(library: Library, category: str) -> None:
     scores = [match.score for match in matches]
     assert scores == sorted(scores, reverse=True)
     assert sum(scores) == pytest.approx(1)
+    (alone, *_) = library.retrieve(mask=mask, camera=CAMERA, workers=1)
+    assert alone.alignment == matches[0].alignment
+    assert alone.score == matches[0].score
     again = library.retrieve(mask=mask, camera=CAMERA, exclude=[key], top=2)
     assert len(again) <= 2
     assert key not in [(match.category, match.model_id) for match in again]

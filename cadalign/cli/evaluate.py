@@ -14,11 +14,11 @@ from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError
 from cadalign.evaluation.experiments.demo import DemoOptions
+from cadalign.evaluation.methods.registry import load_plugin
 from cadalign.evaluation.options import ExperimentOptions, FunctionOptions, PluginOption, RunOptions
-from cadalign.evaluation.registry import known_options, spec_named, spec_of_config
+from cadalign.evaluation.registry import Spec, known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.registry import Spec
     from cadalign.evaluation.runs.opened import Run
 
 _COMMAND = "evaluate"
@@ -55,7 +55,6 @@ class RunCommand(JsonOption, RunOptions):
     def do_run(self) -> tuple[Spec, Run]:
         """Do the run, showing its progress; gives its specification and its tables."""
         from cadalign.evaluation.api import prepared
-        from cadalign.evaluation.methods.registry import load_plugin
         from cadalign.evaluation.runs.folder import RunFolder
         from cadalign.evaluation.runs.run import execute
 

@@ -33,15 +33,17 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
+from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
+from cadalign.io.files import write_json
 from cadalign.io.input_kinds import is_of_many, refuse_photo
+from cadalign.io.observation import Observation, ObservationChanges
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.scene import AlignedScene
     from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.view import View
-    from cadalign.io.observation import Observation, ObservationChanges
     from cadalign.render import OverlayStyle
 
 _OBJECTS, _SHARE = "objects", "share"
@@ -138,9 +140,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
 
     def _fit_mask(self, mask: Path) -> int:
         """Align the model to a mask alone; returns the exit code."""
-        from cadalign.geometry.camera import Camera
         from cadalign.io.images import photo_size
-        from cadalign.io.observation import Observation
 
         width, height = photo_size(mask)
         nothing, camera = np.empty((0, 3)), Camera.without_focal(width, height)
@@ -276,8 +276,6 @@ def _write_scene(
     observations: list[Observation],
 ) -> list[str]:
     """Write the files of the scene; returns the texts of its objects."""
-    from cadalign.io.files import write_json
-
     make_folder(folder)
     texts, entries = [], []
     for each, seen, result in zip(objects, observations, scene.results, strict=True):

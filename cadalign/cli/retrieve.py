@@ -17,7 +17,7 @@ from cadalign.io.documents import read_json
 from cadalign.io.images import read_image
 from cadalign.io.input_kinds import is_of_many
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.query import ObservationRetrieval
+from cadalign.retrieval.query import ObservationRetrieval, read_mask, read_query
 
 if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
@@ -86,7 +86,6 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     def _retrieve(self, path: Path) -> int:
         """Retrieve the models of one observation; returns the exit code."""
         from cadalign.retrieval.page import none_text, write_retrieval
-        from cadalign.retrieval.query import read_mask, read_query
 
         query = self.of_camera.applied_to(read_query(path), str(path))
         library, _ = self.opened()

@@ -13,12 +13,13 @@ from cadalign.cli.common import answer, exit_code, file_stem, make_folder, say, 
 from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import RansacOptions
+from cadalign.geometry.camera import Camera
+from cadalign.io.observation import with_lens
 
 if TYPE_CHECKING:
     from cadalign.batch.tracks import FoundTrack, VideoTrack
     from cadalign.datasets import ImageKeypoints
     from cadalign.estimation.tracks.motion import Motion
-    from cadalign.geometry.camera import Camera
     from cadalign.io.images import Video
     from cadalign.shapes.model import ShapeModel
 
@@ -124,9 +125,6 @@ class TrackCommand(CameraOptions):
 
     def _camera(self, objects: Sequence[ImageKeypoints], video: Video | None) -> Camera | None:
         """The camera of the options, for pictures of the video's or the detections' size."""
-        from cadalign.geometry.camera import Camera
-        from cadalign.io.observation import with_lens
-
         changes = self.of_camera
         size = objects[0].size if video is None else video.size
         camera = changes.read_camera(size)

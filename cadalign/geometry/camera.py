@@ -513,7 +513,7 @@ class Camera:
         if self.turn:
             what = "a camera in a turned frame has no form in files"
             raise InputError(what, where="camera", fix="write the camera that was turned")
-        return write_form(self, pixel_origin)
+        return write_form(vars(self), pixel_origin)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Camera:

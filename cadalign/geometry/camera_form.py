@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from cadalign.arrays import as_floats, is_number
 from cadalign.errors import InputError, quote
 from cadalign.geometry.pixels import LensKind, PixelOrigin, require_perspective_lens, shift_of
-
-if TYPE_CHECKING:
-    from cadalign.geometry.camera import Camera
 
 # COLMAP's camera models: the names of their parameters, in COLMAP's order.
 COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
@@ -43,19 +40,20 @@ _NO_SKEW = 1e-9  # relative to the focal length
 _FORM_FIX = 'give {"model", "width", "height", "params"} as COLMAP does'
 
 
-def write_form(camera: Camera, pixel_origin: PixelOrigin | None) -> dict[str, Any]:
-    """A camera in COLMAP's form; see `Camera.to_dict`."""
-    model = _WRITTEN.get((camera.lens, len(camera.distortion)), "FULL_OPENCV")
+def write_form(fields: Mapping[str, Any], pixel_origin: PixelOrigin | None) -> dict[str, Any]:
+    """COLMAP's form of a camera with these fields; see `Camera.to_dict`."""
+    lens, distortion = fields["lens"], fields["distortion"]
+    model = _WRITTEN.get((lens, len(distortion)), "FULL_OPENCV")
     shift = shift_of(pixel_origin or "corner")
-    names = COLMAP_PARAMS[model][4:] if camera.is_wide else _DISTORTION_NAMES
-    focals = (camera.fx, camera.fy) if camera.focal_known else (None, None)
-    values: dict[str, float | None] = dict(zip(names, camera.distortion, strict=False))
-    numbers = (*focals, camera.cx + shift, camera.cy + shift)
+    names = _DISTORTION_NAMES if lens == "perspective" else COLMAP_PARAMS[model][4:]
+    focals = (fields["fx"], fields["fy"]) if fields["focal_known"] else (None, None)
+    values: dict[str, float | None] = dict(zip(names, distortion, strict=False))
+    numbers = (*focals, fields["cx"] + shift, fields["cy"] + shift)
     values |= zip(("fx", "fy", "cx", "cy"), numbers, strict=True)
     form = {
         "model": model,
-        "width": camera.width,
-        "height": camera.height,
+        "width": fields["width"],
+        "height": fields["height"],
         "params": [values.get(name, 0.0) for name in COLMAP_PARAMS[model]],
     }
     return form if pixel_origin is None else form | {"pixel_origin": pixel_origin}

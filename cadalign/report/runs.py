@@ -6,19 +6,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cadalign.batch import retrievals, spec
 from cadalign.errors import InputError
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.registry import register, spec_of, spec_of_config
+from cadalign.evaluation.registry import Spec, register, spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
 from cadalign.io.files import refuse_nul
-
-if TYPE_CHECKING:
-    from cadalign.evaluation.registry import Spec
 
 for many in (spec, retrievals):  # runs over many observations are shown as experiments are
     register(many.SPEC)

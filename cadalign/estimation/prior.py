@@ -74,7 +74,7 @@ def rows_among(known: Sequence[Hashable], ids: Sequence[Hashable], where: str) -
         listed = ", ".join(quote(name) for name in missing[:5])
         names = ", ".join(quote(name) for name in known[:12])
         more = ", ..." if len(known) > 12 else ""
-        fix = f"the model has {names}{more}"
+        fix = f"the model has {names}{more}" if names else "give the model points_3d="
         raise InputError(f"the model has no keypoint {listed}", where=where, fix=fix)
     return [place[name] for name in ids]
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
-from cadalign.errors import InputError
+from cadalign.errors import InputError, require_kind
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box, oriented_box
 from cadalign.geometry.camera import Camera
@@ -78,6 +78,8 @@ def nearest_truth(*, est: Alignment, gt: Alignment, symmetry: Symmetry) -> Align
 
 
 def _truth(est: Alignment, gt: Alignment, symmetry: Symmetry | None) -> Alignment:
+    for name, given in (("est", est), ("gt", gt)):
+        require_kind(given, Alignment, name, fix="give the result's alignment")
     return gt if symmetry is None else nearest_truth(est=est, gt=gt, symmetry=symmetry)
 
 

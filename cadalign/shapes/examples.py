@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_points, read_only
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, InputError, quote, require_kind
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids, checked_box
 
@@ -103,6 +103,9 @@ def tabulated(
     of the models have bounds, the boxes are those of the keypoints. For the errors raised see
     `ShapeModel.learn`.
     """
+    for number, each in enumerate(examples):
+        fix = "`cadalign shape learn` takes the folder of a data set"
+        require_kind(each, Example, f"models[{number}]", fix=fix)
     if len(examples) < least:
         raise InputError(
             f"{len(examples)} models are too few to learn a shape from",

@@ -319,6 +319,19 @@ def test_mask_sharpens_the_estimate(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert without["mask"]["rotation_deg"] > 2 * data["std"]["rotation_deg"]
 
 
+def test_inverted_mask_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = truth_of((1.0, 0.7, 1.5))
+    corners = write_box(tmp_path, truth)
+    inverted = 255 - cv2.imread(str(tmp_path / "mask.png"), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(tmp_path / "mask.png"), inverted)
+    inner = corners.mean(axis=0) + 0.9 * (corners - corners.mean(axis=0))
+    evidence = ImageEvidence(mask=tmp_path / "mask.png")
+    seen = ObservedImage(inner, CAMERA.project(truth.apply(inner)), CAMERA, evidence=evidence)
+    assert main(["fit", str(write(tmp_path, seen, model=tmp_path / "box.obj"))]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "8 of 8 keypoints lie off it: it may be inverted, or another object's" in said
+
+
 # --- refusals ----------------------------------------------------------------------------------
 
 

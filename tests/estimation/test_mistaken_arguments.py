@@ -11,8 +11,19 @@ import pytest
 from support.refusals import refusal_text
 from support.scenes import CAMERA, keypoints, truth_of
 
-from cadalign import Library, Mesh, Model, Result, View, align, load_mesh
+from cadalign import (
+    Library,
+    Mesh,
+    Model,
+    Result,
+    ShapeModel,
+    Tracker,
+    View,
+    align,
+    load_mesh,
+)
 from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.metrics import rotation_error
 from cadalign.retrieval import LibraryModel
 
 POINTS, TRUTH = keypoints(), truth_of((1.0, 0.7, 1.9))
@@ -41,6 +52,23 @@ GIVEN: list[tuple[Callable[..., Any], str]] = [
     (
         lambda: align(MODEL, VIEW).mesh(3),  # type: ignore[arg-type]
         "mesh: expected a cadalign.Mesh or a path, got int; read it with cadalign.load_mesh",
+    ),
+    (
+        lambda: align(Model(mesh=BOX), VIEW),
+        "views[0].ids: the model has no keypoint 0, 1, 2, 3, 4; give the model points_3d=",
+    ),
+    (
+        lambda: Tracker(MODEL).update(VIEW.points_2d),  # type: ignore[arg-type]
+        "view: expected a cadalign.View, got ndarray",
+    ),
+    (
+        lambda: ShapeModel.learn("chairs"),  # type: ignore[arg-type]
+        "models[0]: expected a cadalign.Example, got str; "
+        "`cadalign shape learn` takes the folder of a data set",
+    ),
+    (
+        lambda: rotation_error(est=align(MODEL, VIEW), gt=TRUTH),  # type: ignore[arg-type]
+        "est: expected a cadalign.Alignment, got Result; give the result's alignment",
     ),
     (
         lambda: Library.from_models([MODEL]),  # type: ignore[list-item]

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
 
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.descent import ContourFit, Masked, Settled, settle, settle_with
 from cadalign.estimation.contours.measured import (
@@ -43,6 +44,7 @@ _DISPLACED = (-2.0, -1.0, 1.0, 2.0)  # standard deviations
 # estimate without masks, above the second its misfit says little about whether they were.
 _WELL_KNOWN, _POORLY_KNOWN = 0.05, 0.25
 _LEAST_SUPPORT = 0.5  # share of the contour that must agree
+_LEAST_KEYPOINTS = 4  # that tell whether a mask is inverted
 _LEAST_TOLERANCE = 3.0  # [px], of a sample that agrees, and the same relative to the mask's size
 _RELATIVE_TOLERANCE = 0.02
 _WARPED_TOLERANCE = 0.06  # where the model is only similar to the object
@@ -165,7 +167,8 @@ def fit_masks(
             warnings.append(f"views[{contour.image}].mask: {reason}")
             break
         warnings.append(
-            f"views[{contour.image}].mask contradicts the rest and is left out: {reason}"
+            f"views[{contour.image}].mask contradicts the rest and is left out: "
+            f"{reason}{_off_mask(views[contour.image])}"
         )
         left_out.append(contour)
         used.remove(contour)
@@ -277,6 +280,17 @@ def _contradicting(
         best.start, best.masked.evidence, best.settled.joined.place.state, _LEAST_PROBABILITY
     )
     return None if reason is None else (contours[worst], reason)
+
+
+def _off_mask(view: View) -> str:
+    """Report that most keypoints lie off a view's mask, as they do where it is inverted."""
+    mask = cast("FloatArray | BoolArray", view.mask_image)
+    pixels = np.round(np.asarray(view.points_2d)).astype(int)
+    u, v = pixels[((pixels >= 0) & (pixels < mask.shape[::-1])).all(axis=1)].T
+    count, off = len(u), int((mask[v, u] < 0.5).sum())
+    if count < _LEAST_KEYPOINTS or 2 * off <= count:
+        return ""
+    return f"; {off} of {count} keypoints lie off it: it may be inverted, or another object's"
 
 
 def tension(

@@ -7,7 +7,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.contours.descent import Masked, approached
 from cadalign.estimation.contours.silhouettes import differ, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
@@ -91,8 +91,15 @@ def minima_of_mask(
         cost = min((proposal.cost for proposal in proposals), default=np.inf)
         if cost < met:  # as likely as one whose whole outline meets the contour
             break
+    if not proposals:
+        raise DegenerateError(
+            "no pose gives the model an outline like the mask's",
+            where=_WHERE,
+            fix="check that the mask is nonzero on the object, not around it, and that the model "
+            "is the object's; or give an init or keypoints",
+        )
     proposals.sort(key=lambda proposal: proposal.cost)
-    misfit = proposals[0].misfit if proposals else np.inf
+    misfit = proposals[0].misfit
     mistake = None
     if not is_exact:
         mistake = (

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, is_whole
-from cadalign.errors import DegenerateError, InputError, NoConsensusError
+from cadalign.errors import DegenerateError, InputError, NoConsensusError, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.joint_robust import under_cauchy, whitened_lengths
 from cadalign.estimation.model import Model
@@ -147,8 +147,9 @@ class Tracker:
         Raises
         ------
         InputError
-            If the view has no time, or one that is not later than the last.
+            If it is no `View`, has no time, or one that is not later than the last.
         """
+        require_kind(view, View, "view")
         if view.time is None:
             raise InputError("a tracked view needs one", where="view.time", fix="give seconds")
         if self._views and float(view.time) <= float(self._views[-1].time or 0.0):

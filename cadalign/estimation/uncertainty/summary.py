@@ -25,6 +25,7 @@ _THIN = 0.1  # spread along an axis over the largest that counts as nearly a pla
 _END_ON_DEG = 15.0
 _ANOTHER_DEG = 10.0
 _LEAST_TURN = 1e-12  # [rad], and of a relative variance
+_ROUNDING = 1e-12  # relative standard deviation below which a length is known
 _REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
 _MOST_NAMED = 5  # outliers, in a sentence
 
@@ -46,6 +47,7 @@ class Uncertainty:
 def uncertainty_of(covariance: FloatArray) -> Uncertainty:
     """Standard deviations from a covariance (9, 9) or (10, 10)."""
     variance = np.maximum(covariance.diagonal(), 0.0)
+    variance[6:9][variance[6:9] < _ROUNDING**2] = 0.0
     x, y, z, sx, sy, sz = np.sqrt(variance[3:9]).tolist()
     return Uncertainty(
         rotation_deg=float(np.degrees(np.sqrt(variance[:3].sum()))),

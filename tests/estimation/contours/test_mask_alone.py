@@ -11,6 +11,7 @@ import pytest
 
 from cadalign import Alignment, Camera, Mesh, Model, Symmetry, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.silhouettes import atlas_of, resembling_poses
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
@@ -68,6 +69,18 @@ class TestOwnModel:
         found = align(model, View(CAMERA, mask=mask_of(body(), truth)))
         assert found.alignment.scale.tolist() == [1.0, 1.0, 1.0]
         assert rotation_error(est=found.alignment, gt=truth) < 0.5
+
+    def test_known_length_has_no_uncertainty(self) -> None:
+        found = align(Model(mesh=body()), View(CAMERA, mask=mask_of(body(), posed(0))))
+        assert found.std is not None
+        assert found.std.scale[0] == 0.0
+        assert "stretch      (1, " in str(found)
+
+    def test_mask_of_the_background_is_refused_as_such(self) -> None:
+        mask = np.ones((240, 320), bool)
+        mask[100:140, 140:180] = False
+        with pytest.raises(DegenerateError, match="nonzero on the object, not around it"):
+            align(Model(mesh=body()), View(CAMERA, mask=mask))
 
     def test_dilated_mask(self) -> None:
         truth = posed(4, (1.0, 0.8, 1.2))

@@ -20,6 +20,7 @@ from cadalign.estimation.result import Result
 from cadalign.export.aligned_object import AlignedObject
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file, read_json
+from cadalign.io.input_kinds import OBSERVATION, kind_of
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
@@ -46,6 +47,9 @@ def read_exported(
     data = read_json(fit)
     if not isinstance(data, Mapping):
         raise DataError("is not a fit's result", where=str(fit), fix="give a fit.json")
+    if kind_of(data) == OBSERVATION and "alignment" not in data:
+        fix = f"fit it first, `cadalign fit {fit.name}`, and give the fit.json that this writes"
+        raise DataError("an observation, not the result of a fit", where=str(fit), fix=fix)
     path = observation or _observation_of(fit, data)
     seen = Observation.load(path, needs_xyz=False)
     with in_file(fit):

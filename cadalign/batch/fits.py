@@ -247,10 +247,14 @@ def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[Ob
 
 def _tally(folder: RunFolder) -> Tally:
     counts: Counter[str] = Counter()
+    whole: dict[str, str] = {}  # with the source, which tells what the only failure is of
     total = 0
     for table in read_groups(folder.results, fix=DONE_ANEW):
         total += len(table)
         failed = table.filter(pc.not_equal(table["status"], OK))
         for row in failed.select(["source", "reason"]).to_pylist():
-            counts[row["reason"].removeprefix(row["source"]).lstrip(": ,")] += 1
-    return Tally(total, counts.total(), tuple(counts.most_common()))
+            reason = row["reason"].removeprefix(row["source"]).lstrip(": ,")
+            counts[reason] += 1
+            whole[reason] = row["reason"]
+    reasons = [(whole[each] if count == 1 else each, count) for each, count in counts.most_common()]
+    return Tally(total, counts.total(), tuple(reasons))

@@ -30,7 +30,7 @@ from cadalign.io.input_kinds import (
     TABLE,
     is_pattern,
     kind_of,
-    refuse_photo,
+    refuse_photo_or_mesh,
 )
 
 _DAMAGED = "damaged"
@@ -212,7 +212,7 @@ def _of_folder(folder: Path) -> list[Source]:
 
 def _of_file(path: Path) -> Source:
     suffix = path.suffix.lower()
-    refuse_photo(path)
+    refuse_photo_or_mesh(path)
     if suffix in LINES:
         lines = Lines(path)
         if not len(lines):

@@ -36,7 +36,8 @@ class Export:
     """
 
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
-    """Result of `cadalign fit` or `cadalign annotate`; or the folder of a run of many fits."""
+    """Result of `cadalign fit` or `cadalign annotate`; their folder; or the folder of a run of many
+    fits."""
     to: Path
     """File to write, or folder of a format of several files. For a run, a format's name is a folder
     of that name: json, overlay, glb, coco, bop-results, colmap, nerfstudio, bop, kitti, pix3d,
@@ -63,12 +64,15 @@ class Export:
         """Write the file; returns the exit code."""
         from cadalign.batch.exported import read_exported
 
-        if self.fit.is_dir():
+        fit = self.fit
+        if (fit / "fit.json").is_file():  # the folder that a fit of one observation writes
+            fit = fit / "fit.json"
+        if fit.is_dir():
             return self._export_run()
         with named_as_flags(self, self.options):
             name = self.format or format_of(self.to)
             exported = read_exported(
-                self.fit,
+                fit,
                 observation=self.observation,
                 shape=self.shape,
                 world_from_cam=None if self.world is None else read_matrix(self.world, (4, 4)),

@@ -36,7 +36,7 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.files import write_json
-from cadalign.io.input_kinds import is_of_many, refuse_photo
+from cadalign.io.input_kinds import is_of_many, refuse_photo_or_mesh
 from cadalign.io.observation import Observation, ObservationChanges
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         if not self.observations and "mask" in self.given and self.model is not None:
             return self._fit_mask(self.given["mask"])
         path = self.first()
-        refuse_photo(path)
+        refuse_photo_or_mesh(path)
         is_read = len(self.observations) == 1 and path.suffix.lower() == ".json" and path.is_file()
         data = read_json(path) if is_read else None
         if len(self.observations) > 1 or is_of_many(path, data):

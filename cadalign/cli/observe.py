@@ -84,6 +84,9 @@ class Observe(CameraOptions, EvidenceOptions):
             found = choose_object(objects, image=name, number=self.object)
         out = self.out or self.keypoints.with_suffix(".observation.json")
         observation = self.observe(found, model, self.image, out)
+        called = found.image or ""
+        if name is not None and Path(called).suffix and not found.is_of(name):
+            say(f"{self.keypoints} calls the photo {called}; its keypoints count for {name}")
         text = f"{len(observation.points_2d)} of {len(found)} keypoints: {out}"
         if observation.evidence.mask is not None:
             text += f"; mask: {observation.evidence.mask}"

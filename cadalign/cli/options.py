@@ -41,6 +41,8 @@ def named_as_flags(
     try:
         yield
     except DataError as error:
+        if (error.fix or "").startswith("known are "):  # names of a file's fields, no options
+            raise
         raise DataError(error.what, where=error.where, fix=_with_flags(error.fix, flags)) from None
     except InputError as error:
         if error.where not in flags:

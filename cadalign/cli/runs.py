@@ -147,8 +147,10 @@ def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
         return RunFolder(command.out)
     if len(command.observations) > 1 or not first.exists():
         return RunFolder(first.parent / kind)
-    name = first.resolve().name if first.is_dir() else first.stem
-    return RunFolder(first.with_name(f"{name}_{kind}"))
+    if first.is_dir():  # resolved, since `.` and `..` have no name of their own
+        first = first.resolve()
+        return RunFolder(first.parent / f"{first.name}_{kind}")
+    return RunFolder(first.with_name(f"{first.stem}_{kind}"))
 
 
 def write_overlays(run: RunFolder, to: Path, style: OverlayStyle | None) -> None:

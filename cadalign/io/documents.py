@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 
-from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.errors import CadalignError, DataError, InputError, quote, unknown
 from cadalign.io.files import read_text
 
 _MAX = sys.float_info.max
@@ -205,10 +205,9 @@ def _located(error: msgspec.ValidationError, data: Any, kind: Any, where: str) -
         return DataError("missing", where=f"{where}.{field[2]}" if where else field[2])
     if field:
         known = sorted(each.encode_name for each in _parts_at(kind, path, "fields"))
+        refused = unknown("field", field[2], known)
         return DataError(
-            f"unknown field {quote(field[2])}",
-            where=where or "top level",
-            fix=f"known are {', '.join(known)}" if known else None,
+            refused.what, where=where or "top level", fix=refused.fix if known else None
         )
     if text.startswith("Invalid enum value"):
         allowed = ", ".join(map(repr, _parts_at(kind, path, "values")))

@@ -83,8 +83,11 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except FileNotFoundError:
         raise DataError("no such file", where=printable(path)) from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
+    except UnicodeDecodeError as error:
+        what = f"cannot be read as text: byte {error.start} is not UTF-8"
+        raise DataError(what, where=printable(path)) from None
+    except OSError as error:
+        reason = error.strerror or error
         raise DataError(f"cannot be read ({reason})", where=printable(path)) from None
 
 

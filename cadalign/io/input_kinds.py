@@ -15,6 +15,7 @@ LINES = (".jsonl", ".ndjson")
 TABLE = ".csv"
 OBSERVATION, DETECTOR, OTHER = "observation", "detector", "other"
 _WILD = frozenset("*?[")
+_MESHES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 _PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 
@@ -58,8 +59,14 @@ def kind_of(data: object) -> str:
     return OBSERVATION if is_meant else OTHER
 
 
-def refuse_photo(path: Path) -> None:
-    """Refuse an image in the place of an observation, and say what makes one."""
+def refuse_photo_or_mesh(path: Path) -> None:
+    """Refuse an image or a mesh in the place of an observation, and say what makes one."""
+    if path.suffix.lower() in _MESHES:
+        raise InputError(
+            "a mesh, not an observation, which is a JSON file with camera and keypoints",
+            where=str(path),
+            fix=f"mark keypoints with `cadalign annotate PHOTO {path.name}`, which writes one",
+        )
     if path.suffix.lower() in _PHOTOS:
         raise InputError(
             "a photo, not an observation, which is a JSON file with camera and keypoints",

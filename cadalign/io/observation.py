@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from cadalign.errors import InputError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
@@ -134,6 +134,9 @@ class Observation(ObservedImage):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
+        if "alignment" in data:
+            fix = "give the observation that was fitted"
+            raise DataError("the result of a fit, not an observation", fix=fix)
         read, fields = read_fields(data)
         images = []
         for number, each in enumerate(fields):

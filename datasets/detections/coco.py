@@ -16,6 +16,7 @@ from msgspec import Meta, field
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.models.model_keypoints import FORMAT as MODEL_KEYPOINTS_FORMAT
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import DataError, InputError, quote
@@ -104,6 +105,8 @@ def _read(data: Any) -> list[ImageKeypoints]:
         return _from_predictions(convert(data, _File))
     if not isinstance(data, dict):
         raise DataError(f"{quote(data)} is not an object or a list", fix=_FIX)
+    if data.get("format") == MODEL_KEYPOINTS_FORMAT:
+        raise DataError("keypoints of a model, not those that a detector found in a photo")
     raise DataError("neither annotations nor instance_info", where="top level", fix=_FIX)
 
 

@@ -78,6 +78,13 @@ class ImageKeypoints:
     def __len__(self) -> int:
         return len(self.points_2d)
 
+    def is_of(self, photo: str) -> bool:
+        """True if the image's name, or its id, is that of the photo's file."""
+        path = Path(photo)
+        return self.image is not None and (
+            self.image in (photo, path.stem) or Path(self.image).name == path.name
+        )
+
 
 def choose_object(
     objects: Sequence[ImageKeypoints], *, image: str | None = None, number: int | None = None
@@ -99,7 +106,7 @@ def choose_object(
         If there is no such image or object, or no telling which is meant.
     """
     images = list(dict.fromkeys(found.image for found in objects))
-    wanted = [found for found in objects if image is not None and _is_image(found.image, image)]
+    wanted = [found for found in objects if image is not None and found.is_of(image)]
     if not wanted:
         listed_images = max((found.images for found in objects), default=0)
         if image is not None and listed_images > 1 and len(images) == 1:
@@ -229,9 +236,3 @@ def _plain(name: str) -> str:
 
 def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-def _is_image(name: str | None, wanted: str) -> bool:
-    return name is not None and (
-        name == wanted or Path(name).name == Path(wanted).name or name == Path(wanted).stem
-    )

@@ -54,6 +54,9 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
     path = Path(path)
     if path.name == TRACKS or (path / TRACKS).is_file():
         return read_track_keypoints(path if path.name == TRACKS else path / TRACKS)
+    if path.is_dir():
+        fix = "give a file of a detector's keypoints, JSON or CSV"
+        raise DataError(f"the folder has no {TRACKS}", where=str(path), fix=fix)
     return read_csv_keypoints(path) if path.suffix.lower() == ".csv" else read_coco_keypoints(path)
 
 

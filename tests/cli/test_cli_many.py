@@ -66,7 +66,7 @@ def test_every_object_of_a_file_becomes_an_observation_and_is_fitted(
     (written / "notes.json").write_text("{}")
     assert main(["fit", str(written)]) == 3
     text = capsys.readouterr().err
-    assert "failed 1: line 1: not valid JSON" in text
+    assert f"failed 1: {written / 'broken.json'}, line 1: not valid JSON" in text
     assert "3 of 4 aligned, 1 failed: " in text
     out = folder / "found_observations_fit"
     with (out / "results.csv").open() as file:

@@ -69,6 +69,8 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
+    if reader is None and path.is_dir():
+        raise DataError("a folder, not a mesh file", where=str(path), fix="give a file in it")
     if reader is None:
         raise DataError(
             f"{path.suffix or 'no extension'} is not a known mesh format",

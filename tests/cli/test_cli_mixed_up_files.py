@@ -1,0 +1,138 @@
+"""Files given in each other's place, and folders: refused in one line, by what they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.files import TETRAHEDRON
+from support.refusals import refusal_line
+
+import cadalign
+from cadalign.cli import main
+from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
+
+PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
+NAMES = [f"corner {row}" for row in range(10)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder, the present one, with an observation, a mesh, a photo and keypoints of both."""
+    monkeypatch.chdir(tmp_path)
+    model, camera = Path("model.obj"), PROBLEM.camera
+    model.write_text(TETRAHEDRON)
+    Path("model.ply").write_bytes(b"ply\n\x9a\xff")
+    write_image(Path("photo.png"), np.zeros((camera.height, camera.width, 3), np.uint8))
+    seen = Observation(PROBLEM.points_3d, PROBLEM.points_2d, camera, model=model.absolute())
+    seen.save(Path("seen.json"))
+    points = [
+        {"name": name, "xyz": xyz}
+        for name, xyz in zip(NAMES, PROBLEM.points_3d.tolist(), strict=True)
+    ]
+    named = {"format": "cadalign model keypoints", "version": 1, "keypoints": points}
+    Path("model.keypoints.json").write_text(json.dumps(named))
+    flat = [value for u, v in PROBLEM.points_2d.tolist() for value in (u, v, 2)]
+    size = {"width": camera.width, "height": camera.height}
+    found = {
+        "images": [{"id": 1, "file_name": "elsewhere.jpg", **size}],
+        "annotations": [{"id": 1, "image_id": 1, "category_id": 1, "keypoints": flat}],
+        "categories": [{"id": 1, "name": "object", "keypoints": NAMES}],
+    }
+    Path("found.json").write_text(json.dumps(found))
+    return tmp_path
+
+
+@pytest.mark.parametrize("command", ["fit", "retrieve --library none.library"])
+@pytest.mark.parametrize("mesh", ["model.obj", "model.ply"])
+def test_mesh_is_no_observation(
+    folder: Path, mesh: str, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name, *options = command.split()
+    line = refusal_line(capsys, name, mesh, *options)
+    assert line.startswith(f"{mesh}: a mesh, not an observation")
+    assert f"cadalign annotate PHOTO {mesh}" in line
+
+
+def test_photo_is_no_query(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refusal_line(capsys, "retrieve", "photo.png", "--library", "none.library")
+    assert line.startswith("photo.png: a photo, not an observation")
+
+
+def test_text_that_is_none_is_called_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refusal_line(capsys, "export", "model.ply", "--to", "x.glb")
+    assert line == "model.ply: cannot be read as text: byte 4 is not UTF-8"
+
+
+def test_observation_and_fit_are_told_apart(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal_line(capsys, "export", "seen.json", "--to", "x.glb")
+    assert line.startswith("seen.json: an observation, not the result of a fit; fit it first")
+    assert main(["fit", "seen.json"]) == 0
+    capsys.readouterr()
+    line = refusal_line(capsys, "fit", "seen_fit/fit.json")
+    fix = "give the observation that was fitted"
+    assert line == f"seen_fit/fit.json: the result of a fit, not an observation; {fix}"
+
+
+def test_folder_of_a_fit_is_exported(folder: Path) -> None:
+    assert main(["fit", "seen.json"]) == 0
+    assert main(["export", "seen_fit", "--to", "x.glb"]) == 0
+    assert Path("x.glb").stat().st_size
+
+
+def test_present_folder_is_fitted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here = folder / "here"
+    here.mkdir()
+    (folder / "seen.json").rename(here / "seen.json")
+    monkeypatch.chdir(here)
+    assert main(["fit", ".", "--no-picture"]) == 0
+    assert (folder / "here_fit" / "results.csv").is_file()
+
+
+def test_only_file_that_fails_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fit", "seen.json", "gone.json", "--no-picture"]) == 3
+    assert "failed 1: gone.json: no such file" in capsys.readouterr().err
+
+
+def test_keypoints_of_the_model_are_none_of_a_photo(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = refusal_line(capsys, "observe", "model.keypoints.json", "found.json")
+    what = "keypoints of a model, not those that a detector found in a photo"
+    assert line == f"model.keypoints.json: {what}"
+
+
+def test_another_name_of_the_photo_is_said(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["observe", "found.json", "model.keypoints.json", "--image", "photo.png"]) == 0
+    said = capsys.readouterr().err
+    assert "found.json calls the photo elsewhere.jpg; its keypoints count for photo.png" in said
+
+
+def test_folder_without_tracks_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "empty").mkdir()
+    line = refusal_line(capsys, "track", "empty")
+    assert line.startswith("empty: the folder has no car_tracks.json; give a file")
+
+
+def test_unknown_field_is_answered_by_fields(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = json.loads(Path("seen.json").read_text())
+    Path("typo.json").write_text(json.dumps(data | {"up_axs": "y"}))
+    line = refusal_line(capsys, "fit", "typo.json")
+    assert "unknown field 'up_axs', did you mean 'up_axis'?; known are cam_from_rig, " in line
+    assert "camera_height, " in line
+    assert "--" not in line
+
+
+def test_folder_is_no_mesh(folder: Path) -> None:
+    with pytest.raises(cadalign.errors.DataError, match="a folder, not a mesh file"):
+        cadalign.load_mesh(folder)

@@ -40,6 +40,7 @@ from cadalign.estimation.symmetry import (
 )
 from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
+from cadalign.estimation.uncertainty.misfit import unexplained
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
@@ -236,6 +237,9 @@ def result_of_minima(
         warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails)
     else:
         warnings = misfits(minimum.cost, track.redundancy, tails)
+    if problem.lacks_sigma:
+        nothing = unexplained(problem.noise, [view.pixels for view in views if view.sigma is None])
+        warnings = warnings if nothing is None else (nothing, *warnings)
     return result_of(
         model,
         prior,

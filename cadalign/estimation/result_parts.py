@@ -171,6 +171,11 @@ class KeypointStatistics(FittedKeypoints):
 
             unverified = unverified_stretch(self)
             doubts = [] if unverified is None else [unverified]
+        if self.sigma is not None and self.options.sigma is None:
+            from cadalign.estimation.uncertainty.misfit import unexplained
+
+            nothing = unexplained(self.sigma, [self._observed()])
+            doubts += [] if nothing is None else [nothing]
         chance = self.search and self.search.doubt(self.residuals, self.inliers)
         if chance:
             doubts.append(chance)
@@ -191,11 +196,15 @@ class KeypointStatistics(FittedKeypoints):
             others = another_pose(self.alignment, poses, self.covariance)
         return (*placed, *doubts, *weak, *others)
 
-    def _placed(self) -> tuple[str, ...]:
-        """Warnings about keypoints and a principal point outside of the image."""
+    def _observed(self) -> FloatArray:
+        """The keypoints in the image (n, 2) [px] that have residuals."""
         ahead = np.isfinite(self.residuals).all(axis=1)
         in_camera = self.alignment.apply(self.points_3d[ahead])
-        observed = self.camera.project_where_ahead(in_camera) - self.residuals[ahead]
+        return self.camera.project_where_ahead(in_camera) - self.residuals[ahead]
+
+    def _placed(self) -> tuple[str, ...]:
+        """Warnings about keypoints and a principal point outside of the image."""
+        observed = self._observed()
         if self.camera.is_centred and self.camera.contains(observed).all():
             return ()
         from cadalign.estimation.mistakes import outside_image  # rarely asked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from scipy.optimize import least_squares
 from support.covariances import of_unknowns
 from support.problems import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
 
-from cadalign import Alignment, Camera, fit
+from cadalign import Alignment, Camera, Model, View, align, fit
+from cadalign.errors import DegenerateError
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem
 from cadalign.geometry.metrics import rotation_error
 
@@ -92,6 +94,28 @@ def test_unknown_sigma_is_estimated_from_the_residuals() -> None:
     known = fit_problem(problem, sigma=result.sigma)
     assert_same(known.alignment, result.alignment, 1e-7)
     np.testing.assert_allclose(known.fisher_covariance, result.fisher_covariance, rtol=1e-5)
+
+
+def said_of(problem: Problem, points_2d: np.ndarray) -> list[bool]:
+    """Whether a fit and an estimate from two views say that keypoints explain nothing."""
+    view = View(problem.camera, points_2d, sigma=None)
+    views = [view, replace(view, points_2d=points_2d + 1.0)]
+    try:
+        fitted = fit(problem.points_3d, points_2d, problem.camera, sigma=None)
+        aligned = align(Model(points_3d=problem.points_3d), views)
+    except DegenerateError:
+        return [True, True]
+    return [any("which is which" in text for text in r.warnings) for r in (fitted, aligned)]
+
+
+def test_keypoints_in_random_order_are_warned_of_although_sigma_is_unknown() -> None:
+    named = []
+    for seed in range(10):
+        problem = problem_of(seed)
+        assert not any(said_of(problem, problem.points_2d))
+        order = np.random.default_rng(seed).permutation(len(problem.points_2d))
+        named += said_of(problem, problem.points_2d[order])
+    assert sum(named) >= 18  # of 20
 
 
 def test_unknown_sigma_is_estimated_in_spite_of_outliers_where_the_loss_is_robust() -> None:

@@ -13,7 +13,6 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
-from cadalign.estimation import principal
 from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake
@@ -155,6 +154,8 @@ def align(
 def _align_cropped(
     model: Model | ShapeModel, views: Sequence[View], options: FitOptions, **given: Any
 ) -> Result:
+    from cadalign.estimation import principal
+
     principal.check_shiftable(views)
     known = replace(options, principal_sigma=None).of_views
 

@@ -13,7 +13,6 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.focal import FocalPrior, PriorOption
-from cadalign.estimation.older_document import completed, upgraded
 from cadalign.estimation.options import FitOptions, pixel_information
 from cadalign.estimation.result_data import ResultData
 from cadalign.estimation.result_parts import Alternative, FitStats, Stated, ViewResult
@@ -277,6 +276,8 @@ def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
     try:
         with np.errstate(over="ignore", invalid="ignore"):
             if isinstance(data, Mapping) and "version" not in data:
+                from cadalign.estimation.older_document import completed, upgraded
+
                 form = {"version": VERSION, **upgraded(data)}
                 return completed(_result(convert(form, _Result), kind))
             return _result(convert(data, _Result), kind)

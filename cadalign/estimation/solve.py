@@ -27,7 +27,6 @@ from cadalign.estimation.problems import (
 )
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
-from cadalign.solvers.baselines import aepnp_paper, epnp
 from cadalign.solvers.constants import OK, OUT_OF_RANGE, POSE_SIZE
 from cadalign.solvers.linear import aepnp_batch
 from cadalign.solvers.optimal import optimal_batch
@@ -354,6 +353,8 @@ def _with_exact_sorted(found: Solutions, exact: BoolArray) -> Solutions:
 
 
 def _solve_baseline(problems: Problems, options: FitOptions, points: FloatArray) -> Solutions:
+    from cadalign.solvers.baselines import aepnp_paper, epnp
+
     solver = epnp if options.method == "epnp" else aepnp_paper
     rays, errors = _rays(problems)
     poses = np.zeros((len(problems), 1, POSE_SIZE))

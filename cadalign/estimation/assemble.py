@@ -20,10 +20,8 @@ from cadalign.estimation.result_parts import (
     quickly,
 )
 from cadalign.estimation.solve import LEAST_LIKELIHOOD, camera_of, fitted_fields
-from cadalign.estimation.symmetry import carried, held_axes, is_same
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.geometry.symmetry_group import group_of
 
 
 def result_of_solution(
@@ -110,6 +108,9 @@ def _alternatives(
 
 def canonical_result(result: Result, symmetry: Symmetry) -> Result:
     """A result of keypoints in one view as its canonical one, with alternatives that are others."""
+    from cadalign.estimation.symmetry import carried, held_axes, is_same
+    from cadalign.geometry.symmetry_group import group_of  # most models have none
+
     group = group_of(symmetry)
     held = held_axes(result.stretched_axes)
     best = group.canonical(result.alignment, held=held)

@@ -20,7 +20,6 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.estimation.problems import Problems, each_of, in_threads, pack_many, pack_one
 from cadalign.estimation.result import Result
 from cadalign.estimation.solve import solve, solve_one
-from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.names import renamed
@@ -283,6 +282,8 @@ def _check(ransac: object, scores: object, symmetry: Symmetry | None) -> None:
         fix = "give ransac=RansacOptions(...), or the keypoints' sigma instead"
         raise InputError("given without ransac", where="scores", fix=fix)
     if symmetry is not None:
+        from cadalign.estimation.symmetry import check_symmetry  # most models have none
+
         check_symmetry(symmetry)
 
 

@@ -14,12 +14,12 @@ import numpy.typing as npt
 
 from cadalign.errors import InputError
 from cadalign.estimation.result_data import ResultData
-from cadalign.estimation.uncertainty.summary import Contribution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from cadalign.estimation.uncertainty.sensitivity import Sensitivity
+    from cadalign.estimation.uncertainty.summary import Contribution
     from cadalign.export import ExportOptions
     from cadalign.geometry.mesh import Mesh
 

@@ -23,25 +23,19 @@ from cadalign.estimation.result_parts import (
     points_covariances,
     rms_of,
 )
-from cadalign.estimation.symmetry import equal_text, held_axes
-from cadalign.estimation.uncertainty.summary import (
-    EvidenceSummary,
-    MaskResiduals,
-    Misfit,
-    Uncertainty,
-    uncertainty_of,
-)
+from cadalign.estimation.uncertainty.summary import Uncertainty, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.shapes.parts import NearestShape, radius_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.tracks.motion import Trajectory
+    from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
+    from cadalign.shapes.parts import NearestShape
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,6 +276,8 @@ class ResultData:
             return self.own_equal
         if self.symmetry is None or self.symmetry.is_trivial:
             return ""
+        from cadalign.estimation.symmetry import equal_text, held_axes  # most models have none
+
         return equal_text(self.alignment, self.symmetry, held=held_axes(self.stretched_axes))
 
     @property
@@ -306,6 +302,8 @@ class ResultData:
         InputError
             If the probability is not between 0 and 1, or the dimension is not positive.
         """
+        from cadalign.shapes.parts import radius_of
+
         if not 0 < probability < 1:
             raise InputError(f"{probability!r} is not between 0 and 1", where="probability")
         if dimension < 1:

@@ -17,7 +17,6 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.focal import focal_doubt
 from cadalign.estimation.options import pixel_information
-from cadalign.estimation.symmetry import held_axes, without_free_turns
 from cadalign.estimation.uncertainty.posterior import FittedKeypoints, posterior_covariance
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
@@ -31,7 +30,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box, extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import by_rotation
-from cadalign.geometry.symmetry_group import group_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.consensus import RobustSearch
@@ -142,6 +140,9 @@ class KeypointStatistics(FittedKeypoints):
         covariance = posterior_covariance(self)
         if self.symmetry is None:
             return covariance
+        from cadalign.estimation.symmetry import held_axes, without_free_turns
+        from cadalign.geometry.symmetry_group import group_of  # most models have none
+
         held = held_axes(self.options.stretched_axes)
         best = group_of(self.symmetry).canonical(self.alignment, held=held)
         return without_free_turns(covariance, best)

@@ -12,7 +12,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.errors import CadalignError
-from cadalign.estimation.facing import faced, turned_covariance, turned_poses
 from cadalign.estimation.focal import check_estimable
 from cadalign.estimation.options import LOSSES, FitOptions, Sigma
 from cadalign.estimation.problems import (
@@ -107,6 +106,9 @@ def _solve_facing(
     problems: Problems, options: FitOptions, sigmas: Sequence[Sigma] | None
 ) -> Solutions:
     """Solve in frames that face the keypoints of wide lenses."""
+    # Only here: wide lenses are rare.
+    from cadalign.estimation.facing import faced, turned_covariance, turned_poses
+
     every = range(len(problems))
     cameras = [faced(problems.camera(b), problems.points_2d[problems.rows(b)]) for b in every]
     found = solve(replace(problems, cameras=tuple(cameras)), options, sigmas)

@@ -19,7 +19,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
 from cadalign.io.files import write_json
@@ -134,7 +133,7 @@ class Observation(ObservedImage):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], *, folder: Path | None = None) -> Observation:
         """Read the parsed form of an observation file; paths are relative to ``folder``."""
-        if "alignment" in data:
+        if isinstance(data, Mapping) and "alignment" in data:
             fix = "give the observation that was fitted"
             raise DataError("the result of a fit, not an observation", fix=fix)
         read, fields = read_fields(data)
@@ -247,4 +246,6 @@ class ObservationChanges:
 def _read_camera(
     path: Path, size: tuple[int, int] | None, pixel_origin: PixelOrigin | None
 ) -> Camera:
+    from cadalign.io.camera_file import read_camera
+
     return read_camera(path, size=size, pixel_origin=pixel_origin)

@@ -118,7 +118,7 @@ def test_annotated_model_is_written_and_lies_on_its_mesh(sample_root: Path, tmp_
         ),
         (
             DATA | {"points": 3},
-            "{path}: top level: unknown field 'points'; "
+            "{path}: top level: unknown field 'points', did you mean 'keypoints'?; "
             "known are format, keypoints, model, version",
         ),
         (DATA | {"keypoints": {}}, "{path}: keypoints: {{}} is not a list"),

@@ -127,7 +127,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (changed("keypoints", {}), "{path}: keypoints: {{}} is not a list"),
         (
             DATA | {"cameras": 3},
-            "{path}: top level: unknown field 'cameras'; "
+            "{path}: top level: unknown field 'cameras', did you mean 'camera'?; "
             "known are cam_from_rig, camera, camera_height, camera_height_sigma, depth, "
             "depth_scale, depth_sigma, fit, image, init, keypoints, mask, mask_sigma, model, "
             "object, pixel_origin, shape, size, symmetry, unfinished, up, up_axis, up_sigma_deg",
@@ -141,7 +141,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (changed("keypoints.3.uv", ...), "{path}: keypoints[3].uv: missing"),
         (
             changed("keypoints.2.uvw", 3),
-            "{path}: keypoints[2]: unknown field 'uvw'; "
+            "{path}: keypoints[2]: unknown field 'uvw', did you mean 'uv'?; "
             "known are confidence, depth, name, score, semantic_id, sigma, uv, xyz",
         ),
         (changed("keypoints.2.xyz", [1, 2]), "{path}: keypoints[2].xyz: [1, 2] is not a list of 3"),

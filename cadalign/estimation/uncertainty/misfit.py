@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import CadalignError, InputError
-from cadalign.estimation.mistakes import OTHER_SIZES, Explained, find_in_all, other_sizes
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
@@ -295,6 +294,8 @@ def _contradicting_camera(tested: _Tested) -> Camera | None:
         return None
     if tested.passes and tested.decrease_by_focal() < _WORTH_A_SEARCH:
         return None
+    from cadalign.estimation.mistakes import OTHER_SIZES  # rarely asked
+
     found = [tested.again(focal="estimate")]
     for factor in OTHER_SIZES:
         given = tested.camera.width, tested.camera.height
@@ -350,6 +351,8 @@ def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> str | None
     leaves nearly as much open as a stretch, counts only where neither a stretch nor a few wrong
     keypoints explain it.
     """
+    from cadalign.estimation.mistakes import Explained, find_in_all, other_sizes
+
     camera = None if misfit is None else misfit.camera
     has_reason = misfit is not None and bool(misfit.outliers or misfit.free_scale)
     try:

@@ -19,7 +19,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.facing import faced, turned_alignment, turned_covariance
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
 from cadalign.estimation.problems import distinct_rows
@@ -125,6 +124,9 @@ def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
     assert result.fisher_covariance is not None
     if needs_facing([result.camera]):
+        # Wide lenses are rare.
+        from cadalign.estimation.facing import faced, turned_alignment, turned_covariance
+
         kept = result.points_3d[result.inliers]
         camera = faced(result.camera, result.camera.project(result.alignment.apply(kept)))
         turn = camera.lens_from_camera

@@ -25,7 +25,6 @@ from cadalign.estimation.options import LOSSES
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
-from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.pixels import perspective
 from cadalign.shapes.gaussians import Gaussians
@@ -35,6 +34,7 @@ from cadalign.solvers.projection import ray_derivatives
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
+    from cadalign.estimation.view import View
 
 _POSE = 6
 _FALSE_ALARMS = 0.005  # of all tests of a view together

@@ -251,7 +251,7 @@ def tests_of(mutant: Mutant, arguments: Arguments) -> dict[str, list[str]]:
     if not covering:
         rooms = (f"{room}/", "tests/estimation/") if room == "tests/solvers" else (f"{room}/",)
         covering = [name for names in lines.values() for name in names if name.startswith(rooms)]
-    every = {name for names in lines.values() for name in names}
+    every = all_tests(arguments.coverage)
     inside = beginning_with([name for name in covering if name.startswith(f"{room}/")], every)
     outside = beginning_with([name for name in covering if not name.startswith(f"{room}/")], every)
     groups = {"room": inside, "others": outside}
@@ -294,6 +294,12 @@ def covering_tests(data: Path) -> dict[tuple[str, int], list[str]]:
             names = {name.split("|")[0] for name in contexts if name}
             tests.setdefault((path, line), []).extend(sorted(names))
     return tests
+
+
+@cache
+def all_tests(data: Path) -> set[str]:
+    """Names of all tests in the data of a run with coverage."""
+    return {name for names in covering_tests(data).values() for name in names}
 
 
 def difference(mutant: Mutant) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -217,8 +217,13 @@ def evidence_labels(observation: Observation) -> tuple[str, ...]:
     return tuple(labels)
 
 
-Fact = tuple[str, str, str]
-"""One row of the result: label, value, and a remark on the value."""
+@dataclass(frozen=True)
+class Fact:
+    """One row of the result: label, value, and a remark on the value."""
+
+    label: str
+    value: str
+    note: str
 
 
 def facts_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[Fact, ...]:
@@ -235,7 +240,7 @@ def facts_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[Fac
     if 2 * live.counts.sum() > 6 + len(result.stretched_axes):
         off = f"points off by {short(live.sigma)} px" if live.sigma > 1 else "clicks of 1 px"
         note = f"rms; the standard deviations above are for {off}"
-        facts.append(("Pairs agree to", f"{short(result.rms)} px", note))
+        facts.append(Fact("Pairs agree to", f"{short(result.rms)} px", note))
     return tuple(facts)
 
 
@@ -274,30 +279,30 @@ def _extent(live: LiveAlignment, axis: str, shape: ObjectShape | None, *, in_len
         label, unit = f"Length along {axis}", _unit(shape)
         value = float(np.ptp(result.bounds, axis=0)[row] * result.alignment.scale[row])
     if not value > 0 or relative > _UNCERTAIN:
-        return (label, *_UNDETERMINED)
+        return Fact(label, *_UNDETERMINED)
     average = "the model" if shape is None else shape.average
     if relative == 0:
-        return (label, f"{value:.3g}{unit}", f"{average}'s, taken as known")
+        return Fact(label, f"{value:.3g}{unit}", f"{average}'s, taken as known")
     text = f"{value:.3g} ± {short(value * relative)}{unit}"
     prior = float(live.prior_lengths[row])
     if prior and relative > _LEFT_OPEN * prior:
         if in_lengths:
-            return (label, text, f"the pairs leave it open: {average}'s and its spread")
+            return Fact(label, text, f"the pairs leave it open: {average}'s and its spread")
         note = f"the pairs leave it open: about 1 by the prior of ± {100 * prior:.0f} %"
-        return (label, "not determined", note)
+        return Fact(label, "not determined", note)
     percent = 100 * (stretch - 1)
     if abs(percent) < 100 * relative:
-        return (label, text, f"{average}'s length lies within the standard deviation")
+        return Fact(label, text, f"{average}'s length lies within the standard deviation")
     if abs(percent) < 0.5:
-        return (label, text, f"as long as {average}")
+        return Fact(label, text, f"as long as {average}")
     than = "longer" if percent > 0 else "shorter"
-    return (label, text, f"{abs(percent):.0f} % {than} than {average}")
+    return Fact(label, text, f"{abs(percent):.0f} % {than} than {average}")
 
 
 def _rotation(sigma: float) -> Fact:
     if sigma > _UNCERTAIN_DEG:
-        return ("Rotation", *_UNDETERMINED)
-    return ("Rotation", f"known to ± {short(sigma)}°", "")
+        return Fact("Rotation", *_UNDETERMINED)
+    return Fact("Rotation", f"known to ± {short(sigma)}°", "")
 
 
 def _distance(live: LiveAlignment, shape: ObjectShape | None) -> Fact:
@@ -308,12 +313,12 @@ def _distance(live: LiveAlignment, shape: ObjectShape | None) -> Fact:
     units = {"m": "", "diagonal": "diagonals of the object's box"}
     note = "model units" if learned is None else units.get(learned.unit, learned.unit)
     if covariance is None or not distance > 0:
-        return ("Distance", f"{distance:.3g} {note}", "")
+        return Fact("Distance", f"{distance:.3g} {note}", "")
     along = translation / distance
     sigma = math.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0))
     if sigma > _UNCERTAIN * distance:
-        return ("Distance", *_UNDETERMINED)
-    return ("Distance", f"{distance:.3g} ± {short(sigma)}{_unit(shape)}", note)
+        return Fact("Distance", *_UNDETERMINED)
+    return Fact("Distance", f"{distance:.3g} ± {short(sigma)}{_unit(shape)}", note)
 
 
 def _focal(live: LiveAlignment) -> Fact:
@@ -321,18 +326,18 @@ def _focal(live: LiveAlignment) -> Fact:
     assert result is not None
     if result.std is None or result.focal == "known":
         note = "assumed" if "focal length" in live.message else "taken as known"
-        return ("Focal length", f"{focal:.0f} px", note)
+        return Fact("Focal length", f"{focal:.0f} px", note)
     if live.camera != result.camera:  # another lens, which is not in the covariance
-        return ("Focal length", f"{focal:.0f} px", "estimated")
+        return Fact("Focal length", f"{focal:.0f} px", "estimated")
     relative = result.std.focal
     if relative > _UNCERTAIN:
-        return ("Focal length", *_UNDETERMINED)
+        return Fact("Focal length", *_UNDETERMINED)
     others = live.others_focal
     note = "estimated"
     if others is not None:
         percent = short(100 * others.relative_sigma)
         note += f" with the photo's other objects, which say {others.focal:.0f} px ± {percent} %"
-    return ("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", note)
+    return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", note)
 
 
 def _unit(shape: ObjectShape | None) -> str:

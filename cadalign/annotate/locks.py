@@ -14,6 +14,7 @@ import platform
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
@@ -178,6 +179,13 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_dev, status.st_ino
 
 
+@dataclass(frozen=True)
+class _Claim:
+    browser: str
+    person: str
+    since: float
+
+
 class Claims:
     """Claims of browsers on the photos that they change.
 
@@ -187,7 +195,7 @@ class Claims:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._claims: dict[int, tuple[str, str, float]] = {}  # browser, person, since when
+        self._claims: dict[int, _Claim] = {}
 
     def take(self, photos: Collection[int], browser: str, person: str) -> None:
         """Claim photos for a browser, all or none, or renew its claims.
@@ -195,18 +203,20 @@ class Claims:
         Raises InputError if another person has changed one of them within the last `LEASE` seconds.
         """
         now = self._clock()
-        for _, owner, since in (self._claims[each] for each in photos if each in self._claims):
-            left = since + LEASE - now
-            if owner != person and left > 0:
+        for claim in (self._claims[photo] for photo in photos if photo in self._claims):
+            left = claim.since + LEASE - now
+            if claim.person != person and left > 0:
                 raise InputError(
                     "someone else is annotating this photo, so that your change is not made",
                     where="photo",
                     fix=f"take another one, or try again {left:.0f} s after their last change",
                 )
         for photo in photos:
-            self._claims[photo] = browser, person, now
+            self._claims[photo] = _Claim(browser, person, now)
 
     def is_elsewhere(self, photo: int, browser: str) -> bool:
         """True while a photo belongs to another browser."""
-        owner, _, since = self._claims.get(photo, (browser, "", 0.0))
-        return owner != browser and self._clock() < since + LEASE
+        claim = self._claims.get(photo)
+        if claim is None or claim.browser == browser:
+            return False
+        return self._clock() < claim.since + LEASE

@@ -287,10 +287,7 @@ def _alignment(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
     return {
         "status": "done",
         "message": "",
-        "facts": [
-            dict(zip(("label", "value", "note"), fact, strict=True))
-            for fact in facts_of(live, session.shape)
-        ],
+        "facts": [asdict(fact) for fact in facts_of(live, session.shape)],
         "notes": [_with_photo_names(state, note) for note in notes_of(live, session.shape)],
         "also_used": ", ".join(live.also_used),
         "alignment": alignment.to_dict(),

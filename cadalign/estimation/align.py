@@ -126,8 +126,13 @@ def align(
     if size is not None:
         require_kind(size, Size, "size")
     inits = _checked_inits(init, given)
-    lens: dict[str, Any] = {"focal": focal, "focal_prior": focal_prior}
-    options = FitOptions(loss=loss, loss_scale=loss_scale, principal_sigma=principal_sigma, **lens)
+    options = FitOptions(
+        loss=loss,
+        loss_scale=loss_scale,
+        focal=focal,
+        focal_prior=focal_prior,
+        principal_sigma=principal_sigma,
+    )
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
     if motion is not None:
@@ -275,14 +280,20 @@ def align_batch(
     sizes = _one_each(size, len(objects), "size", Size)
     starts = _one_each(init, len(objects), "init", Alignment)
 
-    chosen: dict[str, Any] = {"loss": loss, "loss_scale": loss_scale, "ransac": ransac}
-    chosen |= {"focal": focal, "focal_prior": focal_prior, "principal_sigma": principal_sigma}
+    options: dict[str, Any] = {
+        "loss": loss,
+        "loss_scale": loss_scale,
+        "ransac": ransac,
+        "focal": focal,
+        "focal_prior": focal_prior,
+        "principal_sigma": principal_sigma,
+    }
 
     def one(
         views: View | Sequence[View], size: Size | None, init: Alignment | None
     ) -> Result | CadalignError:
         try:
-            return align(model, views, size=size, init=init, **chosen)
+            return align(model, views, size=size, init=init, **options)
         except CadalignError as error:
             return error
 

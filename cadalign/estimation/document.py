@@ -189,11 +189,6 @@ class _Result(ForeignDocument):
 def write_result(result: ResultData) -> dict[str, Any]:
     """A result as plain lists and numbers; its model is not part of it."""
     std, misfit, statistics = result.std, result.misfit, result.statistics
-    options = None if result.options is None else {**vars(result.options)}
-    if options is not None:
-        sigma = options["sigma"]
-        options["sigma"] = None if sigma is None else np.asarray(sigma, dtype=float).tolist()
-        options["focal_prior"] = _plain_prior(options["focal_prior"])
     return {
         "version": VERSION,
         **{name: getattr(result, name) for name in _PLAIN},
@@ -239,21 +234,19 @@ def write_result(result: ResultData) -> dict[str, Any]:
             for each in result.evidence
         ],
         "misfit": misfit and misfit.to_dict(),
-        "options": options,
+        "options": result.options and _plain_options(result.options),
         "symmetry": result.symmetry and result.symmetry.to_dict(),
         "equal_under_symmetry": result.equal_under_symmetry,
         "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
-        "mask_residuals": [
-            each
-            and {
-                **{name: _plain(value) for name, value in vars(each).items()},
-                "residuals": [r if math.isfinite(r) else None for r in each.residuals.tolist()],
-                "sigma": each.sigma if each.is_used else None,
-            }
-            for each in result.mask_residuals
-        ],
+        "mask_residuals": [each and _written_mask(each) for each in result.mask_residuals],
         "stats": {**vars(result.stats)},
     }
+
+
+def _written_mask(mask: MaskResiduals) -> dict[str, Any]:
+    plain = {name: _plain(value) for name, value in vars(mask).items()}
+    residuals = [each if math.isfinite(each) else None for each in plain["residuals"]]
+    return {**plain, "residuals": residuals, "sigma": mask.sigma if mask.is_used else None}
 
 
 def _finite_rows(rows: FloatArray) -> list[list[float] | None]:
@@ -262,6 +255,12 @@ def _finite_rows(rows: FloatArray) -> list[list[float] | None]:
 
 def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _plain_options(options: FitOptions) -> dict[str, Any]:
+    sigma = None if options.sigma is None else np.asarray(options.sigma, dtype=float).tolist()
+    prior = _plain_prior(options.focal_prior)
+    return {**vars(options), "sigma": sigma, "focal_prior": prior}
 
 
 def _plain_prior(prior: PriorOption) -> Any:

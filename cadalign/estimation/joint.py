@@ -238,8 +238,8 @@ def result_of_minima(
     else:
         warnings = misfits(minimum.cost, track.redundancy, tails)
     if problem.lacks_sigma:
-        nothing = unexplained(problem.noise, [view.pixels for view in views if view.sigma is None])
-        warnings = warnings if nothing is None else (nothing, *warnings)
+        pixels = [view.pixels for view in views if view.sigma is None]
+        warnings = (*unexplained(problem.noise, pixels), *warnings)
     return result_of(
         model,
         prior,

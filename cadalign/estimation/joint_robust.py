@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +30,14 @@ _KEPT = 4  # minima of the robust search that are settled on their inliers
 _LEAST_INLIERS = 3
 
 
-Supported = tuple[BoolArray, Evidence, State, float, float]
-"""Sightings (N,) that agree, their evidence, the estimate from it, its cost, and its score."""
+class JointConsensus(NamedTuple):
+    """Sightings (N,) that agree, the estimate from them, and its score."""
+
+    inliers: BoolArray
+    evidence: Evidence
+    state: State
+    cost: float
+    score: float
 
 
 def robust_starts(
@@ -63,7 +70,7 @@ def robust_starts(
 
 def robust_minima(
     evidence: Evidence, starts: Starts, threshold: FloatArray, *, settles: bool, projects: bool
-) -> tuple[list[Supported], int]:
+) -> tuple[list[JointConsensus], int]:
     """Estimates that most keypoints support, the best first, with the iterations they took.
 
     Each of the starts is refined under a robust loss, then on its inliers alone, once, or where it
@@ -81,14 +88,14 @@ def robust_minima(
         refined = _settle(evidence, state, limits, _ROUNDS if settles else 1)
         if refined is not None:
             found.append(refined)
-    found.sort(key=lambda each: each[-1])
+    found.sort(key=lambda consensus: consensus.score)
     return found, iterations
 
 
 def _settle(
     evidence: Evidence, state: State, threshold: FloatArray, rounds: int
-) -> Supported | None:
-    best: Supported | None = None
+) -> JointConsensus | None:
+    best: JointConsensus | None = None
     inliers = whitened_lengths(evidence, state) < threshold
     for _ in range(rounds):
         if inliers.sum() < _LEAST_INLIERS:
@@ -101,8 +108,8 @@ def _settle(
         state = minima.states[0]
         left_out = threshold[~inliers] ** 2 + OUTLIER_COST
         score = float(minima.scores[0]) + float(left_out.sum())
-        if best is None or score < best[-1]:
-            best = inliers, some, state, float(minima.costs[0]), score
+        if best is None or score < best.score:
+            best = JointConsensus(inliers, some, state, float(minima.costs[0]), score)
         again = whitened_lengths(evidence, state) < threshold
         if (again == inliers).all():
             break

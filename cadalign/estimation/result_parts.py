@@ -162,21 +162,19 @@ class KeypointStatistics(FittedKeypoints):
         mistake = self._mistake()
         if mistake is not None:  # nothing else can be said of the alignment
             return (mistake,)
-        placed = self._placed()
+        observed = self._observed()
+        placed = self._placed(observed)
         if self.covariance is None:
             return placed
+        from cadalign.estimation.uncertainty.misfit import unexplained, unverified_stretch
+
         if self.misfit is not None:
             doubts = [str(self.misfit)]
         else:
-            from cadalign.estimation.uncertainty.misfit import unverified_stretch
-
             unverified = unverified_stretch(self)
             doubts = [] if unverified is None else [unverified]
         if self.sigma is not None and self.options.sigma is None:
-            from cadalign.estimation.uncertainty.misfit import unexplained
-
-            nothing = unexplained(self.sigma, [self._observed()])
-            doubts += [] if nothing is None else [nothing]
+            doubts.extend(unexplained(self.sigma, [observed]))
         chance = self.search and self.search.doubt(self.residuals, self.inliers)
         if chance:
             doubts.append(chance)
@@ -203,9 +201,8 @@ class KeypointStatistics(FittedKeypoints):
         in_camera = self.alignment.apply(self.points_3d[ahead])
         return self.camera.project_where_ahead(in_camera) - self.residuals[ahead]
 
-    def _placed(self) -> tuple[str, ...]:
-        """Warnings about keypoints and a principal point outside of the image."""
-        observed = self._observed()
+    def _placed(self, observed: FloatArray) -> tuple[str, ...]:
+        """Warnings about keypoints (n, 2) [px] and a principal point outside of the image."""
         if self.camera.is_centred and self.camera.contains(observed).all():
             return ()
         from cadalign.estimation.mistakes import outside_image  # rarely asked

@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.joint_robust import (
+    JointConsensus,
     robust_minima,
     robust_starts,
     whitened_lengths,
@@ -145,7 +146,7 @@ def minima_at_noise(
             minima_of, used = search_joint(evidence, *starts)
             every = np.ones(len(evidence.sightings.point), dtype=bool)
             found = [
-                (every, evidence, state, float(cost), float(score))
+                JointConsensus(every, evidence, state, float(cost), float(score))
                 for state, cost, score in zip(*minima_of, strict=True)
             ]
         else:
@@ -157,8 +158,8 @@ def minima_at_noise(
         iterations += used
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
-            Minimum(number, kept, own, state, cost, score + prior_score, problem.lenses)
-            for kept, own, state, cost, score in found
+            Minimum(number, *each._replace(score=each.score + prior_score), problem.lenses)
+            for each in found
         )
     if ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)

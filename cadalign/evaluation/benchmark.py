@@ -16,9 +16,9 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.methods.method import LIMIT, Method, MethodInput
 from cadalign.evaluation.methods.registry import choose_methods, fingerprints
 from cadalign.evaluation.metrics.registry import (
+    Compared,
     RegisteredMetric,
     choose_metrics,
-    compared,
     metrics_config,
 )
 from cadalign.evaluation.options import ExperimentOptions
@@ -265,7 +265,7 @@ class Benchmark:
             return row
         instance, estimate = pair
         given = self.setting.given(instance)
-        found = compared(estimate, given.gt)
+        found = Compared.of(estimate, given.gt)
         for each in self.metrics:
             value = attempt(each.measure, found, given)
             if isinstance(value, Exception):

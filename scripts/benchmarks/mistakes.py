@@ -16,13 +16,13 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import angle_between
 from cadalign.render import look_at
+from cadalign.solvers.constants import UNKNOWNS
 
 _NOISE_PX, _OUTLIERS = 1.0, 0.3
 _FEWEST, _MOST = 7, 16  # keypoints
 _STRETCH_SIGMA = 0.25  # of log scales
 _DISTANCE, _ELEVATION_DEG = (2.0, 4.0), (-10.0, 50.0)
 _WRONG_DEG = 10.0
-_UNKNOWNS = 8
 _CLAUSES = ("is mirrored", "are swapped", "is flipped", "from the bottom")
 
 
@@ -156,7 +156,7 @@ def _said(seen: SeenModel, shape_sigma: float) -> tuple[bool, bool, bool, bool]:
     turn = angle_between(found.alignment.rotation, seen.rotation)
     named = any(each in text for text in texts for each in _CLAUSES)
     square, count = (found.residuals**2).sum() / _NOISE_PX**2, found.residuals.size
-    fits = found.inliers.all() and square < chi2.isf(0.01, max(count - _UNKNOWNS, 1))
+    fits = found.inliers.all() and square < chi2.isf(0.01, max(count - UNKNOWNS, 1))
     return not texts and turn > _WRONG_DEG, named, False, bool(fits)
 
 

@@ -324,7 +324,7 @@ def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
 
 def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> None:
     problem = problem_of(7, points=15, noise_px=1.0)
-    facts = {label: fact for label, *fact in facts_of(live_of(problem))}
+    facts = {fact.label: fact for fact in facts_of(live_of(problem))}
     assert list(facts) == [
         "Stretch along y",
         "Stretch along z",
@@ -333,27 +333,25 @@ def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> Non
         "Focal length",
         "Pairs agree to",
     ]
-    value, _, std = facts["Stretch along y"][0].partition(" ± ")
+    value, _, std = facts["Stretch along y"].value.partition(" ± ")
     assert abs(float(value) - problem.alignment.scale[1]) < 5 * float(std)
     longer = problem.alignment.scale[1] > 1
-    assert facts["Stretch along y"][1].endswith(
+    assert facts["Stretch along y"].note.endswith(
         f"{'longer' if longer else 'shorter'} than the model"
     )
-    assert facts["Focal length"][0] == "150 px"
-    assert facts["Rotation"][0].startswith("known to ± ")
-    assert facts["Pairs agree to"][0].endswith(" px")
+    assert facts["Focal length"].value == "150 px"
+    assert facts["Rotation"].value.startswith("known to ± ")
+    assert facts["Pairs agree to"].value.endswith(" px")
     assert facts_of(LiveAlignment()) == ()
 
 
 def test_estimated_focal_length_has_a_standard_deviation() -> None:
     facts = {
-        label: fact
-        for label, *fact in facts_of(
-            live_of(problem_of(7, points=15, noise_px=1.0), choice=UNKNOWN)
-        )
+        fact.label: fact
+        for fact in facts_of(live_of(problem_of(7, points=15, noise_px=1.0), choice=UNKNOWN))
     }
-    assert " ± " in facts["Focal length"][0]
-    assert facts["Focal length"][1] == "estimated"
+    assert " ± " in facts["Focal length"].value
+    assert facts["Focal length"].note == "estimated"
 
 
 def test_notes_name_alternatives_and_weak_stretches() -> None:

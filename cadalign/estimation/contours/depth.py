@@ -66,7 +66,7 @@ def fit_depths(
         return list(minima)
     keypoints, first = len(prior.ids), minima[0]
     where = f"views[{samples[0].image}].depth"
-    surface = surfaces_of(model, first.points[:keypoints], where)[0][0]
+    surface = surfaces_of(model, first.points[:keypoints], where).surfaces[0]
     likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
     found = []
     for each in likely[:_MOST_STARTS]:

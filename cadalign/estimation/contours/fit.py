@@ -122,12 +122,7 @@ def fit_masks(
     first = minima[0]
     where = f"views[{contours[0].image}].mask"
     surfaces, convex = surfaces_of(model, first.points[:keypoints], where)
-    # Where the evidence without masks leaves unknowns open, any minimum may be the one.
-    _, information = information_of(*reduced(first.evidence, first.state))
-    sizes, is_open = information.diagonal(), True
-    if np.isfinite(sizes).all() and (sizes > 0).all():
-        least = np.linalg.eigvalsh(scaled(information)[0])[0]
-        is_open = not least > _LEAST_INFORMATION
+    is_open = not _is_determined(first)
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
@@ -137,12 +132,11 @@ def fit_masks(
     while used:
         best = explore(used, surfaces)
         if not convex and not is_open:
-            least = _WELL_KNOWN
-            if best and _misfit(best[0].settled) <= _AGREEING:
-                least = _POORLY_KNOWN if best[0].masked.surface.is_exact else np.inf
-            others = _displaced(first, least)
-            displaced = _explored(others, keypoints, used, surfaces, is_wide=False)
-            best = sorted([*best, *displaced], key=lambda each: _misfit(each.settled))
+            agrees = bool(best) and _misfit(best[0].settled) <= _AGREEING
+            if not agrees or best[0].masked.surface.is_exact:
+                others = _displaced(first, _POORLY_KNOWN if agrees else _WELL_KNOWN)
+                displaced = _explored(others, keypoints, used, surfaces, is_wide=False)
+                best = sorted([*best, *displaced], key=lambda each: _misfit(each.settled))
         hulls = [_hull_contour(each, views[each.image]) for each in used] if convex else []
         known = [each for each in hulls if each is not None]
         if known and len(known) == len(used):
@@ -185,6 +179,14 @@ def fit_masks(
     ]
     found = [each.minimum for each in best] if used else list(minima)
     return Refined(found, summaries, warnings, tuple(residuals))
+
+
+def _is_determined(minimum: Minimum) -> bool:
+    """True if the evidence without masks determines all unknowns."""
+    _, information = information_of(*reduced(minimum.evidence, minimum.state))
+    if not np.isfinite(information.diagonal()).all() or not (information.diagonal() > 0).all():
+        return False
+    return bool(np.linalg.eigvalsh(scaled(information)[0])[0] > _LEAST_INFORMATION)
 
 
 def _displaced(start: Minimum, least: float) -> list[tuple[Minimum, State]]:
@@ -285,7 +287,7 @@ def _contradicting(
 def _off_mask(view: View) -> str:
     """Report that most keypoints lie off a view's mask, as they do where it is inverted."""
     mask = cast("FloatArray | BoolArray", view.mask_image)
-    pixels = np.round(np.asarray(view.points_2d)).astype(int)
+    pixels = np.round(view.pixels).astype(int)
     u, v = pixels[((pixels >= 0) & (pixels < mask.shape[::-1])).all(axis=1)].T
     count, off = len(u), int((mask[v, u] < 0.5).sum())
     if count < _LEAST_KEYPOINTS or 2 * off <= count:

@@ -321,7 +321,7 @@ def fit_photos(
     ]
     keypoints = len(prior.ids)
     where = f"views[{photos[0].image}].image"
-    surface = surfaces_of(model, minima[0].points[:keypoints], where)[0][0]
+    surface = surfaces_of(model, minima[0].points[:keypoints], where).surfaces[0]
     warnings: list[str] = []
     found: dict[int, OutlineSupport] = {}
     left_out: dict[int, OutlineSupport] = {}
@@ -332,14 +332,7 @@ def fit_photos(
         if wrong is None:
             supports = best[0].supports
             found = {photo.image: each for photo, each in zip(photos, supports, strict=True)}
-            for number, each in found.items():
-                where = f"views[{number}].image"
-                share = f"shows only {100 * each.share:.0f} % of the model's outline"
-                off = f"{each.rms_sigmas:.1f} standard deviations off the model's outline"
-                if each.share < _GOOD_SUPPORT:
-                    warnings.append(f"{where} {share}")
-                elif each.rms_sigmas > _MOST_RMS:
-                    warnings.append(f"{where}: edges lie {off}: some may be another object's")
+            warnings.extend(_weak(found))
             refined = [each.minimum for each in best]
             break
         photo, reason = wrong
@@ -351,6 +344,19 @@ def fit_photos(
         for view, own in {**found, **left_out}.items()
     ]
     return Refined(refined, summaries, warnings, photos=frozenset(found))
+
+
+def _weak(found: dict[int, OutlineSupport]) -> list[str]:
+    """Warnings about photos that show only a part of the outline, or another thing's."""
+    warnings = []
+    for view, each in found.items():
+        where = f"views[{view}].image"
+        if each.share < _GOOD_SUPPORT:
+            warnings.append(f"{where} shows only {100 * each.share:.0f} % of the model's outline")
+        elif each.rms_sigmas > _MOST_RMS:
+            off = f"{each.rms_sigmas:.1f} standard deviations off the model's outline"
+            warnings.append(f"{where}: edges lie {off}: some may be another object's")
+    return warnings
 
 
 def _explored(

@@ -170,7 +170,7 @@ def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:
         training = cast(TrainingShapes, model.training)
         rows = _varied(training, mean)
         shapes = list(training.points_3d[rows].astype(np.float64))
-    return [surfaces_of(model, points, _WHERE)[0][0] for points in shapes]
+    return [surfaces_of(model, points, _WHERE).surfaces[0] for points in shapes]
 
 
 def _varied(training: TrainingShapes, mean: FloatArray) -> list[int]:

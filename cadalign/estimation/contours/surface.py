@@ -8,10 +8,11 @@ masks and meshes compare by their hulls as they do by themselves.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -146,13 +147,18 @@ def _hull_faces(vertices: FloatArray) -> IntArray:
     return cast(IntArray, ConvexHull(vertices, qhull_options=_QHULL).simplices.astype(np.int64))
 
 
-def surfaces_of(
-    model: Model | ShapeModel, points_3d: FloatArray, where: str
-) -> tuple[list[Surface], list[Surface]]:
+class SurfaceChoice(NamedTuple):
+    """Surfaces, the likeliest first; ``hulls`` are their convex hulls, none of an exact one."""
+
+    surfaces: list[Surface]
+    hulls: list[Surface]
+
+
+def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) -> SurfaceChoice:
     """Surfaces for a shape whose keypoints are about ``points_3d`` (m, 3), the nearest first.
 
-    Also returns their convex hulls, none of an exact one. Raises InputError where there is no mesh,
-    which the mask or photo ``where`` needs; DataError if one cannot be read.
+    Raises InputError where there is no mesh, which the mask or photo ``where`` needs; DataError if
+    one cannot be read.
     """
     wanting = "a photo" if where.endswith("image") else "a mask"
     if isinstance(model, Model):
@@ -160,13 +166,17 @@ def surfaces_of(
             fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
             raise InputError(f"the model has no mesh, which {wanting} needs", where=where, fix=fix)
         if model.shape_sigma is None:
-            return [RigidSurface(model.mesh)], []
+            return SurfaceChoice([RigidSurface(model.mesh)], [])
         points = cast(FloatArray, model.points_3d)
-        given = [(model.mesh, points, np.arange(len(points)))]
-    else:
-        given = _nearest_with_mesh(model, points_3d, where, wanting)
-    surfaces, hulls = ([WarpedSurface(*g, is_hull=h) for g in given] for h in (False, True))
-    return [*surfaces], [*hulls]
+        return _warped([(model.mesh, points, np.arange(len(points)))])
+    return _warped(_nearest_with_mesh(model, points_3d, where, wanting))
+
+
+def _warped(given: Sequence[tuple[Mesh, FloatArray, IntArray]]) -> SurfaceChoice:
+    return SurfaceChoice(
+        [WarpedSurface(*each) for each in given],
+        [WarpedSurface(*each, is_hull=True) for each in given],
+    )
 
 
 def _nearest_with_mesh(

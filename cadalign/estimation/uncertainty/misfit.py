@@ -330,7 +330,7 @@ def _outliers(tested: _Tested) -> dict[int, float]:
     return {int(tested.rows[row]): length for row, length in found.items()}
 
 
-def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> str | None:
+def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> tuple[str, ...]:
     """Warn of an estimated sigma [px] that is nearly the spread of the keypoints of views (n, 2).
 
     In 98 % of pairs of a category's models it is a smaller share, of keypoints in random order in
@@ -338,9 +338,9 @@ def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> str | None:
     """
     spread = max(float(points.std(axis=0).max()) for points in points_2d if len(points))
     if sigma <= _LARGEST_SHARE * spread:
-        return None
+        return ()
     share = f"{sigma:.3g} px, {100 * sigma / spread:.0f} % of the keypoints' standard deviation"
-    return f"sigma is {share}: the model explains next to nothing of them, check which is which"
+    return (f"sigma is {share}: the model explains next to nothing of them, check which is which",)
 
 
 def mistake_in_fit(result: FittedKeypoints, misfit: Misfit | None) -> str | None:

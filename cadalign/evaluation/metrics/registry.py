@@ -25,25 +25,32 @@ from cadalign.evaluation.portable import Portable, code_hash
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
+    from cadalign.estimation.result import Result
     from cadalign.evaluation.runs.tables import Columns
 
-ARGUMENTS = ("est", "gt", "result", "points_3d", "points_2d", "camera", "sigma", "bounds")
+_OF_ESTIMATES = ("est", "gt", "result")
+ARGUMENTS = (*_OF_ESTIMATES, "points_3d", "points_2d", "camera", "sigma", "bounds")
 """Names of the parameters that functions may have."""
 _REGISTERED: dict[str, RegisteredMetric] = {}
 
 
-Compared = dict[str, Any]
-"""An estimated alignment ``est``, the true one ``gt``, and the ``result`` it is of; or None."""
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """An estimated alignment, the true one if it is known, and the result it is of, if any."""
 
+    est: Alignment
+    gt: Alignment | None
+    result: Result | None = None
 
-def compared(estimate: Any, gt: Alignment | None) -> Compared:
-    """An alignment, a result, or another estimate with an ``alignment`` and perhaps one."""
-    from cadalign.estimation.result import Result
+    @classmethod
+    def of(cls, estimate: Any, gt: Alignment | None) -> Compared:
+        """An alignment, a result, or another estimate with an ``alignment`` and perhaps one."""
+        from cadalign.estimation.result import Result
 
-    if isinstance(estimate, Alignment):
-        return {"est": estimate, "gt": gt, "result": None}
-    result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
-    return {"est": estimate.alignment, "gt": gt, "result": result}
+        if isinstance(estimate, Alignment):
+            return cls(estimate, gt)
+        result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
+        return cls(estimate.alignment, gt, result)
 
 
 @dataclass(frozen=True)
@@ -59,11 +66,12 @@ class RegisteredMetric:
 
         Raises InputError if the function raises, or returns no number.
         """
-        if "gt" in self.parameters and found["gt"] is None:
+        if "gt" in self.parameters and found.gt is None:
             return None
         where = f"metric {self.metric.key}"
         arguments = {
-            name: found[name] if name in found else getattr(given, name) for name in self.parameters
+            name: getattr(found if name in _OF_ESTIMATES else given, name)
+            for name in self.parameters
         }
         try:
             value = self.function(**arguments)

@@ -29,7 +29,7 @@ from cadalign.evaluation.runs.parallel import Chunk, Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import OK
-from cadalign.io.files import write_whole
+from cadalign.io.files import as_path, write_whole
 from cadalign.io.input_kinds import DetectorOptions
 from cadalign.io.observation import Observation, ObservationChanges
 
@@ -115,7 +115,7 @@ def fit_many(
         is_kept = out is not None
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
-        folder = RunFolder(Path(out))
+        folder = RunFolder(as_path(out, "out"))
         chosen = replace(options_of(options), inputs=_inputs(observations, folder))
         chosen = replace(chosen, pictures=pictures)
         run_many(chosen, folder, workers=workers, dask=dask, on_progress=on_progress)
@@ -209,13 +209,13 @@ def options_of(given: dict[str, Any]) -> FitRunOptions:
 def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
     """The inputs of a run; observations are written to a file of its folder."""
     if isinstance(observations, str | os.PathLike):
-        return (Path(observations),)
+        return (as_path(observations, "observations"),)
     source = iter(observations)
     first = next(source, None)
     if first is None:
         raise InputError("there are none", where="observations")
     if not isinstance(first, Observation):
-        return (Path(first), *(Path(each) for each in source))  # type: ignore[arg-type]
+        return tuple(as_path(each, "observations") for each in (first, *source))
     folder.make()
     path = folder.path / _SPOOL
 

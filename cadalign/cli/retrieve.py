@@ -48,7 +48,8 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
     """Folder for matches.json, the matches' overlays and index.html; by default none is
     written. For many observations the run's, by default beside them."""
     mask: Path | None = None
-    """Image of the object's pixels in white: ranks the matches again by their silhouettes."""
+    """Image of the object's pixels in white: ranks the matches again by their silhouettes; by
+    default the observation's."""
     workers: int | None = None
     """Threads for one observation, -1 (the default) for one per core. Processes for many, 0 for
     none; by default -1, for few observations 0."""

@@ -12,10 +12,17 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 import numpy as np
 
 from cadalign.arrays import FloatArray, worker_count
-from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
+from cadalign.errors import (
+    CadalignError,
+    DegenerateError,
+    InputError,
+    NoConsensusError,
+    quote,
+    require_kind,
+)
 from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.joint import result_of_minima
-from cadalign.estimation.joint_mistakes import joint_mistake
+from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prepared_views import align_facing, align_without, views_without_pose
@@ -199,13 +206,18 @@ def _align_all(
         minima, iterations, hypotheses = minima_at_start(problem, inits)
         mistake = None
     else:
-        problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
+        try:
+            problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
+        except NoConsensusError as error:
+            error.fix = mistake_beside(problem, ransac) or error.fix
+            raise
         mistake = joint_mistake(problem, minima[0], ransac) if minima else None
     if not minima:
         raise DegenerateError(
             "no pose has the keypoints in front of the camera",
             where="views",
-            fix="give at least 3 keypoints in one view, or `init`, and check which is which",
+            fix=mistake_beside(problem, ransac)
+            or "give at least 3 keypoints in one view, or `init`, and check which is which",
         )
     refined = []
     if any(view.mask is not None for view in views):

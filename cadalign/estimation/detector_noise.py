@@ -21,7 +21,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_point
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Count, Document, Finite, NotNegative, Positive, read_document
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import write_json
+from cadalign.io.files import as_path, write_json
 from cadalign.io.observation import Observation
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ class DetectorNoise:
         factors = [{"id": name, "factor": factor} for name, factor in self.factors.items()]
         plain = {name: getattr(self, name) for name in ("outliers", "correlation", "count")}
         document = {"unit": self.unit, "knots": knots, "factors": factors, **plain}
-        write_json(Path(path), document)
+        write_json(as_path(path), document)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> DetectorNoise:
@@ -164,7 +164,7 @@ class DetectorNoise:
         DataError
             If the file cannot be read, or a field is missing or invalid; the message names both.
         """
-        read = read_document(Path(path), _NoiseFile)
+        read = read_document(as_path(path), _NoiseFile)
         return cls(
             [knot.score for knot in read.knots],
             [knot.sigma for knot in read.knots],

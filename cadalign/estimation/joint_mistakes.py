@@ -11,6 +11,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError
 from cadalign.estimation.joint_robust import OUTLIER_COST
 from cadalign.estimation.mistakes import (
+    DOWNWARD,
     Explained,
     Mistake,
     find_in_all,
@@ -54,8 +55,8 @@ def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions | 
 
     found = _explained(problem, best, ransac)
     if are_few:
-        return find_likelier(found.score, len(best.inliers), explain)
-    return find_mistake(found, len(best.inliers), explain)
+        return find_likelier(found.score, len(best.inliers), explain, _beside_keypoints(problem))
+    return find_mistake(found, len(best.inliers), explain, _beside_keypoints(problem))
 
 
 def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:
@@ -75,20 +76,31 @@ def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:
             return None
         return Explained(minimum.score, count, _up(minimum))
 
-    sizes = []
+    more = _beside_keypoints(problem)
     has_more = problem.size is not None or any(view.sources for view in problem.views)
     # Another image size leaves much open, so that other evidence which is wrong would pass for it.
     is_one = len({(view.camera.width, view.camera.height) for view in problem.views}) == 1
     if is_one and not has_more:
         pixels = np.concatenate([view.pixels for view in problem.views])
-        sizes = other_sizes(pixels, problem.views[0].camera)
-    found = find_in_all(best.score, count, explain, sizes)
+        more += other_sizes(pixels, problem.views[0].camera)
+    found = find_in_all(best.score, count, explain, more)
     if found is None:
         return None
     return (
         f"{found[0]}: corrected, all evidence agrees; as given, the residuals are {given:.2g} "
         "times what their standard deviations allow"
     )
+
+
+def _beside_keypoints(problem: JointProblem) -> list[Mistake]:
+    """Mistakes in other evidence than keypoints."""
+    return [DOWNWARD] if any(view.up is not None for view in problem.views) else []
+
+
+def mistake_beside(problem: JointProblem, ransac: RansacOptions | None) -> str | None:
+    """Name the mistake in other evidence than keypoints without which there is an estimate."""
+    tried = _beside_keypoints(problem)
+    return next((each.clause for each in tried if _without(problem, each, ransac)), None)
 
 
 def _misfit(minimum: Minimum) -> float:
@@ -115,6 +127,10 @@ def _without(
     views = [
         replace(each, points_2d=mistake.undo_2d(each.pixels, each.camera)) for each in problem.views
     ]
+    if mistake.downward:
+        views = [
+            each if each.up is None else replace(each, up=np.negative(each.up)) for each in views
+        ]
     prior = replace(problem.prior, components=components)
     unknown = [None] * len(views)  # starts are of the data as given
     try:

@@ -45,8 +45,9 @@ class Explained(NamedTuple):
 class Mistake(NamedTuple):
     """A usual mistake in keypoints, named by a clause; made again, it is undone.
 
-    The model mirrored across x, u or v counted from the photo's other side, u and v swapped, or
-    pixels of an image ``factor`` times as large as the camera's.
+    The model mirrored across x, u or v counted from the photo's other side, u and v swapped, pixels
+    of an image ``factor`` times as large as the camera's, or, beside the keypoints, an ``up`` that
+    points down.
     """
 
     clause: str
@@ -54,6 +55,7 @@ class Mistake(NamedTuple):
     flipped: tuple[bool, bool] = (False, False)
     swapped: bool = False
     factor: float = 1.0
+    downward: bool = False
 
     def undo_3d(self, points_3d: FloatArray) -> FloatArray:
         """Keypoints on the model (n, 3) without the mistake."""
@@ -75,6 +77,7 @@ _MISTAKES = (
     Mistake("the photo is flipped", flipped=(True, False)),
     Mistake("v counts from the bottom", flipped=(False, True)),
 )
+DOWNWARD = Mistake("`up` points down (give its opposite)", downward=True)
 Tried = Sequence[tuple[Mistake, Explained]]
 
 
@@ -118,14 +121,15 @@ def find_in_all(
     score: float,
     count: int,
     explain: Callable[[Mistake], Explained | None],
-    sizes: Sequence[Mistake] = (),
+    more: Sequence[Mistake] = (),
 ) -> tuple[str, Mistake, float] | None:
     """Name the mistake without which all keypoints of an estimate without search would agree.
 
     ``score`` is that of the ``count`` keypoints as given; ``explain`` says None where they do not
-    agree after a mistake is undone. Returns clauses, the likeliest mistake and its score.
+    agree after a mistake is undone, one of ``more`` mistakes among them. Returns clauses, the
+    likeliest mistake and its score.
     """
-    tried = try_mistakes(explain, count) + try_mistakes(explain, count, sizes)
+    tried = try_mistakes(explain, count, (*_MISTAKES, *more))
     tried = [each for each in tried if each[1].score < score - _DECISIVE]
     if not tried:
         return None
@@ -148,14 +152,14 @@ def find_mistake(
     found: Explained,
     given: int,
     explain: Callable[[Mistake], Explained | None],
-    sizes: Sequence[Mistake] = (),
+    more: Sequence[Mistake] = (),
 ) -> str | None:
     """Name the mistake without which more keypoints of a robust search would agree.
 
     ``found`` is what the estimate explains of the ``given`` number of keypoints; ``explain`` says
-    what the best estimate explains after a mistake is undone, None where there is none; ``sizes``
-    are mistakes in the resolution, tried where keypoints are rejected. Returns a warning; None
-    where no mistake makes the data likelier.
+    what the best estimate explains after a mistake is undone, None where there is none; ``more``
+    are mistakes in the resolution or beside the keypoints, tried where keypoints are rejected.
+    Returns a warning; None where no mistake makes the data likelier.
     """
 
     def is_better(each: Explained) -> bool:
@@ -166,7 +170,7 @@ def find_mistake(
     rejected = given - found.inliers
     # Where all agree, perspective is so weak that they agree with a mirrored model if with any.
     first = 2 if rejected else 1
-    tried = try_mistakes(explain, given, (*_MISTAKES[:first], *(sizes if rejected else ())))
+    tried = try_mistakes(explain, given, (*_MISTAKES[:first], *(more if rejected else ())))
     if not any(is_better(each) for _, each in tried):
         return None
     tried += try_mistakes(explain, given, _MISTAKES[first:])
@@ -178,19 +182,23 @@ def find_mistake(
 
 
 def find_likelier(
-    score: float, count: int, explain: Callable[[Mistake], Explained | None]
+    score: float,
+    count: int,
+    explain: Callable[[Mistake], Explained | None],
+    more: Sequence[Mistake] = (),
 ) -> str | None:
     """Name the mistake without which the keypoints of an uncertain shape are likelier.
 
     Such a shape follows the keypoints of most mistakes, so that none is rejected: the likelihoods
-    tell them apart. ``score`` is that of the ``count`` keypoints as given.
+    tell them apart. ``score`` is that of the ``count`` keypoints as given; ``more`` are mistakes
+    beside them.
     """
 
     def likelier(tried: Tried) -> list[Explained]:
         return [each for _, each in tried if each.score < score - _SURE]
 
     # About a centred principal point, flips are the same as a mirrored model.
-    tried = try_mistakes(explain, count, _MISTAKES[:2])
+    tried = try_mistakes(explain, count, (*_MISTAKES[:2], *more))
     if not likelier(tried):
         return None
     tried += try_mistakes(explain, count, _MISTAKES[2:])
@@ -266,8 +274,9 @@ class Support(NamedTuple):
 
 def area_of(points_2d: FloatArray, camera: Camera, max_reproj_error: float) -> float:
     """The area [px^2] over which the outliers among keypoints (n, 2) are scattered."""
-    extent = np.ptp(points_2d, axis=0) + 2 * max_reproj_error
-    return min(float(np.prod(extent)), float(camera.width) * float(camera.height))
+    with np.errstate(over="ignore"):  # an infinite extent is more than the image's, too
+        extent = np.ptp(points_2d, axis=0) + 2 * max_reproj_error
+        return min(float(np.prod(extent)), float(camera.width) * float(camera.height))
 
 
 def check_support(

@@ -209,9 +209,9 @@ class Result(ResultData):
         DataError
             If the file cannot be written.
         """
-        from cadalign.io.files import write_json
+        from cadalign.io.files import as_path, write_json
 
-        write_json(Path(path), self.to_dict())
+        write_json(as_path(path), self.to_dict())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Result:
@@ -223,9 +223,11 @@ class Result(ResultData):
             If the file cannot be read, or a field is missing or invalid; the message names both.
         """
         from cadalign.io.documents import in_file, read_json
+        from cadalign.io.files import as_path
 
-        data = read_json(Path(path))
-        with in_file(Path(path)):
+        path = as_path(path)
+        data = read_json(path)
+        with in_file(path):
             return cls.from_dict(data)
 
     def to_dict(self) -> dict[str, Any]:

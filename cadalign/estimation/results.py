@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -21,6 +20,7 @@ from cadalign.estimation.symmetry import carried, held_axes
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
+from cadalign.io.files import as_path
 from cadalign.solvers.constants import POSE_SIZE
 
 if TYPE_CHECKING:
@@ -214,7 +214,7 @@ class Results(Sequence[Result | CadalignError]):
         >>> results = Results.open("runs/fit")  # doctest: +SKIP
         >>> results[0].alignment, results.to_dataframe()  # doctest: +SKIP
         """
-        path = Path(folder)
+        path = as_path(folder, "folder")
         from cadalign.estimation.results_file import StoredResults, read_arrays
 
         arrays = read_arrays(path)

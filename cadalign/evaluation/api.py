@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.evaluation.methods.registry import register_method
@@ -18,6 +17,7 @@ from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.parallel import Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.work import Plan
+from cadalign.io.files import as_path
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -77,7 +77,7 @@ def evaluate(
     >>> table.groupby("method").rotation_error_deg.median()  # doctest: +SKIP
     >>> table = evaluate("colmap_model", "correspondences", draws=5)  # doctest: +SKIP
     """
-    source = () if root is None else (Path(root),)
+    source = () if root is None else (as_path(root, "root"),)
     for name, register in (("methods", register_method), ("metrics", register_metric)):
         if options.get(name) is not None:
             options[name] = names_of(options[name], register, where=name)
@@ -85,7 +85,7 @@ def evaluate(
     with ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
-        folder = RunFolder(Path(out))
+        folder = RunFolder(as_path(out, "out"))
         run(chosen, folder, workers=workers, dask=dask)
         done = Run.open(folder.path)
         frame: pd.DataFrame = done.results.to_pandas()

@@ -29,7 +29,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE, alignment_from_opengl, opengl_from_model
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.documents import Finite, ForeignDocument, convert, in_file, read_json, within
-from cadalign.io.files import write_json, write_text
+from cadalign.io.files import as_path, write_json, write_text
 
 _OPEN3D_VIEW = "PinholeCameraParameters"
 _OPEN3D_TRAJECTORY = "PinholeCameraTrajectory"
@@ -93,7 +93,7 @@ def write_open3d(path: str | os.PathLike[str], views: Sequence[CameraView]) -> N
     data: dict[str, Any] = entries[0]
     if len(entries) > 1:
         data = {"class_name": _OPEN3D_TRAJECTORY, "parameters": entries, **_VERSION}
-    write_json(Path(path), data)
+    write_json(as_path(path), data)
 
 
 def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
@@ -110,7 +110,7 @@ def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> Non
         own = {key: value for key, value in camera.items() if key not in shared}
         pose = np.linalg.inv(opengl_from_model(view.rigid(f"views[{number}]")))
         frames.append({"file_path": view.name, **own, "transform_matrix": pose.tolist()})
-    write_json(Path(path), {**shared, "frames": frames})
+    write_json(as_path(path), {**shared, "frames": frames})
 
 
 def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
@@ -159,7 +159,7 @@ def _require_views(views: Sequence[CameraView]) -> None:
 
 def read_camera_views(path: str | os.PathLike[str]) -> list[CameraView]:
     """Read cameras and poses from an Open3D or NeRF JSON file, or the folder of a COLMAP model."""
-    path = Path(path)
+    path = as_path(path)
     if path.is_dir():
         model = Colmap(path)
         images = (model[name] for name in model.ids)

@@ -23,7 +23,7 @@ from cadalign.export.usd import write_usd
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import written_path
-from cadalign.io.files import printable, refuse_nul, write_json
+from cadalign.io.files import as_path, printable, refuse_nul, write_json
 from cadalign.io.meshes.write import write_obj_mesh, write_ply_mesh
 
 _SAME = 1e-9
@@ -245,7 +245,7 @@ def format_of(path: str | os.PathLike[str]) -> str:
     >>> format_of("chair.glb"), format_of("out/transforms.json"), format_of("chair.lines.ply")
     ('glb', 'nerfstudio', 'lines')
     """
-    name = Path(path).name.lower()
+    name = as_path(path).name.lower()
     found = [
         (len(ending), key)
         for key, each in FORMATS.items()
@@ -294,7 +294,7 @@ def export_object(
     DataError
         If a photo cannot be read, or the file cannot be written.
     """
-    path = Path(path)
+    path = as_path(path)
     refuse_nul(path)
     name = format_of(path) if format is None else format
     if name not in FORMATS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import warnings
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.io.documents import in_file, read_json
-from cadalign.io.files import read_bytes, read_text
+from cadalign.io.files import as_path, read_bytes, read_text
 
 _ARRAY = ".npy"
 _MOST_BYTES = 2**20  # of an array, which has nine numbers
@@ -22,13 +23,16 @@ _FIX = "give 3 x 3 numbers, or a JSON file with model, width, height and params 
 
 
 def read_camera(
-    path: Path, *, size: tuple[int, int] | None = None, pixel_origin: PixelOrigin | None = None
+    path: str | os.PathLike[str],
+    *,
+    size: tuple[int, int] | None = None,
+    pixel_origin: PixelOrigin | None = None,
 ) -> Camera:
     """Read a camera from a file.
 
     Parameters
     ----------
-    path : Path
+    path : path-like
         A calibration matrix K: text of 3 x 3 numbers, a ``.npy`` array, or JSON, bare or as
         ``matrix`` (also ``K``, ``camera_matrix``, ``cam_K``), by rows; or a camera in the form of
         `Camera.from_dict` as JSON.
@@ -43,6 +47,7 @@ def read_camera(
     DataError
         If the file cannot be read, holds no camera, or lacks the image's size.
     """
+    path = as_path(path)
     form = _read_form(path)
     if pixel_origin is not None:
         form["pixel_origin"] = pixel_origin

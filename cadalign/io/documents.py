@@ -118,6 +118,8 @@ def in_file(path: Path | str) -> Iterator[None]:
         yield
     except CadalignError as error:
         where = str(path)
+        if error.where == where or (error.where or "").startswith(f"{where}: "):
+            raise DataError(error.what, where=error.where, fix=error.fix) from None
         if error.where:
             where += (", " if error.where.startswith("line ") else ": ") + error.where
         raise DataError(error.what, where=where, fix=error.fix) from None

@@ -22,6 +22,7 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, as_posit
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Finite, PathText, Point3, Positive
+from cadalign.io.files import as_path
 from cadalign.names import renamed
 
 _Row4 = tuple[Finite, Finite, Finite, Finite]
@@ -221,6 +222,7 @@ class ImageEvidence(DeclaredEvidence):
             if each.stored is Positive and each.name not in self.more:
                 value = as_positive(given[each.name], name=each.name)
                 object.__setattr__(self, each.name, value)
+        _keep_paths(self, "mask", "depth")
         for name, shape in (("up", (3,)), ("cam_from_rig", (4, 4))):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_floats(value, name=name, shape=shape))
@@ -338,6 +340,7 @@ class ObservedImage:
         points_2d = as_floats(self.points_2d, name="points_2d", shape=(len(points_3d), 2))
         object.__setattr__(self, "points_3d", points_3d)
         object.__setattr__(self, "points_2d", points_2d)
+        _keep_paths(self, "image")
         for name in ("sigma", "scores"):
             if (value := getattr(self, name)) is not None:
                 checked = as_floats(value, name=name, shape=(len(points_3d),))
@@ -362,3 +365,10 @@ class ObservedImage:
     def has_more(self) -> bool:
         """True where more than keypoints is known."""
         return self.depths is not None or bool(self.evidence.given)
+
+
+def _keep_paths(given: object, *names: str) -> None:
+    """Make paths of the texts in some fields of a frozen dataclass; None stays."""
+    for name in names:
+        if (value := getattr(given, name)) is not None:
+            object.__setattr__(given, name, as_path(value, name))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cadalign.errors import DataError, quote
+from cadalign.errors import DataError, InputError, quote
 
 _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
 _MAX_PATH = 1000  # of a path that is shown whole
@@ -75,6 +75,15 @@ def damaged(what: str, where: object) -> DataError:
     return DataError(what, where=str(where), fix=fix)
 
 
+def as_path(given: object, where: str = "path") -> Path:
+    """A path that somebody gives as an argument ``where``; an InputError if it is none."""
+    text = os.fspath(given) if isinstance(given, str | os.PathLike) else None
+    if not isinstance(text, str):
+        what = f"expected a path, got {type(given).__name__} {quote(given)}"
+        raise InputError(what, where=where, fix="give a str or a pathlib.Path")
+    return Path(text)
+
+
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Convert errors of the file system, and of text that is not UTF-8, to `DataError`."""
@@ -117,6 +126,7 @@ def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
 
     Raises DataError if it is missing, no regular file, larger, or cannot be read.
     """
+    path = as_path(path)
     with reading(path), InputFile(path) as file:
         if not stat.S_ISREG(file.status.st_mode):
             fix = "give a file, no pipe and no device"

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import open_input, reading, write_whole
+from cadalign.io.files import as_path, open_input, reading, write_whole
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -40,7 +40,7 @@ _FREE_BYTES = 2**26
 @contextmanager
 def open_photo(path: str | os.PathLike[str]) -> Iterator[Image]:
     """Open a photo; its pixels are read when they are asked for, errors then named as well."""
-    path = Path(path)
+    path = as_path(path)
     with open_input(path) as file, open_picture(file, file.size, where=str(path)) as image:
         yield image
 
@@ -99,7 +99,7 @@ def read_photo(path: str | os.PathLike[str]) -> ByteImage:
 
 def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:
     """Width and height [px] of a photo turned upright; its pixels are not read."""
-    with open_photo(Path(path)) as image:
+    with open_photo(as_path(path)) as image:
         width, height = image.size
         is_on_its_side = image.getexif().get(_ORIENTATION) in _ON_ITS_SIDE
     return (height, width) if is_on_its_side else (width, height)

@@ -21,7 +21,7 @@ from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
-from cadalign.io.files import write_json
+from cadalign.io.files import as_path, write_json
 from cadalign.io.observation_file import (
     fill_xyz,
     read_fields,
@@ -121,7 +121,7 @@ class Observation(ObservedImage):
             If the file is missing, is not JSON, or a field is missing, unknown or invalid; the
             message names file and field.
         """
-        path = Path(path)
+        path = as_path(path)
         data = read_json(path)
         if needs_xyz is None:
             needs_xyz = not (isinstance(data, dict) and data.get("shape"))
@@ -186,7 +186,7 @@ class Observation(ObservedImage):
 
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
-        write_json(Path(path), self.to_dict(folder=Path(path).parent, states_origins=True))
+        write_json(as_path(path), self.to_dict(folder=as_path(path).parent, states_origins=True))
 
 
 def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None = None) -> Camera:

@@ -60,7 +60,7 @@ from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.opened import Run
-from cadalign.io.files import dense_json, made_folder, write_text
+from cadalign.io.files import as_path, dense_json, made_folder, write_text
 from cadalign.report.headline import Headline, headline_of
 from cadalign.report.instances import (
     INLINE_LIMIT,
@@ -122,7 +122,7 @@ def write_report(
     >>> write_report(["runs/keypointnet"], "report.html").assets  # doctest: +SKIP
     >>> write_report(["runs/before", "runs/after"], "compare.html")  # doctest: +SKIP
     """
-    page = Path(path)
+    page = as_path(path)
     found = read_runs(runs)
     made_folder(page.parent)
     table, media, folder = None, {}, None

@@ -15,7 +15,7 @@ from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.registry import Spec, register, spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
-from cadalign.io.files import refuse_nul
+from cadalign.io.files import as_path, refuse_nul
 
 for many in (spec, retrievals):  # runs over many observations are shown as experiments are
     register(many.SPEC)
@@ -42,7 +42,7 @@ _UNITS = {
 
 def read_runs(folders: Sequence[str | os.PathLike[str]]) -> list[Run]:
     """Read runs that go into one report."""
-    paths = [Path(folder) for folder in folders]
+    paths = [as_path(folder, "folder") for folder in folders]
     if not paths:
         raise InputError(
             "none is given",

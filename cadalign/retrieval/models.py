@@ -27,7 +27,7 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_onl
 from cadalign.datasets import AnnotatedModel, Circle, RotationalSymmetry, Symmetries, load_mesh
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import Seal, checksum
+from cadalign.io.files import Seal, as_path, checksum
 from cadalign.names import renamed
 
 ModelKey = tuple[str, str]
@@ -349,7 +349,7 @@ def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) 
 
 def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
     """Write a library's file atomically."""
-    SEAL.write(Path(path), _payload(models))
+    SEAL.write(as_path(path), _payload(models))
 
 
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
@@ -357,7 +357,7 @@ def read_library(path: str | os.PathLike[str]) -> ModelTable:
     where = str(path)
     try:
         # Opening a pipe would wait for its other end.
-        if Path(path).exists() and not Path(path).is_file():
+        if as_path(path).exists() and not Path(path).is_file():
             raise OSError("not a regular file")
         with pa.memory_map(where) as source:
             content = source.read_buffer()

@@ -15,7 +15,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
-from cadalign.io.images import open_photo, read_image
+from cadalign.io.images import open_photo, read_grey, read_image
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.shapes.model import ShapeModel
@@ -38,7 +38,7 @@ class ObservationRetrieval:
     length is estimated with it, with the photo's EXIF data as a prior."""
     silhouette: bool = False
     """Rank the matches again by the object's pixels: those of the photo's opacity, or what is
-    segmented around the keypoints."""
+    segmented around the keypoints; without it, by the observation's mask if it has one."""
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
     ranking: RetrievalOptions = field(default_factory=RetrievalOptions)
@@ -61,8 +61,8 @@ class ObservationRetrieval:
     ) -> list[Match]:
         """Rank the library's models by an observation, which messages call ``where``.
 
-        ``mask`` and ``workers`` are as for `Library.retrieve`. An observation without keypoints is
-        ranked by its mask alone.
+        ``mask``, by default the observation's, and ``workers`` are as for `Library.retrieve`. An
+        observation without keypoints is ranked by its mask alone.
 
         Raises
         ------
@@ -72,9 +72,10 @@ class ObservationRetrieval:
         """
         library, shape = self.opened()
         camera, ids = seen.camera, _semantic_ids(seen, where)
+        cuts_out = self.silhouette and len(ids)
+        if mask is None and seen.evidence.mask is not None and not cuts_out:
+            mask = read_grey(seen.evidence.mask) != 0  # as a fit to the observation reads it
         if not len(ids):
-            if mask is None and seen.evidence.mask is not None:
-                mask = read_mask(seen.evidence.mask, camera)
             return library.retrieve(mask=mask, camera=camera, workers=workers, **vars(self.ranking))
         if shape is None and not camera.focal_known:
             what = "the focal length is unknown, without which no model's pose is searched"

@@ -18,7 +18,7 @@ from msgspec import Meta
 
 from cadalign.errors import InputError
 from cadalign.io.documents import Count, Document, PathText, in_file
-from cadalign.io.files import Seal, read_bytes
+from cadalign.io.files import Seal, as_path, read_bytes
 
 Kind = TypeVar("Kind")
 SEAL = Seal(
@@ -40,12 +40,12 @@ class _Array(Document):
 def write_shape(path: str | os.PathLike[str], model: Any) -> None:
     """Write a shape model's file atomically."""
     document = {each.name: getattr(model, each.name) for each in fields(model)}
-    SEAL.write(Path(path), msgspec.msgpack.encode(document, enc_hook=_written))
+    SEAL.write(as_path(path), msgspec.msgpack.encode(document, enc_hook=_written))
 
 
 def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:
     """Read and check a shape model's file; ``kind`` is `cadalign.ShapeModel`."""
-    file = Path(path)
+    file = as_path(path)
     payload = SEAL.unwrap(read_bytes(file, most=_MAX_BYTES), str(file))
     try:
         document = msgspec.msgpack.decode(payload)

@@ -16,7 +16,7 @@ from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, Imag
 from cadalign.datasets.photos.kitti_keypoints import TRACKS, read_track_keypoints
 from cadalign.errors import DataError, InputError, brief, quote
 from cadalign.io.documents import Finite, Text, convert, in_file
-from cadalign.io.files import read_text
+from cadalign.io.files import as_path, read_text
 
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _COLUMNS: dict[str, Any] = {
@@ -51,7 +51,7 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
     DataError
         If the file is missing, malformed or of no known kind; names file and field.
     """
-    path = Path(path)
+    path = as_path(path)
     if path.name == TRACKS or (path / TRACKS).is_file():
         return read_track_keypoints(path if path.name == TRACKS else path / TRACKS)
     if path.is_dir():

@@ -29,7 +29,7 @@ from cadalign.datasets.models.shapenet import MeshLocator
 from cadalign.errors import DataError, InputError, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.files import read_text
+from cadalign.io.files import as_path, read_text
 from cadalign.io.meshes.load import load_mesh
 
 logger = logging.getLogger("cadalign")
@@ -156,7 +156,7 @@ class KeypointNet:
     def __init__(
         self, root: str | os.PathLike[str], *, shapenet_root: str | os.PathLike[str] | None = None
     ) -> None:
-        self.root = Path(root)
+        self.root = as_path(root, "root")
         if not self.root.is_dir():
             raise DataError("no such folder", where=str(self.root), fix="give KeypointNet's root")
         self._locator = MeshLocator(self.root, shapenet_root)

@@ -31,7 +31,7 @@ from cadalign.io.documents import (
     require_unique,
     written_path,
 )
-from cadalign.io.files import write_json
+from cadalign.io.files import as_path, write_json
 from cadalign.io.meshes.load import load_mesh
 from cadalign.names import renamed
 
@@ -191,7 +191,7 @@ class ModelKeypoints:
             missing, unknown or invalid, or it has no annotations of the model; the message names
             file and field.
         """
-        path = Path(path)
+        path = as_path(path)
         data = read_json(path)
         if isinstance(data, list):
             return cls._from_annotations(data, path, model)
@@ -244,7 +244,7 @@ class ModelKeypoints:
         DataError
             If it cannot be written.
         """
-        write_json(Path(path), self.to_dict(folder=Path(path).parent))
+        write_json(as_path(path), self.to_dict(folder=as_path(path).parent))
 
     def to_dict(self, *, folder: Path | None) -> dict[str, Any]:
         """Content of the file, the model's path relative to ``folder``."""

@@ -12,6 +12,7 @@ from typing import overload
 from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.files import as_path
 from cadalign.io.meshes.load import load_mesh
 
 # Where a model's mesh lies in its folder: version 2, then version 1.
@@ -67,7 +68,7 @@ class ShapeNet:
     """
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        self.root = Path(root)
+        self.root = as_path(root, "root")
         if not self.root.is_dir():
             raise DataError("no such folder", where=str(self.root), fix="give ShapeNetCore's root")
         self._models: dict[str, dict[str, ShapeNetModel]] = {}

@@ -62,7 +62,7 @@ from cadalign.io.documents import (
     in_file,
     read_json,
 )
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import as_path, write_json, writing
 from cadalign.io.images import photo_size
 
 MILLIMETRES = 1e-3
@@ -164,7 +164,7 @@ class Bop(PhotoDataset):
     kind = "BOP"
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        folder = Path(root)
+        folder = as_path(root, "root")
         scenes = tuple(find_scenes(folder))
         if not scenes:
             what = f"there is no {TRUTH} in this folder, nor one or two below"

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 from cadalign.datasets.photos import bop, kitti, objectron, pascal3d, pix3d, posed_photos, scan2cad
 from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import placed_objects
 from cadalign.errors import DataError, InputError, unknown
-from cadalign.io.files import writing
+from cadalign.io.files import as_path, writing
 
 PHOTO_FORMATS = (
     scan2cad.FORMAT,
@@ -55,7 +54,7 @@ def open_photos(
     >>> dataset  # doctest: +SKIP
     KittiCars('KITTI/training'): 7481 photos
     """
-    folder = Path(path)
+    folder = as_path(path)
     if "\0" in str(path) or not folder.is_dir():
         raise DataError("no such folder", where=repr(str(path)), fix="give a data set's folder")
     for each in formats:
@@ -108,7 +107,7 @@ def write_photos(
     >>> write_photos("pix3d", cadalign.datasets.open("lmo"), "pix3d")  # doctest: +SKIP
     ()
     """
-    folder = Path(path)
+    folder = as_path(path)
     writers = {each.name: each.write for each in formats if each.write is not None}
     if form not in writers:
         raise unknown("form", form, writers)

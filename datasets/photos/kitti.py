@@ -34,7 +34,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
-from cadalign.io.files import damaged, read_text
+from cadalign.io.files import as_path, damaged, read_text
 from cadalign.io.images import photo_size
 
 _OBJECT, _TRACKING = ("label_2", "image_2"), ("label_02", "image_02")
@@ -110,7 +110,7 @@ class KittiCars(PhotoDataset):
     def __init__(
         self, root: str | os.PathLike[str], *, categories: Iterable[str] = ("Car",)
     ) -> None:
-        folder = Path(root)
+        folder = as_path(root, "root")
         self._categories = frozenset(categories)
         self._frames: list[KeypointFrame | _LabelFrame] = []
         bad: dict[str, DataError] = {}

@@ -40,7 +40,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import convert
-from cadalign.io.files import open_input, write_json
+from cadalign.io.files import as_path, open_input, write_json
 from cadalign.io.images import ByteImage
 
 ANNOTATIONS = "annotations"
@@ -111,7 +111,7 @@ class Objectron(PhotoDataset):
     kind = "Objectron"
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        folder = Path(root)
+        folder = as_path(root, "root")
         paths = list_annotations(folder)
         if not paths:
             fix = "give the folder of Objectron's annotations"

@@ -40,6 +40,7 @@ from cadalign.io.documents import (
     in_file,
     read_document,
 )
+from cadalign.io.files import as_path
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
@@ -78,7 +79,7 @@ class Pascal3D(PhotoDataset):
     kind = "PASCAL3D+"
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        folder = Path(root)
+        folder = as_path(root, "root")
         # Annotation files, and the category whose objects each annotates; None for all.
         place = folder / ANNOTATIONS
         self._records: list[tuple[Path, str | None]] = [
@@ -277,7 +278,7 @@ class Pascal3DDetections(PhotoDataset):
     kind = "PASCAL3D+ photos with detected keypoints"
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        folder = Path(root)
+        folder = as_path(root, "root")
         self._records: list[tuple[str, int]] = []  # category and number of the CAD model
         names: list[str] = []
         for path in sorted((folder / DETECTED).glob("*.mat")):

@@ -32,6 +32,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import Finite, ForeignDocument, PathText, Point2, Point3, Positive, Text
+from cadalign.io.files import as_path
 from cadalign.io.meshes.load import load_mesh
 
 T = TypeVar("T")
@@ -83,7 +84,7 @@ class Pix3D(PhotoDataset):
     kind = "Pix3D"
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        folder = Path(root)
+        folder = as_path(root, "root")
         self._entries = read_list(folder / ANNOTATIONS)
         super().__init__(folder, (str(number) for number in range(len(self._entries))))
 

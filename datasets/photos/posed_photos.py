@@ -16,6 +16,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import Finite, ForeignDocument, PathText, Positive
+from cadalign.io.files import as_path
 
 POSES = "poses.json"
 _Row = tuple[Finite, Finite, Finite, Finite]
@@ -45,8 +46,9 @@ class PosedPhotos(PhotoDataset):
     kind = "posed photos (BOP's units)"
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
-        self._table = read_table(Path(root, POSES))
-        super().__init__(Path(root), self._table)
+        folder = as_path(root, "root")
+        self._table = read_table(folder / POSES)
+        super().__init__(folder, self._table)
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""

@@ -46,6 +46,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
 from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, read_json
+from cadalign.io.files import as_path
 
 FULL = "full_annotations.json"
 # One scan's annotations, as in the repository and its derivatives.
@@ -137,12 +138,14 @@ class Scan2CAD(PhotoDataset):
         shapenet: str | os.PathLike[str] | None = None,
         every: int = 1,
     ) -> None:
-        folder, self.annotations = _annotation_file(Path(root))
+        folder, self.annotations = _annotation_file(as_path(root, "root"))
         self._entries = read_list(self.annotations)
-        frames = [folder / name for name in _FRAME_FOLDERS] if scannet is None else [Path(scannet)]
+        frames = [folder / name for name in _FRAME_FOLDERS]
+        if scannet is not None:
+            frames = [as_path(scannet, "scannet")]
         self._frame_folders = frames
         below = [folder / name for name in _MODEL_FOLDERS]
-        self._models = below if shapenet is None else [Path(shapenet)]
+        self._models = below if shapenet is None else [as_path(shapenet, "shapenet")]
         self._records: list[tuple[int, ScanNetFrame]] = []  # with the row of the scan
         names, bad = [], {}
         for number, entry in enumerate(self._entries):

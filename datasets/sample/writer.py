@@ -20,7 +20,7 @@ from cadalign.datasets.sample.chair import chair
 from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
 from cadalign.datasets.sample.vessel import vessel
 from cadalign.errors import DataError, InputError
-from cadalign.io.files import writing
+from cadalign.io.files import as_path, writing
 from cadalign.io.meshes.write import write_ply_mesh
 
 _Maker = Callable[[np.random.Generator, int], Draft]
@@ -115,7 +115,7 @@ def write_sample_dataset(
     DataError
         If ``root`` is a file or holds anything else, or cannot be written.
     """
-    target = Path(root)
+    target = as_path(root, "root")
     names = _check_arguments(per_category, categories, seed)
     _check_replaceable(target)
     marker = _marker(names, per_category, seed)

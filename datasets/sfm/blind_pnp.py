@@ -20,6 +20,7 @@ from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.io.files import as_path
 
 DEFAULT_FOCAL = 800.0
 """The virtual camera's focal length [px] where the files don't say one."""
@@ -87,7 +88,7 @@ class BlindPnP(CorrespondenceSet):
         if focal is not None and not (np.isfinite(focal) and focal > 0):
             raise InputError(f"{focal!r} is not a focal length", where="focal")
         self._focal = focal
-        folder, required = _find_layout(Path(path))
+        folder, required = _find_layout(as_path(path))
         self._is_matches = "matches" in required
         *_, self._rotation, self._translation = required
         optional = [name for name in LAYOUTS[required] if (folder / f"{name}.pkl").is_file()]

@@ -19,7 +19,7 @@ from cadalign.datasets.sfm.correspondences import Correspondences, Correspondenc
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
-from cadalign.io.files import damaged, read_text
+from cadalign.io.files import as_path, damaged, read_text
 from cadalign.io.images import open_photo
 
 ImageSize = tuple[int, int]
@@ -67,7 +67,7 @@ class Bundler(CorrespondenceSet):
     def __init__(
         self, path: str | os.PathLike[str], *, sizes: ImageSize | Sequence[ImageSize] | None = None
     ) -> None:
-        file = _find_file(Path(path))
+        file = _find_file(as_path(path))
         self._model = _read_bundler(file)
         count = len(self._model.cameras)
         self._sizes = _as_sizes(sizes, count)

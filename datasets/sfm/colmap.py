@@ -28,7 +28,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.camera_form import COLMAP_PARAMS
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
-from cadalign.io.files import damaged, read_bytes, read_text, write_text, writing
+from cadalign.io.files import as_path, damaged, read_bytes, read_text, write_text, writing
 
 STEMS = ("cameras", "images", "points3D")
 SUFFIXES = (".bin", ".txt")  # COLMAP itself prefers the binary files where both are there
@@ -84,7 +84,7 @@ class Colmap(CorrespondenceSet):
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        folder, suffix = _find_model(Path(path))
+        folder, suffix = _find_model(as_path(path))
         self._camera_file, image_file, self._point_file = (folder / f"{s}{suffix}" for s in STEMS)
         is_text = suffix == ".txt"
         read_cameras, read_points, read_images = _TEXT_READERS if is_text else _BINARY_READERS
@@ -176,7 +176,7 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
         entry = camera.to_dict()
         size = f"{camera.width} {camera.height}"
         cameras.append(f"{camera_id} {entry['model']} {size} {_written(entry['params'])}\n")
-    folder = Path(folder)
+    folder = as_path(folder, "folder")
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for stem, lines in zip(STEMS, (cameras, images, ()), strict=True):

@@ -12,7 +12,7 @@ from cadalign.datasets.sfm import blind_pnp, colmap
 from cadalign.datasets.sfm.bundler import Bundler
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
-from cadalign.io.files import open_input
+from cadalign.io.files import as_path, open_input
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
     if format not in CORRESPONDENCE_FORMATS:
         fix = f"known are {', '.join(CORRESPONDENCE_FORMATS)}"
         raise InputError(f"unknown format {format!r}", where="format", fix=fix)
-    root = Path(path)
+    root = as_path(path)
     return _FORMATS[_recognize(root) if format == AUTO else format].load(root)
 
 

@@ -20,13 +20,12 @@ import pickle
 import pickletools
 import re
 from collections.abc import Collection
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cadalign.errors import DataError, quote
-from cadalign.io.files import damaged, read_bytes
+from cadalign.io.files import as_path, damaged, read_bytes
 
 # Numbers, text and objects; no records, whose fields can hide objects.
 _PLAIN_DTYPE = re.compile(r"b1|[iufc]\d{1,2}|[SU]\d{1,6}|O\d?")
@@ -43,7 +42,7 @@ def load_pickle(path: str | os.PathLike[str]) -> Any:
     Pickles of Python 2 and of old and new NumPy are understood. Text of Python 2 is taken as
     Latin-1, the encoding that keeps its bytes.
     """
-    data = read_bytes(Path(path))
+    data = read_bytes(as_path(path))
     try:
         _check_program(data)
         value = _PlainUnpickler(io.BytesIO(data), str(path)).load()

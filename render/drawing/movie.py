@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.errors import InputError, RenderError
-from cadalign.io.files import write_whole
+from cadalign.io.files import as_path, write_whole
 from cadalign.render.drawing.canvas import ByteImage
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[ByteImage], *, fp
     RenderError
         If this build of PyAV has no encoder.
     """
-    path = Path(path)
+    path = as_path(path)
     ending = path.suffix.lower()
     if ending not in MOVIES:
         fix = f"give a name that ends in {', '.join(MOVIES)}"

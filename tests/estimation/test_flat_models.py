@@ -62,6 +62,18 @@ def largest_log_scale(alignment: Alignment) -> float:
 # --- one view of keypoints ------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("axis", [1, 2])
+def test_a_stretch_across_a_plane_is_as_open_as_its_prior(axis: int) -> None:
+    """Also where rounding alone lifts the points from their plane."""
+    for seed in range(5):
+        problem = flat_problem(seed, axis=axis, points=5, noise_px=1.0, thickness=1e-24)
+        result = fit_problem(problem)
+        assert result.covariance is not None
+        assert (result.covariance.diagonal() >= 0).all()
+        assert 0.5 < result.std.scale[axis] < 2.0
+        assert any(text.startswith(f"s_{'xyz'[axis]} is known only to") for text in result.warnings)
+
+
 @pytest.mark.parametrize("points", [5, 6, 8, 12])
 @pytest.mark.parametrize("noise_px", [1.0, 4.0])
 def test_no_result_costs_more_than_the_truth(points: int, noise_px: float) -> None:

@@ -5,11 +5,17 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from support.mistaken import said
 from support.problems import with_outliers
+from support.scenes import CAMERA as SCENE
+from support.scenes import keypoints, truth_of, turned
+from support.scenes import seen as seen_in_scene
 
 from cadalign import Camera, Model, RansacOptions, Result, View, align, fit
 from cadalign.errors import CadalignError, NoConsensusError
@@ -17,6 +23,7 @@ from cadalign.estimation.mistakes import (
     Explained,
     Mistake,
     Support,
+    area_of,
     check_support,
     find_mistake,
     log_expected_by_chance,
@@ -255,6 +262,36 @@ def test_likelihoods_tell_mistakes_that_a_similar_model_follows(mistake: str) ->
                 named += any("times as likely" in text for text in texts)
     assert alarms == 0
     assert named >= 0.3 * followed > 0
+
+
+@pytest.mark.parametrize(
+    "view",
+    [{"sigma": 1.0}, {"sigma": 3.0}, {}, {"sigma": 3.0, "spread": 0.03}, {"ransac": True}],
+    ids=["1 px", "3 px", "unknown noise", "similar model", "robust"],
+)
+def test_an_up_that_points_down_is_told_to_be_the_opposite(view: dict[str, Any]) -> None:
+    """And not where gravity is right, or wrong by another angle."""
+    view = dict(view)
+    spread, noise = view.pop("spread", None), view.get("sigma", 3.0)
+    more = {"ransac": RansacOptions()} if view.pop("ransac", False) else {}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        points = keypoints(10, seed)
+        truth = truth_of((1.0, 0.8, 1.3))
+        pixels = seen_in_scene(points, truth, np.eye(4)).pixels
+        pixels = pixels + rng.normal(0, noise, pixels.shape)
+        model = Model(points_3d=points, shape_sigma=spread)
+        up = truth.rotation[:, 1]
+        told = {}
+        for name, each in {"down": -up, "right": up, "aside": turned(up, 25, rng)}.items():
+            told[name] = said(partial(align, model, View(SCENE, pixels, up=each, **view), **more))
+        assert "opposite" in told["down"]
+        assert "opposite" not in told["right"] + told["aside"]
+
+
+def test_an_endless_extent_of_keypoints_is_cut_to_the_image() -> None:
+    points = np.array([[0.0, 0.0], [1e308, 275.0], [-1e308, 100.0]])
+    assert area_of(points, CENTRED, 2.0) == 640 * 480
 
 
 def test_what_explains_no_more_keypoints_is_no_mistake() -> None:

@@ -8,12 +8,33 @@ import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
+from PIL import Image
 from support.refusals import refusal_line
 
-from cadalign import Library, ShapeModel
-from cadalign.datasets import load_mesh, read_image_keypoints
+from cadalign import Camera, DetectorNoise, FocalPrior, Library, Result, Results, ShapeModel
+from cadalign.datasets import (
+    BlindPnP,
+    Bop,
+    Bundler,
+    Colmap,
+    KeypointNet,
+    KittiCars,
+    ModelKeypoints,
+    Objectron,
+    Pascal3D,
+    Pascal3DDetections,
+    Pix3D,
+    PosedPhotos,
+    Scan2CAD,
+    ShapeNet,
+    load_mesh,
+    open_correspondences,
+    open_photos,
+    read_image_keypoints,
+)
 from cadalign.datasets.photos.bop_files import read_bop_results
 from cadalign.datasets.photos.dataset import read_list, read_table
 from cadalign.datasets.photos.kitti import read_labels
@@ -21,12 +42,13 @@ from cadalign.datasets.photos.mat_files import read_structs
 from cadalign.datasets.photos.objectron_files import read_sequence
 from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.datasets.sfm.unpickling import load_pickle
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.export.camera_files import read_camera_views
 from cadalign.io.camera_file import read_camera
+from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import open_input, read_bytes, read_text
-from cadalign.io.images import read_grey, read_photo
+from cadalign.io.images import photo_size, read_grey, read_photo
 from cadalign.io.observation import Observation
 
 BYTES = 2**33
@@ -124,3 +146,53 @@ def test_no_more_is_read_than_a_file_had(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         read_bytes(path, most=5)
     assert str(caught.value) == f"{path}: 18 bytes, more than the 5 that are read of such a file"
+
+
+class Opened:
+    """What is no path, though it can be converted to one of another kind."""
+
+    def __fspath__(self) -> bytes:
+        return b"chair.obj"
+
+
+@pytest.mark.parametrize("given", [3, None, 2.5, ["chair.obj"], {}, b"chair.obj", Opened()])
+@pytest.mark.parametrize(
+    "read",
+    [
+        *dict.fromkeys(each.read for each in READERS if each.read is not read_sequence),
+        *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections, Objectron),
+        *(KittiCars, Bop, PosedPhotos, Colmap, Bundler, BlindPnP, open_correspondences),
+        *(open_photos, ModelKeypoints.load, Result.load, Results.open, DetectorNoise.open),
+        *(FocalPrior.from_exif, photo_size),
+    ],
+)
+def test_what_is_no_path_is_refused_with_what_to_give(
+    given: Any, read: Callable[[Any], object]
+) -> None:
+    with pytest.raises(InputError, match=r"expected a path, got .*; give a str or a pathlib.Path"):
+        read(given)
+
+
+def test_texts_are_paths_of_cameras_and_observations(tmp_path: Path) -> None:
+    camera = Camera(4, 4, 5.0, 5.0, 1.5, 1.5)
+    matrix = tmp_path / "camera.txt"
+    matrix.write_text("5 0 1.5 0 5 1.5 0 0 1")
+    assert read_camera(str(matrix), size=(4, 4)) == camera
+    evidence = ImageEvidence(mask=str(tmp_path / "mask.png"))  # type: ignore[arg-type]
+    photo: Any = str(tmp_path / "photo.png")
+    seen = Observation([[0, 0, 0]], [[1, 1]], camera, image=photo, evidence=evidence)  # type: ignore[arg-type]
+    seen.save(tmp_path / "seen.json")
+    read = Observation.load(tmp_path / "seen.json")
+    assert (read.image, read.evidence.mask) == (tmp_path / "photo.png", tmp_path / "mask.png")
+
+
+def test_a_photo_in_place_of_a_mask_is_named_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo, model = tmp_path / "photo.png", tmp_path / "model.obj"
+    Image.new("RGB", (64, 48)).save(photo)
+    model.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    alone = refusal_line(capsys, "fit", "--mask", photo, "--model", model, "--focal", 50)
+    assert alone == (
+        f"{photo}: the image has the mode RGB; give an image of one grey channel, of 8 or 16 bits"
+    )

@@ -20,6 +20,7 @@ from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
+from cadalign.io.evidence import ImageEvidence
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval import LibraryModel
@@ -310,6 +311,22 @@ def test_silhouettes_are_compared(
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split()[-1] == "IoU"
     assert float(lines[2].split()[-1]) > 0.9
+
+
+def test_the_mask_of_an_observation_is_used(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the option's is; an option comes before it."""
+    mask = case.folder / "mask.png"
+    replace(case.observation, evidence=ImageEvidence(mask=mask)).save(tmp_path / "seen.json")
+    library = ("--json", *case.arguments[1:])
+    for path, given in ((case.arguments[0], ("--mask", str(mask))), (tmp_path / "seen.json", ())):
+        assert main(["retrieve", str(path), *library, *given]) == 0
+    by_option, by_file = capsys.readouterr().out.split("]\n[")
+    assert json.loads(by_option + "]") == json.loads("[" + by_file)
+    assert json.loads(by_option + "]")[0]["silhouette_iou"] > 0.9
+    assert main(["retrieve", str(tmp_path / "seen.json"), *library, "--silhouette"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["silhouette_iou"] > 0.5
 
 
 @pytest.mark.long

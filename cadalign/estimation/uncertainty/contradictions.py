@@ -203,7 +203,7 @@ def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
 
 
 def _hint(evidence: Evidence, trial: _Trial) -> str:
-    """A hint at another unit of measurements, or at a direction of another axis; else nothing."""
+    """A hint at another unit of measurements, or at another axis or sign; else nothing."""
     factor = measured_factor(evidence, trial.state, trial.piece)
     if factor is not None and not _is_plausible(factor):
         return f": {name_of(*trial.piece)} is {factor:.3g} times what is expected, {_UNIT}"
@@ -215,6 +215,8 @@ def _hint(evidence: Evidence, trial: _Trial) -> str:
     turn = trial.state.poses[rig.pose[view], :9].reshape(3, 3)
     axes = rig.cam_from_rig[view, :9].reshape(3, 3) @ turn
     cosines = directions.camera[row] @ axes
+    if cosines @ directions.model[row] < -_ALONG:
+        return ": it seems to point down, give its opposite"
     axis = int(np.argmax(np.abs(cosines)))
     if directions.model[row, axis] or abs(cosines[axis]) < _ALONG:
         return ""

@@ -166,7 +166,9 @@ def _within_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray
         most = log_scale**2 + width**2 / 3 + 1 / weight
         variance, own = covariance[axis, axis], covariance[axis]
         if variance > most:
-            covariance = covariance - np.outer(own, own) * (variance - most) / variance**2
+            left = own * (most / variance)  # exact, where the difference below is of large numbers
+            covariance = covariance - np.outer(own / variance, own) * (1 - most / variance)
+            covariance[axis], covariance[:, axis] = left, left
     return covariance
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.files import as_path
 from cadalign.io.meshes.gltf_scene import read_gltf
 from cadalign.io.meshes.obj import read_obj
 
@@ -67,7 +68,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     >>> mesh.faces.tolist(), mesh.polygon.tolist()
     ([[0, 1, 2], [0, 2, 3]], [0, 0])
     """
-    path = Path(path)
+    path = as_path(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None and path.is_dir():
         raise DataError("a folder, not a mesh file", where=str(path), fix="give a file in it")

@@ -28,6 +28,18 @@ from cadalign.io.observation import Observation
 pytestmark = pytest.mark.long
 
 PROGRAM = "import sys; from cadalign.cli import main; sys.exit(main())"
+BUSY = f"""
+import cv2
+import numpy as np
+from cadalign.annotate.session import Session
+
+def warm_up(session):
+    while True:
+        cv2.GaussianBlur(np.zeros((300, 300, 3), np.uint8), (0, 0), 15)
+
+Session.warm_up = warm_up
+{PROGRAM}
+"""
 LOCK = "*annotate-lock"
 
 
@@ -57,8 +69,8 @@ class Annotator:
 
 
 @contextmanager
-def annotator(case: Case, *arguments: object) -> Iterator[Annotator]:
-    command = [sys.executable, "-c", PROGRAM, "annotate", "--no-open", "--model", str(case.model)]
+def annotator(case: Case, *arguments: object, program: str = PROGRAM) -> Iterator[Annotator]:
+    command = [sys.executable, "-c", program, "annotate", "--no-open", "--model", str(case.model)]
     given = [*command, "--camera", str(case.camera), *map(str, arguments)]
     process = subprocess.Popen(given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
@@ -105,6 +117,14 @@ def test_second_process_is_refused_and_a_killed_one_leaves_no_lock(
         code, err = third.end(signal.SIGTERM)
     assert (code, err.strip().splitlines()[-1]) == (0, f"Saved in {case.folder}")
     assert not list(case.folder.glob(LOCK))
+
+
+def test_what_warms_up_in_an_extension_ends_with_the_program(case: Case) -> None:
+    """OpenCV gives control back to Python where C++ allows no exception, as of a thread's end."""
+    for _ in range(3):
+        with annotator(case, "--image", case.photo, program=BUSY) as first:
+            code, err = first.end(signal.SIGTERM)
+        assert (code, err.strip().splitlines()[-1]) == (0, f"Saved in {case.folder}")
 
 
 def test_folder_keeps_annotators_of_its_photos_out(

@@ -2,8 +2,9 @@
 
 Without keypoints, each model has an outline: its silhouettes along directions all around, free of
 affine maps and so of pose and stretch. The models whose outlines resemble the mask most are aligned
-with it, and ranked by the likelihood of its contour at the estimate, neighbouring samples of which
-count as one as far as they are correlated.
+with it, roughly by their whole outlines; those that meet it, or all where none does, for a part may
+be hidden, are aligned by whatever part the mask shows. They are ranked by the likelihood of its
+contour at the estimate, neighbouring samples of which count as one as far as they are correlated.
 
 With keypoints, the silhouette of each match's mesh, posed and stretched, is compared with the
 object's pixels. The intersection over union of the correct model falls short of 1 by 0.05 on
@@ -19,7 +20,7 @@ from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -29,15 +30,18 @@ from cadalign.arrays import BoolArray, FloatArray, worker_count
 from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.align import align
+from cadalign.estimation.contours.proposals import align_outline
 from cadalign.estimation.contours.silhouettes import Whitened, outline_of, outline_of_mask, overlaps
 from cadalign.estimation.contours.view_contour import cost_of_contour
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 from cadalign.render import Geometry, Scene, cast_geometry, silhouette_iou
 from cadalign.retrieval.match import Match
-from cadalign.retrieval.models import ModelKey, ModelTable
+from cadalign.retrieval.models import LibraryModel, ModelKey, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import chosen_models
 
@@ -107,55 +111,98 @@ def rank_by_mask(
         fix = "build the library with meshes, or give keypoints"
         raise InputError(what, where="library", fix=fix)
     resembling = [row for _, row in sorted(overlapping)[:MOST_ALIGNED]]
-    align_row = partial(_aligned, table, inside=inside, camera=camera, options=options)
+    view = View(camera, mask=inside)
     with ThreadPoolExecutor(worker_count(workers)) as pool:
-        aligned = [found for found in pool.map(align_row, resembling) if found is not None]
+        models = [table.model(row) for row in resembling]
+        rough = pool.map(partial(_roughly_aligned, view=view, options=options), models)
+        aligned = [found for found in rough if found is not None]
+        is_any_met = any(each.is_met for each in aligned)
+        aligned = list(pool.map(partial(_aligned, view=view, is_any_met=is_any_met), aligned))
     if not aligned:
         what = "no model can be aligned with the mask"
         fix = "check the mask and the camera, or give keypoints"
         raise DegenerateError(what, where="mask", fix=fix)
-    aligned.sort(key=lambda each: each[0])
-    samples = aligned[0][1]
-    logs = np.array([-samples * cost for cost, _, _ in aligned])
+    aligned.sort(key=lambda each: each.cost)
+    logs = np.array([-aligned[0].samples * each.cost for each in aligned])
     scores = np.exp(logs - logs[0])
     scores /= scores.sum()
     return [
-        replace(match, log_likelihood=float(log), score=float(score))
-        for (_, _, match), log, score in zip(aligned, logs, scores, strict=True)
-    ][: options.top]
+        _match(each, camera, inside, float(log), float(score))
+        for each, log, score in zip(aligned[: options.top], logs, scores, strict=False)
+    ]
 
 
-def _aligned(
-    table: ModelTable, row: int, inside: BoolArray, camera: Camera, options: RetrievalOptions
-) -> tuple[float, float, Match] | None:
-    """A model aligned with the mask; None if it cannot be.
+class _Aligned(NamedTuple):
+    """A model aligned with a mask.
 
-    Returns the mean of a contour sample's -log density, the number of samples without correlation,
-    and the match, whose likelihood and score are left open.
+    The ``residuals`` (S,) [px] are distances of the mask's contour from the rim, NaN where there is
+    none; so many neighbours as the ``correlation`` count as one.
     """
-    model = table.model(row)
+
+    model: LibraryModel
+    given: Model
+    alignment: Alignment
+    residuals: FloatArray
+    correlation: float
+    is_met: bool
+
+    @property
+    def cost(self) -> float:
+        """Mean of the samples' -log probability density."""
+        distances = np.abs(np.nan_to_num(self.residuals, nan=_REACH))
+        return cost_of_contour(np.minimum(distances, _REACH), _REACH)
+
+    @property
+    def samples(self) -> float:
+        """Number of samples that are off independently."""
+        return len(self.residuals) / self.correlation
+
+
+def _roughly_aligned(model: LibraryModel, view: View, options: RetrievalOptions) -> _Aligned | None:
+    """A model aligned with a mask that shows all of it; None if it cannot be."""
     mesh = model.load_mesh()
     given = Model(mesh=mesh, stretch=options.stretch, stretch_sigma=options.stretch_sigma)
     try:
-        result = align(given, View(camera, mask=inside))
+        found = align_outline(given, view)
     except CadalignError as error:
         logger.debug("%s, model %s: %s", model.category, model.model_id, error)
         return None
+    return None if found is None else _Aligned(model, given, *found)
+
+
+def _aligned(rough: _Aligned, view: View, *, is_any_met: bool) -> _Aligned:
+    """A model aligned with whatever part a mask shows, unless another one meets all of it."""
+    if is_any_met and not rough.is_met:
+        return rough
+    try:
+        result = align(rough.given, view)
+    except CadalignError as error:
+        logger.debug("%s, model %s: %s", rough.model.category, rough.model.model_id, error)
+        return rough
     (contour,) = result.mask_residuals
     if contour is None:
-        return None
-    residuals = np.abs(np.nan_to_num(contour.residuals, nan=_REACH))
-    cost = cost_of_contour(np.minimum(residuals, _REACH), _REACH)
-    alignment = result.alignment
-    silhouette = cast_geometry(Scene(mesh), camera, alignment).mask
+        return rough
+    return rough._replace(
+        alignment=result.alignment,
+        residuals=contour.residuals,
+        correlation=contour.correlation,
+    )
+
+
+def _match(
+    aligned: _Aligned, camera: Camera, inside: BoolArray, log_likelihood: float, score: float
+) -> Match:
+    model, alignment = aligned.model, aligned.alignment
+    silhouette = cast_geometry(Scene(cast(Mesh, aligned.given.mesh)), camera, alignment).mask
+    found = aligned.residuals[np.isfinite(aligned.residuals)]
     none: FloatArray = np.empty((0, 3))
-    match = Match(
+    return Match(
         category=model.category,
         model_id=model.model_id,
         alignment=alignment,
-        rms=contour.rms,
-        log_likelihood=np.nan,
-        score=np.nan,
+        rms=float(np.sqrt((found**2).mean())) if len(found) else float("nan"),
+        log_likelihood=log_likelihood,
+        score=score,
         box=Box.from_model(model.bounds, alignment),
         bounds=model.bounds,
         ids=np.empty(0, dtype=np.int64),
@@ -168,7 +215,6 @@ def _aligned(
         silhouette_iou=silhouette_iou(est=silhouette, gt=inside),
         camera=camera,
     )
-    return cost, len(contour.residuals) / contour.correlation, match
 
 
 # Reranking ---------------------------------------------------------------------------------------

@@ -73,6 +73,17 @@ def test_an_observation_of_a_mask_is_ranked_by_it(
     assert (first["category"], first["model_id"]) == key
 
 
+def test_a_part_that_is_hidden_does_not_hide_the_model(library: Library) -> None:
+    """No outline meets the mask whole, so that every model is aligned with what is left."""
+    key = next(key for key in library.keys if key[0] == "chair")
+    mask, _ = masked(library, key)
+    columns = np.nonzero(mask)[1]
+    mask[:, : int(np.quantile(columns, 0.2))] = False
+    matches = library.retrieve(mask=mask, camera=CAMERA)
+    assert matches[0].category == "chair"
+    assert key in [(match.category, match.model_id) for match in matches]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -2,8 +2,8 @@
 
 Each round predicts the outline at the present estimate, learns the colours on both sides of it, and
 takes the places where lines across it leave the object as rows of the evidence (`photo_lines.py`).
-Rounds begin with long lines of blurred colours and end with short ones at full resolution; the last
-ones count with the noise that the residuals show.
+Rounds begin with long lines of blurred colours and end with short ones at full resolution; lengths
+far above the last step are left out. The last rounds count with the noise that the residuals show.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ from cadalign.estimation.contours.view_contour import (
     correlation_length,
     trimmed_deviation,
 )
+from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import Minimum
@@ -54,8 +55,11 @@ from cadalign.solvers.joint.search import reduced, score_state
 
 _COARSE, _FINE = (0.16, 0.08), (0.04, 0.02)  # reaches of lines, relative to the silhouette's size
 _LEAST_REACH = 5.0  # [px]
-_ROUNDS = 3  # of every reach
-_LAST_ROUNDS = 3  # with the noise that is learned
+_ROUNDS = 3  # of every reach, at most
+_LAST_ROUNDS = 3  # with the noise that is learned, at most
+_FORESIGHT = 4.0  # reach of lines that a step may need, relative to the last one
+_FINE_REACH = 0.05  # below which silhouettes have more cells
+_CELLS, _COARSE_CELLS = 160, 80  # along the longer side of a silhouette
 _ITERATIONS = 4  # of a round, whose outline is not that of its end
 # Standard deviations [px] of what all of an outline has in common: an offset outwards, and, where
 # light and blur differ from side to side, shifts to the right and down.
@@ -66,7 +70,7 @@ _LEAST_FACTOR = 0.7
 _LEAST_FREEDOM = 0.1  # share of the residuals' degrees of freedom that the unknowns leave
 _LOSS_SCALE = 2.4  # in standard deviations
 _LEAST_OUTLIER = 2.0  # in standard deviations
-_TOLERANCE = 2.0  # [px], of a line that agrees, and the same relative to the silhouette's size
+_TOLERANCE = 2.0  # [px], of a line that agrees, and the same relative to the silhouette's length
 _RELATIVE_TOLERANCE = 0.01
 _SIMILAR_TOLERANCE = 0.04  # where the model is only similar to the object
 _STRAY = 0.2  # share of the lines whose places are of other things
@@ -98,12 +102,19 @@ Pictured = Sought[PhotoPyramid]
 class Approach(NamedTuple):
     """A place, and the outlines from which the last step led there.
 
-    An outline is None where a photo shows none; ``joined`` is the evidence with them.
+    An outline is None where a photo shows none; ``joined`` is the evidence with them, and
+    ``step`` the root mean square by which the outline moved, relative to the silhouette's size, in
+    the photo where it moved most.
     """
 
     place: Place
     outlines: tuple[Outline | None, ...] = ()
     joined: Joined | None = None
+    step: float = np.inf
+
+    def is_close(self, reach: float) -> bool:
+        """True if the next step will be much smaller than half a ``reach``."""
+        return _FORESIGHT * self.step < reach / 2
 
 
 def _approach(
@@ -111,19 +122,25 @@ def _approach(
 ) -> Approach | None:
     """Rounds with lines of the given reaches; None where no photo shows an outline."""
     here: Approach | None = start
-    for share in reaches:
+    noises = [LineNoise()] * len(pictured.views)
+    for reach in reaches:
         for _ in range(_ROUNDS):
-            noises = [LineNoise()] * len(pictured.views)
-            here = None if here is None else _round(pictured, here.place, share, noises)
+            if here is None:
+                return None
+            if here.is_close(reach):
+                break
+            here = _round(pictured, here.place, reach, noises)
     return here
 
 
 def _finish(pictured: Pictured, start: Approach) -> Approach | None:
     """Rounds with short lines, the last ones at the noise that the residuals show."""
     here, noises = _approach(pictured, start, _FINE), [LineNoise()] * len(pictured.views)
-    for _ in range(_LAST_ROUNDS):
+    for number in range(_LAST_ROUNDS):
         if here is None:
             return None
+        if number and here.is_close(_FINE[-1]):
+            break
         noises = [*map(_noise_of, here.outlines, here.place.own)]
         here = _round(pictured, here.place, _FINE[-1], noises)
     return None if here is None else _widened(pictured, here, noises)
@@ -134,12 +151,13 @@ def _round(
 ) -> Approach | None:
     """One step, with the outline that the present state has."""
     posed, poses = pictured.at(place.state)
+    cells = _CELLS if share < _FINE_REACH else _COARSE_CELLS
     outlines: list[Outline | None] = []
     rows = []
     for photo, noise in zip(pictured.views, noises, strict=True):
         camera = pictured.camera_at(photo.image, photo.camera, place.state)
         pose, outline = poses[photo.image], None
-        silhouette = silhouette_of(posed, camera, pose)
+        silhouette = silhouette_of(posed, camera, pose, cells)
         if silhouette is not None:
             outline = outline_of(photo, silhouette, max(share * silhouette.size, _LEAST_REACH))
         if outline is not None and outline.is_told.any():
@@ -155,7 +173,24 @@ def _round(
         return None
     own, (_, joined) = np.zeros_like(place.own), refined
     own[shown] = joined.place.own
-    return Approach(Place(joined.place.state, own), tuple(outlines), joined)
+    there = Place(joined.place.state, own)
+    return Approach(there, tuple(outlines), joined, _step(pictured, outlines, rows, there.state))
+
+
+def _step(
+    pictured: Pictured, outlines: list[Outline | None], rows: list[Measured], state: State
+) -> float:
+    """The largest step of an outline to another state, as `Approach` has it."""
+    poses, steps = poses_of(pictured.evidence, state), []
+    shown = [each for each in zip(pictured.views, outlines, strict=True) if each[1] is not None]
+    for (photo, outline), measured in zip(shown, rows, strict=True):
+        silhouette, told = cast(Outline, outline).silhouette, cast(Outline, outline).is_told
+        points = measured.mean + np.tensordot(state.coefficients, measured.modes, axes=1)
+        camera = pictured.camera_at(photo.image, photo.camera, state)
+        moved = camera.project(poses[photo.image].apply(points)) - silhouette.contour.points[told]
+        along = (moved * silhouette.contour.normals[told]).sum(axis=1)
+        steps.append(float(np.sqrt((along**2).mean())) / silhouette.size)
+    return max(steps)
 
 
 def _rows(
@@ -252,7 +287,7 @@ def _support_of(outline: Outline | None, own: FloatArray, *, is_exact: bool) -> 
     if outline is None:
         return _NO_SUPPORT
     relative = _RELATIVE_TOLERANCE if is_exact else _SIMILAR_TOLERANCE
-    tolerance = max(_TOLERANCE, relative * outline.silhouette.size)
+    tolerance = max(_TOLERANCE, relative * outline.silhouette.length)
     common = _common(outline, own)
     distances = outline.places - common
     near: BoolArray = outline.is_told & (np.abs(distances) < tolerance)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import (
+    ROUGH,
     Contour,
     Image,
     Sight,
@@ -42,7 +43,6 @@ _LEAST_SIDE = 2.0  # steps on either side of an edge
 _QUANTUM = 3.0  # variance of three channels by their quantisation and a little noise
 STEPS = 10
 """Steps of a line to either side."""
-_CELLS = 160  # along the longer side of the silhouette's box
 _BAND = 2.5  # width of the background that colours are learned from, in reaches
 _LEAST_PIXELS = 30
 _RIM_REACH = 2.0  # cells
@@ -57,15 +57,20 @@ def bins_of(colors: npt.NDArray[np.floating[Any]]) -> IntArray:
     return np.asarray((cells[..., 0] * _BINS + cells[..., 1]) * _BINS + cells[..., 2])
 
 
+def _smoothing_matrix() -> FloatArray:
+    """Weights (bins, bins) of neighbouring bins of a channel."""
+    padded = np.pad(np.eye(_BINS), [(1, 1), (0, 0)], mode="edge")
+    return np.asarray((padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4)
+
+
+_SMOOTHING = _smoothing_matrix()
+
+
 def _histogram(bins: IntArray) -> FloatArray:
     """Shares of the colours by bins, smoothed over neighbouring ones."""
-    counts = np.bincount(bins, minlength=_BINS**3).astype(np.float64).reshape((_BINS,) * 3)
-    for axis in range(3):
-        padded = np.pad(counts, [(int(a == axis),) * 2 for a in range(3)], mode="edge")
-        low, middle, high = (
-            np.take(padded, np.arange(shift, shift + _BINS), axis) for shift in range(3)
-        )
-        counts = (low + 2 * middle + high) / 4
+    counts = np.bincount(bins, minlength=_BINS**3).astype(np.float64)
+    for _ in range(3):  # of red, green, and blue: each is the last axis once
+        counts = (_SMOOTHING @ counts.reshape(_BINS, -1)).T
     shares = counts.ravel() / max(counts.sum(), 1.0)
     return np.asarray((1 - _FLOOR) * shares + _FLOOR / _BINS**3)
 
@@ -150,8 +155,30 @@ class PhotoPyramid(NamedTuple):
 
     def colors(self, points: FloatArray, step: float) -> Image:
         """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
-        level = min(max(int(np.log2(max(step, 1.0))), 0), len(self.levels) - 1)
+        level = self._level(step)
         return interpolated(self.levels[level], rescaled_pixels(points, 0.5**level))
+
+    def cells(
+        self, corner: FloatArray, cell: float, shape: tuple[int, ...], step: float
+    ) -> tuple[Image, BoolArray]:
+        """Colours (h, w, 3) of cells ``cell`` [px] apart from a pixel on, and if they are seen."""
+        level = self._level(step)
+        (x, y), spacing = rescaled_pixels(corner, 0.5**level), cell * 0.5**level
+        colors = cv2.warpAffine(
+            self.levels[level],
+            np.array([[spacing, 0.0, x], [0.0, spacing, y]]),
+            shape[1::-1],
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        columns, rows = (corner[axis] + cell * np.arange(shape[1 - axis]) for axis in (0, 1))
+        is_column = (columns >= 0) & (columns <= self.camera.width - 1)
+        is_row = (rows >= 0) & (rows <= self.camera.height - 1)
+        return np.asarray(colors, dtype=np.float32), is_row[:, None] & is_column
+
+    def _level(self, step: float) -> int:
+        """Number of the copy whose pixels are at most as large as a step [px]."""
+        return min(int(np.log2(max(step, 1.0))), len(self.levels) - 1)
 
 
 def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
@@ -187,6 +214,11 @@ class Silhouette(NamedTuple):
         """Square root of the area [px]."""
         return float(np.sqrt(self.inside.sum()) * self.cell)
 
+    @property
+    def length(self) -> float:
+        """Longer side of its box [px]."""
+        return float(np.ptp(self.contour.points, axis=0).max())
+
     def at(self, points: FloatArray) -> BoolArray:
         """Tell if pixels (..., 2) lie inside."""
         cells = np.rint((points - self.corner) / self.cell).astype(int)
@@ -198,13 +230,15 @@ class Silhouette(NamedTuple):
         )
 
 
-def silhouette_of(surface: PosedSurface, camera: Camera, pose: Alignment) -> Silhouette | None:
-    """The silhouette and its rims; None where no rim is seen."""
+def silhouette_of(
+    surface: PosedSurface, camera: Camera, pose: Alignment, cells: int
+) -> Silhouette | None:
+    """The silhouette, so many ``cells`` long, and its rims; None where no rim is seen."""
     box = _box_in_image(surface.corners, camera, pose)
     if box is None:
         return None
     low, high = box
-    cell = max(1.0, float((high - low).max()) / _CELLS)
+    cell = max(1.0, float((high - low).max()) / cells)
     # Room for the contour's smoothing, and for colours of the background.
     corner = low - 4 * cell
     width, height = (np.ceil((high - low) / cell).astype(int) + 9).tolist()
@@ -215,7 +249,7 @@ def silhouette_of(surface: PosedSurface, camera: Camera, pose: Alignment) -> Sil
     if not len(rough.points):
         return None
     contour = rough._replace(points=corner + cell * rough.points)
-    rims = without_steep(contour, find_rims(sight, contour, _RIM_REACH * cell))
+    rims = without_steep(contour, find_rims(sight, contour, _RIM_REACH * cell, ROUGH))
     on_rim = contour._replace(points=contour.at(rims.offset))
     across = across_rims(on_rim, rims._replace(offset=np.zeros(len(rims.offset))))
     within = (on_rim.points > _BORDER) & (on_rim.points < [camera.width - 3, camera.height - 3])
@@ -290,18 +324,16 @@ def _colors_beside(
     """Bins of the colours well inside, and outside near the outline."""
     cell = silhouette.cell
     room = int(np.ceil(_BAND * reach / cell))
-    labels = np.pad(silhouette.inside, room).astype(np.uint8)
-    depth = cell * np.asarray(cv2.distanceTransform(labels, cv2.DIST_L2, 3), dtype=np.float64)
-    height = cell * np.asarray(cv2.distanceTransform(1 - labels, cv2.DIST_L2, 3), dtype=np.float64)
+    inside = np.pad(silhouette.inside, room).astype(np.uint8)
+    depth, height = (
+        cell * np.asarray(cv2.distanceTransform(side, cv2.DIST_L2, 3))
+        for side in (inside, 1 - inside)
+    )
     margin = min(reach / 4, float(depth.max()) / 2)
-
-    def seen(chosen: BoolArray) -> IntArray:
-        rows, columns = np.nonzero(chosen)
-        pixels = silhouette.corner + cell * (np.column_stack([columns, rows]) - room)
-        pixels = pixels[photo.camera.contains(pixels, margin=PIXEL_CENTRE)]
-        return bins_of(photo.colors(pixels, step)) if len(pixels) else np.empty(0, dtype=np.int64)
-
-    return seen(depth > margin), seen((height > margin) & (height < _BAND * reach))
+    colors, seen = photo.cells(silhouette.corner - cell * room, cell, inside.shape, step)
+    own = seen & (depth > margin)
+    other = seen & (height > margin) & (height < _BAND * reach)
+    return bins_of(colors[own]), bins_of(colors[other])
 
 
 def _on_own_side(photo: PhotoPyramid, silhouette: Silhouette, pixels: FloatArray) -> BoolArray:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple, cast
 
+import cv2
 import numpy as np
 
 from cadalign.arrays import FloatArray
@@ -19,9 +22,13 @@ from cadalign.estimation.contours.view_contour import (
 )
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model, is_exact_model
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
+from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.camera import Camera
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import TrainingShapes
 
@@ -35,21 +42,33 @@ _FAR = 0.01  # misfit, relative to the mask's size, of a model that may be anoth
 _FAR_PX = 2.0
 _MOST_PROPOSALS = 5
 _CLOSE = 1.1  # cost above the least, of a contour's sample, at which a proposal is still one
+_ROUGH_SIZE = 160.0  # [px], of the mask's copy in which starts are followed
+_LEAST_PIXEL = 1.3  # of a smaller copy, in those of the mask
 _WHERE = "views[0].mask"
 
 
 class _Proposal(NamedTuple):
     """A minimum near the mask.
 
-    The ``misfit`` is the mean distance [px] of the mask's contour from the rim, the ``cost`` the
-    mean of the samples' -log probability density [1/px]; neighbouring samples are off alike, so
-    that as many as are ``independent`` count.
+    The ``residuals`` (S,) [px] are the distances of the mask's contour from the rim, the ``cost``
+    the mean of the samples' -log probability density [1/px]; so many neighbouring samples as the
+    ``correlation`` are off alike, and count as one.
     """
 
     minimum: Minimum
-    misfit: float
+    residuals: FloatArray
     cost: float
-    independent: float
+    correlation: float
+
+    @property
+    def misfit(self) -> float:
+        """Mean distance [px]."""
+        return float(np.abs(self.residuals).mean())
+
+    @property
+    def independent(self) -> float:
+        """Number of samples that are off independently."""
+        return len(self.residuals) / self.correlation
 
     def over(self, best: _Proposal) -> float:
         """-2 log of the likelihood over the best one's, for the fewer independent samples."""
@@ -76,21 +95,10 @@ def minima_of_mask(
             where="views[0].camera",
             fix="give a calibrated camera, or keypoints",
         )
-    contour = contour_view(0, view, _WHERE, camera)
+    contour, pixel = _rough_contour(view, camera)
     is_exact = is_exact_model(model)
-    proposals: list[_Proposal] = []
-    steps, starts = 0, 0
-    sigma = max(_MEETS_PX, _MEETS * contour.contour.size)
-    met = np.log(sigma) + (1 + np.log(2 * np.pi)) / 2
-    for is_cut, count in _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR:
-        for alignment, surface in _resembling(problem, model, count, is_cut=is_cut):
-            found, iterations = _approached(problem, alignment, surface, contour)
-            starts, steps = starts + 1, steps + iterations
-            if found is not None:
-                proposals.append(found)
-        cost = min((proposal.cost for proposal in proposals), default=np.inf)
-        if cost < met:  # as likely as one whose whole outline meets the contour
-            break
+    searches = _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR
+    proposals, steps, starts = _searched(problem, model, contour, searches)
     if not proposals:
         raise DegenerateError(
             "no pose gives the model an outline like the mask's",
@@ -98,15 +106,14 @@ def minima_of_mask(
             fix="check that the mask is nonzero on the object, not around it, and that the model "
             "is the object's; or give an init or keypoints",
         )
-    proposals.sort(key=lambda proposal: proposal.cost)
-    misfit = proposals[0].misfit
+    misfit, size = pixel * proposals[0].misfit, pixel * contour.contour.size
     mistake = None
     if not is_exact:
         mistake = (
             f"{_WHERE} alone does not tell the pose of an object that is only similar: the "
             "estimate is a proposal, as its alternatives are, and three keypoints settle it"
         )
-    elif misfit > max(_FAR_PX, _FAR * contour.contour.size):
+    elif misfit > max(_FAR_PX, _FAR * size):
         mistake = (
             f"{_WHERE}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
             "average: the object may be partly hidden, the model another, or the pose wrong"
@@ -121,6 +128,82 @@ def minima_of_mask(
         if np.exp(-score / 2) >= LEAST_LIKELIHOOD
     ]
     return likely, steps, starts, mistake
+
+
+class WholeOutline(NamedTuple):
+    """A model's alignment with a mask that shows all of it, roughly.
+
+    The ``residuals`` (S,) [px] are distances of the mask's contour from the rim; so many neighbours
+    as the ``correlation`` count as one. ``is_met`` says that the whole outline meets the contour.
+    """
+
+    alignment: Alignment
+    residuals: FloatArray
+    correlation: float
+    is_met: bool
+
+
+def align_outline(model: Model, view: View) -> WholeOutline | None:
+    """Align an exact model with a mask that shows all of it, roughly; None where it cannot be.
+
+    For a model of another object it takes a fraction of the time of `cadalign.align`, which seeks
+    the mask among parts of the silhouettes, too. Raises InputError if the mask has no contour or
+    the model no mesh.
+    """
+    lenses = Lenses.of([view], "known", None)
+    problem = JointProblem(prior_of(model), [view], None, FitOptions(), lenses)
+    contour, pixel = _rough_contour(view, lenses.cameras[0])
+    proposals, *_ = _searched(problem, model, contour, _SEARCHES[:1])
+    if not proposals:
+        return None
+    best = proposals[0]
+    (alignment,) = poses_of(best.minimum.evidence, best.minimum.state)
+    is_met = best.cost < _met_by(contour)
+    return WholeOutline(alignment, pixel * best.residuals, best.correlation, is_met)
+
+
+def _searched(
+    problem: JointProblem,
+    model: Model | ShapeModel,
+    contour: ViewContour,
+    searches: Sequence[tuple[bool, int]],
+) -> tuple[list[_Proposal], int, int]:
+    """Minima near a contour, the likeliest first; numbers of iterations and of starts.
+
+    A search follows those before it where none of these meets the contour.
+    """
+    found: list[_Proposal] = []
+    steps, starts = 0, 0
+    for is_cut, count in searches:
+        for alignment, surface in _resembling(problem, model, count, is_cut=is_cut):
+            proposal, iterations = _approached(problem, alignment, surface, contour)
+            starts, steps = starts + 1, steps + iterations
+            if proposal is not None:
+                found.append(proposal)
+        found.sort(key=lambda proposal: proposal.cost)
+        if found and found[0].cost < _met_by(contour):
+            break
+    return found, steps, starts
+
+
+def _met_by(contour: ViewContour) -> float:
+    """Cost below which an outline is as likely as one that meets the whole contour."""
+    sigma = max(_MEETS_PX, _MEETS * contour.contour.size)
+    return float(np.log(sigma) + (1 + np.log(2 * np.pi)) / 2)
+
+
+def _rough_contour(view: View, camera: Camera) -> tuple[ViewContour, float]:
+    """The contour of a view's mask or of a smaller copy, whose pixels are so many of the mask's."""
+    contour = contour_view(0, view, _WHERE, camera)
+    pixel = contour.contour.size / _ROUGH_SIZE
+    if pixel < _LEAST_PIXEL:
+        return contour, 1.0
+    mask = np.asarray(view.mask_image, dtype=np.float32)
+    width, height = (round(side / pixel) for side in mask.shape[::-1])
+    small = np.clip(cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA), 0.0, 1.0)
+    sigma = view.mask_sigma and view.mask_sigma / pixel
+    smaller = replace(view, camera=view.camera.resized(width, height), mask=small, mask_sigma=sigma)
+    return contour_view(0, smaller, _WHERE, camera.resized(width, height)), pixel
 
 
 def _resembling(
@@ -154,10 +237,9 @@ def _approached(
     if found is None:
         return None, iterations
     state, residuals, reach = found
-    misfit, cost = float(np.abs(residuals).mean()), cost_of_contour(residuals, reach)
-    alike = correlation_length(contour.contour, residuals, np.ones(len(residuals), dtype=bool))
-    minimum = best._replace(state=state)
-    return _Proposal(minimum, misfit, cost, len(residuals) / alike), iterations
+    cost, every = cost_of_contour(residuals, reach), np.ones(len(residuals), dtype=bool)
+    alike = correlation_length(contour.contour, residuals, every)
+    return _Proposal(best._replace(state=state), residuals, cost, alike), iterations
 
 
 def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:

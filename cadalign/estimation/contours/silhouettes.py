@@ -237,7 +237,7 @@ def resembling_poses(
     """
     atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
     query = whitened(view.image, view.corner, view.cell)
-    poses = [_pose_of(*each, atlas, free) for each in _affine_cameras(atlas, query)]
+    poses = _poses_of(*_affine_cameras(atlas, query), atlas, free)
     found = [(_overlap(atlas, view, pose, is_cut=is_cut), pose) for pose in poses]
     found.sort(key=lambda each: -each[0])
     kept: list[tuple[float, Alignment]] = []
@@ -304,58 +304,63 @@ def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
     return _Facing(seen_cells, camera.contains(pixels), rays, corner, cell, turn)
 
 
-def _affine_cameras(atlas: Atlas, query: Whitened) -> list[tuple[FloatArray, FloatArray]]:
-    """Maps ``M x + b`` of the model to the query's plane, those of the best overlaps."""
+def _affine_cameras(atlas: Atlas, query: Whitened) -> tuple[FloatArray, FloatArray]:
+    """Maps ``M x + b`` of the model to the query's plane, those of the best overlaps.
+
+    Matrices (n, 2, 3) and shifts (n, 2).
+    """
     overlap = overlaps(atlas.views, query)
     # A whitened silhouette may fit at several turns.
     is_peak = (overlap >= np.roll(overlap, 1, 2)) & (overlap >= np.roll(overlap, -1, 2))
     is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=2, keepdims=True)
     peaks = np.nonzero(is_peak)
     best = np.argsort(-overlap[peaks])[:_MOST_AFFINE]
-    found = []
-    for flip, row, number in zip(*(each[best].tolist() for each in peaks), strict=True):
-        angle = 2 * np.pi * number / _TURNS
-        cosine, sine = np.cos(angle), np.sin(angle)
-        turn = np.array([[cosine, -sine], [sine, cosine]])
-        if flip:
-            turn = np.diag([1.0, -1.0]) @ turn
-        plane = query.spread[0] @ turn @ np.linalg.inv(atlas.views.spread[row])
-        found.append((plane @ atlas.bases[row], query.mean[0] - plane @ atlas.views.mean[row]))
-    return found
+    flip, row, number = (each[best] for each in peaks)
+    angle = 2 * np.pi * number / _TURNS
+    cosine, sine = np.cos(angle), np.sin(angle)
+    turns = np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
+    turns[flip == 1, 1] *= -1.0
+    planes = query.spread[0] @ turns @ np.linalg.inv(atlas.views.spread[row])
+    shifts = query.mean[0] - (planes @ atlas.views.mean[row][:, :, None])[:, :, 0]
+    return planes @ atlas.bases[row], shifts
 
 
-def _pose_of(matrix: FloatArray, shift: FloatArray, atlas: Atlas, free: BoolArray) -> Alignment:
-    """The alignment of an affine camera ``matrix`` (2, 3)."""
-    scale = _stretch_of(matrix, free)
-    rows = matrix / scale
-    lengths = np.linalg.norm(rows, axis=1)
-    size = float(np.sqrt(lengths.prod()))
-    left, _, right = np.linalg.svd(rows)
-    first = left @ right[:2]
-    rotation = np.vstack([first, np.cross(first[0], first[1])])
+def _poses_of(
+    matrices: FloatArray, shifts: FloatArray, atlas: Atlas, free: BoolArray
+) -> list[Alignment]:
+    """The alignments of affine cameras, ``matrices`` (n, 2, 3) and ``shifts`` (n, 2)."""
+    scales = _stretches_of(matrices, free)
+    rows = matrices / scales[:, None]
+    sizes = np.sqrt(np.linalg.norm(rows, axis=2).prod(axis=1))
+    left, _, right = np.linalg.svd(rows, full_matrices=False)
+    first = left @ right
+    rotations = np.concatenate([first, np.cross(first[:, 0], first[:, 1])[:, None]], axis=1)
     middle = atlas.corners.mean(axis=0)
-    seen = np.append(matrix @ middle + shift, 1.0) / size
-    return Alignment(rotation, seen - rotation @ (scale * middle), scale)
+    seen = np.column_stack([matrices @ middle + shifts, np.ones(len(matrices))]) / sizes[:, None]
+    places = seen - (rotations @ (scales * middle)[:, :, None])[:, :, 0]
+    return [Alignment(*each) for each in zip(rotations, places, scales, strict=True)]
 
 
-def _stretch_of(matrix: FloatArray, free: BoolArray) -> FloatArray:
-    """Scales (3,) that make the rows of ``matrix / scale`` orthogonal and of one length.
+def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
+    """Scales (n, 3) that make the rows of ``matrix / scale`` orthogonal and of one length.
 
     Least squares by Gauss and Newton, with a weak prior on the logarithms: some views leave a
     stretch open.
     """
-    first, second = matrix
-    products, differences = first * second, (first**2 - second**2) / 2
-    logs, count = np.zeros(3), int(free.sum())
+    first, second = matrices[:, 0], matrices[:, 1]
+    terms = np.stack([first * second, (first**2 - second**2) / 2], axis=1)
+    squares = (first**2 + second**2) / 2
+    logs, count = np.zeros((len(matrices), 3)), int(free.sum())
     for _ in range(_ITERATIONS if count else 0):
         inverse = np.exp(-2 * logs)
-        size = float(((first**2 + second**2) * inverse).sum()) / 2
-        equations = np.stack([products, differences])[:, free] * inverse[free] / size
-        values = np.array([products @ inverse, differences @ inverse]) / size
-        rows = np.vstack([-2 * equations, _PRIOR * np.eye(count)])
-        residuals = np.concatenate([values, _PRIOR * logs[free]])
-        step = np.linalg.lstsq(rows, -residuals, rcond=None)[0]
-        logs[free] = np.clip(logs[free] + np.clip(step, -0.5, 0.5), -_MOST_LOG, _MOST_LOG)
+        relative = terms * (inverse / (squares * inverse).sum(axis=1, keepdims=True))[:, None]
+        slopes = -2 * relative[:, :, free]
+        normal = slopes.mT @ slopes + _PRIOR**2 * np.eye(count)
+        gradient = (slopes.mT @ relative.sum(axis=2)[:, :, None])[:, :, 0]
+        gradient += _PRIOR**2 * logs[:, free]
+        step = np.linalg.solve(normal, -gradient[:, :, None])[:, :, 0]
+        moved = logs[:, free] + np.clip(step, -0.5, 0.5)
+        logs[:, free] = np.clip(moved, -_MOST_LOG, _MOST_LOG)
     return np.asarray(np.exp(logs))
 
 

@@ -88,6 +88,15 @@ class TestOwnModel:
         found = align(Model(mesh=body()), View(CAMERA, mask=mask))
         assert rotation_error(est=found.alignment, gt=truth) < 4.0
 
+    def test_probabilities_of_a_large_photo(self) -> None:
+        """Starts are followed in a smaller copy of the mask, the end in the mask itself."""
+        truth, camera = posed(0, (1.0, 1.2, 0.8)), CAMERA.resized(1280, 960)
+        mask = cast_geometry(Scene(body()), camera, truth).mask.astype(np.float32)
+        soft = np.clip(cv2.GaussianBlur(mask, (0, 0), 3.0), 0.0, 1.0)
+        found = align(Model(mesh=body()), View(camera, mask=soft, mask_sigma=1.0))
+        assert rotation_error(est=found.alignment, gt=truth) < 0.3
+        assert found.alignment.scale == pytest.approx(truth.scale, rel=0.01)
+
     def test_same_evidence_gives_the_same_estimate(self) -> None:
         view = View(CAMERA, mask=mask_of(body(), posed(1)))
         first, second = (align(Model(mesh=body()), view).alignment for _ in range(2))

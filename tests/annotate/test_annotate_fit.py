@@ -17,7 +17,7 @@ from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.live import facts_of, live_alignment, missing_text, notes_of
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.photos import FocalChoice, Intrinsics
-from cadalign.annotate.problem import Known
+from cadalign.annotate.problem import Known, LiveProblem
 from cadalign.annotate.suggestion import (
     UNKNOWNS,
     NextBest,
@@ -29,6 +29,7 @@ from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation.problems import Problem
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.evidence import ImageEvidence
 from cadalign.io.observation import Observation
 from cadalign.solvers.projection import projection_jacobian
 
@@ -96,6 +97,20 @@ def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
     assert missing_text(np.ones(4, dtype=bool), None, is_plain=True, has_others=False) == ""
     beside = missing_text(np.ones(2, dtype=bool), None, is_plain=False, has_others=True)
     assert beside == "1 more pair to the first alignment of this photo"
+
+
+@pytest.mark.parametrize(("stretch", "noise"), [(0.25, "settled"), (None, "given")])
+def test_clicks_without_a_stated_noise_have_it_found_beside_other_evidence(
+    stretch: float | None, noise: str
+) -> None:
+    """By the prior on the stretch, which residuals alone do not settle; a stated one counts."""
+    problem = problem_of(3, points=8, noise_px=2.0)
+    upright = ImageEvidence(up=problem.alignment.rotation[:, 1])
+    given = problem.points_3d, problem.points_2d, problem.camera
+    known = Known(None, BOX, stretch=stretch)
+    for sigma, expected in ((None, noise), (np.full(8, 2.0), "given")):
+        seen = Observation(*given, sigma=sigma, ids=np.arange(8), evidence=upright)
+        assert LiveProblem.of(known, seen).noise == expected
 
 
 def test_standard_deviations_scale_with_the_residuals() -> None:

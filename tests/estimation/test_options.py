@@ -8,10 +8,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import fields
+from typing import Any
 
+import numpy as np
 import pytest
 
-from cadalign import fit, fit_batch
+from cadalign import Camera, fit, fit_batch
+from cadalign.errors import CadalignError
 from cadalign.estimation import options
 from cadalign.estimation.options import FitOptions, RansacOptions
 
@@ -42,3 +45,28 @@ def test_every_option_has_its_help_below_it(kind: type) -> None:
 def test_importing_the_options_compiles_nothing() -> None:
     code = f"import sys, {options.__name__}; assert 'numba' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "fewest"),
+    [
+        ({}, 4),
+        ({"stretch": "none"}, 3),
+        ({"stretch_sigma": 0.2}, 3),
+        ({"focal": "estimate"}, 4),
+        ({"stretch": "none", "focal": "estimate"}, 3),
+        ({"method": "aepnp"}, 6),
+        ({"method": "epnp"}, 4),
+    ],
+)
+def test_fits_take_as_many_keypoints_as_determine_their_unknowns(
+    given: dict[str, Any], fewest: int
+) -> None:
+    """Two equations each; a prior on an unknown is one. Fewer are refused with their number."""
+    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (fewest, 3))
+    pixels = camera.project(points + [0.0, 0.0, 4.0])
+    assert np.isfinite(fit(points, pixels, camera, **given).alignment.translation).all()
+    with pytest.raises(CadalignError) as refused:
+        fit(points[1:], pixels[1:], camera, **given)
+    assert fewest == 3 or f"give at least {fewest}" in str(refused.value)

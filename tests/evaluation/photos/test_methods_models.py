@@ -1,0 +1,39 @@
+"""Models that the methods of the evaluation on photos are given."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cadalign import Model
+from cadalign.evaluation.photos import protocols
+from cadalign.evaluation.photos.methods import _model
+
+BOUNDS = np.array([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])  # of a diagonal of 3
+
+
+def model_of(base: str) -> Model:
+    sighting: Any = SimpleNamespace(
+        bounds=BOUNDS,
+        width=2.0,
+        model=SimpleNamespace(xyz=0.5 * BOUNDS, names=("first", "second")),
+        protocol=SimpleNamespace(up_axis="y"),
+    )
+    return _model(base, sighting, 0.1, with_mesh=False)
+
+
+def test_a_similar_model_alone_deviates_by_a_share_of_its_diagonal() -> None:
+    assert model_of(protocols.SIMILAR).shape_sigma == pytest.approx(0.1 * 3 * 2)
+    for base in (protocols.RIGID, protocols.STRETCHED, protocols.PRIOR):
+        assert model_of(base).shape_sigma is None
+
+
+def test_a_rigid_model_is_not_stretched_and_a_prior_holds_the_stretch() -> None:
+    stretches = {base: model_of(base).stretch for base in protocols.BASES[1:5]}
+    assert [base for base, each in stretches.items() if each == "none"] == [protocols.RIGID]
+    assert model_of(protocols.PRIOR).stretch_sigma is not None
+    assert model_of(protocols.STRETCHED).stretch_sigma is None
+    assert model_of(protocols.RIGID).points_3d == pytest.approx(BOUNDS)  # in units of the width

@@ -182,6 +182,16 @@ def test_from_basis_scales_with_the_size() -> None:
     assert not model.has_box
 
 
+def test_boxes_move_with_modes_that_stretch_and_shift_the_keypoints() -> None:
+    """By the same factors about the same point, though they reach beyond the keypoints."""
+    mode = TABLE * [0.1, -0.2, 0.3] + [0.5, 0.0, -0.25]
+    box = np.array([TABLE.min(axis=0) - 0.3, TABLE.max(axis=0) + 0.1])
+    component = ShapeModel.from_basis(TABLE, [mode], [2.0], box=box).components[0]
+    moved = component.modes[0] * np.sign((component.modes[0][:-2] * mode).sum())
+    assert moved[:-2] == pytest.approx(2 * mode)
+    assert moved[-2:] == pytest.approx(2 * (box * [0.1, -0.2, 0.3] + [0.5, 0.0, -0.25]))
+
+
 def mirrored_across_x(rows: FloatArray, offset: float = 0.0) -> FloatArray:
     """Tables, or motions of them, (..., 9, 3) in the mirror."""
     found = rows[..., [1, 0, 3, 2, 5, 4, 6, 7, 8], :] * [-1, 1, 1] + [2 * offset, 0, 0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,6 +111,25 @@ def tracks_of(
         label = name if has_one else f"{video}/{name}"
         found.append(VideoTrack(label, views, tuple(frames), names))
     return found
+
+
+def with_pictures(tracks: Sequence[VideoTrack], video: Video, *, first: int) -> list[VideoTrack]:
+    """Tracks whose views have the video's pictures as evidence, where it has their frame.
+
+    ``first`` is the number of the video's first frame. Raises DataError if a picture cannot be
+    read.
+    """
+    wanted = {number for track in tracks for number in track.frames}
+    shown = {number: pixels for number, pixels in video.pictures(first=first) if number in wanted}
+    return [
+        track._replace(
+            views=tuple(
+                replace(view, image=shown.get(number))
+                for view, number in zip(track.views, track.frames, strict=True)
+            )
+        )
+        for track in tracks
+    ]
 
 
 def _video(image: str) -> str:

@@ -47,6 +47,9 @@ class TrackCommand(CameraOptions):
     cars."""
     video: Path | None = None
     """The video, a file or a folder of its pictures, to draw into."""
+    image: bool = False
+    """Use the video's pictures as evidence, too: the outline of the object is sought in each. It
+    takes a second a frame, and the shape needs models with meshes."""
     first_frame: int = 0
     """Number of the first frame of a video file among the frames of the detections."""
     out: Path | None = None
@@ -97,6 +100,13 @@ class TrackCommand(CameraOptions):
                 what = f"the detections are of {len(folders)} videos"
                 raise InputError(what, where="--video", fix="give the detections of one")
             require_size(video, tracks[0].views[0].camera)
+        if self.image:
+            from cadalign.batch.tracks import with_pictures
+
+            if video is None:
+                fix = "give --video"
+                raise InputError("pictures as evidence need the video", where="--image", fix=fix)
+            tracks = with_pictures(tracks, video, first=self.first_frame)
         folder = self.out or self.detections.with_name(f"{self.detections.stem}_tracks")
         make_folder(folder)
         found, failures = self._estimate(tracks, shape, motion)

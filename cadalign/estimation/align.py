@@ -20,6 +20,7 @@ from cadalign.errors import (
     quote,
     require_kind,
 )
+from cadalign.estimation.contours import refine_with_images
 from cadalign.estimation.focal import USUAL, PriorOption
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside
@@ -219,18 +220,7 @@ def _align_all(
             fix=mistake_beside(problem, ransac)
             or "give at least 3 keypoints in one view, or `init`, and check which is which",
         )
-    refined = []
-    if any(view.mask is not None for view in views):
-        from cadalign.estimation.contours.depth import fit_depths
-        from cadalign.estimation.contours.fit import fit_masks  # with OpenCV and embree
-
-        refined.append(fit_masks(model, prior, views, fit_depths(model, prior, views, minima)))
-        minima = refined[-1].minima
-    if any(view.image is not None and view.mask is None for view in views):
-        from cadalign.estimation.contours.photo import fit_photos  # with OpenCV and embree
-
-        refined.append(fit_photos(model, prior, views, minima))
-        minima = refined[-1].minima
+    minima, refined = refine_with_images(model, prior, views, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)
     result = result_of_minima(model, problem, likely, stats, mistake=mistake)

@@ -97,8 +97,8 @@ class Track(NamedTuple):
 
     motion: MotionPrior
     velocities: FloatArray
-    redundancy: int
-    widening: float
+    redundancy: int = 0
+    widening: float = 1.0
 
 
 class Minimum(NamedTuple):

@@ -12,11 +12,15 @@ import pytest
 import trimesh
 from support.refusals import refusal_line
 
-from cadalign import ShapeModel
+from cadalign import Camera, ShapeModel
 from cadalign.cli import main
+from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.simulation.tracks import TRACK_CAMERA, SimulatedTrack, simulate_track
+from cadalign.geometry.rotations import angle_between
 from cadalign.io.images import Video, write_image
+from cadalign.render import RaycastRenderer, Scene, look_at
 from cadalign.render.drawing.movie import write_movie
+from cadalign.shapes.examples import examples_of
 
 pytestmark = pytest.mark.slow
 
@@ -147,6 +151,41 @@ def test_a_video_of_another_size_is_refused(
     assert "its pictures are 64 x 48 px, those of the camera 640 x 480" in line
 
 
+@pytest.mark.long
+def test_pictures_are_evidence(tmp_path: Path) -> None:
+    """A car that turns before a grey wall, with rough keypoints."""
+    dataset = KeypointNet(write_sample_dataset(tmp_path / "sample", per_category=5))
+    cars = [dataset[key] for key in sorted(dataset.ids()) if key[0] == "car"]
+    known = examples_of(cars[1:], meshes=True, on_progress=lambda done, total: None)
+    ShapeModel.learn(known, category="car").save(tmp_path / "car.shape")
+    own, scene, rng = cars[0].keypoints, Scene(cars[0].load_mesh()), np.random.default_rng(1)
+    camera, truths, rows = (
+        Camera(320, 240, 400, 400, 159.5, 119.5),
+        [],
+        ["image,track,semantic_id,u,v"],
+    )
+    (tmp_path / "clip").mkdir()
+    for k in range(6):
+        truths.append(look_at(azimuth=30.0 + 4 * k, elevation=15.0, distance=2.2))
+        picture = RaycastRenderer().render(scene, camera, truths[-1])
+        wall = np.full((240, 320, 3), 150, dtype=np.uint8)
+        write_image(tmp_path / "clip" / f"frame_{k}.png", picture.composite(wall))
+        places = camera.project(truths[-1].apply(own.xyz)) + rng.normal(0, 4, (len(own.xyz), 2))
+        marks = zip(own.ids, places, strict=True)
+        rows += [f"frame_{k}.png,a,{name},{u},{v}" for name, (u, v) in marks]
+    (tmp_path / "found.csv").write_text("\n".join(rows))
+    (tmp_path / "camera.json").write_text(json.dumps(camera.to_dict()))
+    files = {"--shape": "car.shape", "--camera": "camera.json", "--video": "clip", "--out": "out"}
+    given = [word for name, file in files.items() for word in (name, str(tmp_path / file))]
+    errors = []
+    for more in ([], ["--image"]):
+        assert main(["track", str(tmp_path / "found.csv"), *given, "--sigma", "4", *more]) == 0
+        poses = np.loadtxt(tmp_path / "out" / "a.txt").reshape(-1, 3, 4)[:, :, :3]
+        pairs = zip(poses, truths, strict=True)
+        errors.append(np.mean([angle_between(est, truth.rotation) for est, truth in pairs]))
+    assert errors[1] < 0.9 * errors[0], errors
+
+
 def test_csv_with_tracks_is_read(video: tuple[Path, list[SimulatedTrack]], tmp_path: Path) -> None:
     folder, objects = video
     rows = [
@@ -166,6 +205,7 @@ def test_csv_with_tracks_is_read(video: tuple[Path, list[SimulatedTrack]], tmp_p
     [
         (["--rate", "0"], "--rate: 0 is not positive"),
         (["--angular-sigma", "-1"], "--angular-sigma: -1.0 is not positive"),
+        (["--image"], "--image: pictures as evidence need the video; give --video"),
     ],
 )
 def test_bad_options_are_refused(

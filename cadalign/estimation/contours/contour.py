@@ -7,7 +7,7 @@ difference of the two contours is free of both.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -33,6 +33,7 @@ _STEP = 0.25
 
 
 Image = npt.NDArray[np.float32]
+AnyImage = TypeVar("AnyImage", Image, npt.NDArray[np.uint8])
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _MOST_STEPS = 24  # to either side
 _PRECISION = 0.01  # [px], of a rim
@@ -169,21 +170,16 @@ def sampled(image: Image, points: FloatArray) -> FloatArray:
     return interpolated(image, points).astype(np.float64)
 
 
-def interpolated(image: Image, points: FloatArray) -> Image:
+def interpolated(image: AnyImage, points: FloatArray) -> AnyImage:
     """Values (n,) or colours (n, c) of an image (h, w) or (h, w, c) at points (n, 2), bilinear."""
     single = points.astype(np.float32)
-    blocks = [
-        cv2.remap(
-            image,
-            np.ascontiguousarray(part[:, :1]),
-            np.ascontiguousarray(part[:, 1:]),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )[:, 0]
-        for part in np.array_split(single, max(1, -(-len(single) // 30_000)))  # OpenCV takes 32,767
-        if len(part)
-    ]
-    return np.concatenate([*blocks, np.empty((0, *image.shape[2:]), dtype=image.dtype)])
+    found = np.empty((len(points), *image.shape[2:]), dtype=image.dtype)
+    for start in range(0, len(points), 30_000):  # OpenCV takes 32,767
+        part = slice(start, start + 30_000)
+        x, y = (np.ascontiguousarray(single[part, axis, None]) for axis in (0, 1))
+        border = cv2.BORDER_REPLICATE
+        found[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border)[:, 0]
+    return found
 
 
 def _resampled(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -122,7 +122,7 @@ def fit_masks(
     first = minima[0]
     where = f"views[{contours[0].image}].mask"
     surfaces, convex = surfaces_of(model, first.points[:keypoints], where)
-    is_open = not _is_determined(first)
+    is_open = first.track is None and not _is_determined(first)
     likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
@@ -131,7 +131,7 @@ def fit_masks(
     best: list[_Candidate] = []
     while used:
         best = explore(used, surfaces)
-        if not convex and not is_open:
+        if not convex and not is_open and first.track is None:
             agrees = bool(best) and _misfit(best[0].settled) <= _AGREEING
             if not agrees or best[0].masked.surface.is_exact:
                 others = _displaced(first, _POORLY_KNOWN if agrees else _WELL_KNOWN)

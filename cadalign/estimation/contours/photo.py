@@ -364,16 +364,16 @@ def fit_photos(
     while photos:
         best = _explored(minima, keypoints, photos, surface)
         wrong = _lacking(best, photos)
-        if wrong is None:
+        if not wrong:
             supports = best[0].supports
             found = {photo.image: each for photo, each in zip(photos, supports, strict=True)}
             warnings.extend(_weak(found))
             refined = [each.minimum for each in best]
             break
-        photo, reason = wrong
-        warnings.append(f"views[{photo.image}].image is left out: {reason}")
-        left_out[photo.image] = _NO_SUPPORT
-        photos.remove(photo)
+        for photo, reason in wrong:
+            warnings.append(f"views[{photo.image}].image is left out: {reason}")
+            left_out[photo.image] = _NO_SUPPORT
+            photos.remove(photo)
     summaries = [
         EvidenceSummary("photo", view, own.lines, own.rms_sigmas, own.rms, "px", own.share)
         for view, own in {**found, **left_out}.items()
@@ -427,8 +427,13 @@ def _distinct(candidates: list[_Candidate]) -> list[_Candidate]:
 
 
 def _starts(minima: Sequence[Minimum]) -> list[tuple[Minimum, State]]:
-    """The likely minima, and states beside the best one where its pose is known least."""
+    """The likely minima, and states beside the best one where its pose is known least.
+
+    A track is known by all of its frames.
+    """
     best = minima[0]
+    if best.track is not None:
+        return [(best, best.state)]
     first = minima[:_MOST_MINIMA]
     starts = [(each, each.state) for each in first if each.score <= best.score + _UNLIKELY]
     _, information = information_of(*reduced(best.evidence, best.state))
@@ -440,15 +445,19 @@ def _starts(minima: Sequence[Minimum]) -> list[tuple[Minimum, State]]:
     return starts
 
 
-def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> tuple[PhotoPyramid, str] | None:
-    """The photo that lacks the outline, or in which it contradicts the rest, and how; or None."""
+def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> list[tuple[PhotoPyramid, str]]:
+    """Photos that lack the outline, or in which it contradicts the rest, and how.
+
+    Of several that lack it the worse half comes first: these may have led the estimate astray.
+    """
     if not best:
-        return photos[0], "it shows no part of the model's outline"
-    supports = best[0].supports
-    worst = int(np.argmin([each.share for each in supports]))
-    if supports[worst].share < _LEAST_SUPPORT:
-        share = f"{100 * supports[worst].share:.0f} % of the model's outline"
-        return photos[worst], f"it shows only {share}"
+        return [(photos[0], "it shows no part of the model's outline")]
+    shares = [each.share for each in best[0].supports]
+    lacking = [k for k in np.argsort(shares).tolist() if shares[k] < _LEAST_SUPPORT]
+    if lacking:
+        worse = lacking[: -(-len(lacking) // 2)]
+        text = "it shows only {:.0f} % of the model's outline"
+        return [(photos[k], text.format(100 * shares[k])) for k in worse]
     start, pictured, reached = best[0]
     reason = tension(start, pictured.evidence, reached.place.state, _LEAST_PROBABILITY)
-    return None if reason is None else (photos[worst], reason)
+    return [] if reason is None else [(photos[int(np.argmin(shares))], reason)]

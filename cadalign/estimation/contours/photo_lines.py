@@ -9,17 +9,15 @@ smoothed step give the posterior of the place where the line leaves the object.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import (
     ROUGH,
     Contour,
-    Image,
     Sight,
     across_rims,
     contour_of,
@@ -51,9 +49,9 @@ _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other thing
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
-def bins_of(colors: npt.NDArray[np.floating[Any]]) -> IntArray:
-    """Numbers (...) of the histogram's bins of colours (..., 3) from 0 to 255."""
-    cells = np.clip(np.multiply(colors, _BINS / 256), 0, _BINS - 1).astype(np.int64)
+def bins_of(colors: ByteImage) -> IntArray:
+    """Numbers (...) of the histogram's bins of colours (..., 3)."""
+    cells = (colors // (256 // _BINS)).astype(np.int64)
     return np.asarray((cells[..., 0] * _BINS + cells[..., 1]) * _BINS + cells[..., 2])
 
 
@@ -151,16 +149,16 @@ class PhotoPyramid(NamedTuple):
 
     image: int
     camera: Camera
-    levels: tuple[Image, ...]
+    levels: tuple[ByteImage, ...]
 
-    def colors(self, points: FloatArray, step: float) -> Image:
+    def colors(self, points: FloatArray, step: float) -> ByteImage:
         """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
         level = self._level(step)
         return interpolated(self.levels[level], rescaled_pixels(points, 0.5**level))
 
     def cells(
         self, corner: FloatArray, cell: float, shape: tuple[int, ...], step: float
-    ) -> tuple[Image, BoolArray]:
+    ) -> tuple[ByteImage, BoolArray]:
         """Colours (h, w, 3) of cells ``cell`` [px] apart from a pixel on, and if they are seen."""
         level = self._level(step)
         (x, y), spacing = rescaled_pixels(corner, 0.5**level), cell * 0.5**level
@@ -174,7 +172,7 @@ class PhotoPyramid(NamedTuple):
         columns, rows = (corner[axis] + cell * np.arange(shape[1 - axis]) for axis in (0, 1))
         is_column = (columns >= 0) & (columns <= self.camera.width - 1)
         is_row = (rows >= 0) & (rows <= self.camera.height - 1)
-        return np.asarray(colors, dtype=np.float32), is_row[:, None] & is_column
+        return np.asarray(colors, dtype=np.uint8), is_row[:, None] & is_column
 
     def _level(self, step: float) -> int:
         """Number of the copy whose pixels are at most as large as a step [px]."""
@@ -183,13 +181,13 @@ class PhotoPyramid(NamedTuple):
 
 def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
-    levels = [np.ascontiguousarray(pixels, dtype=np.float32)]
+    levels = [np.ascontiguousarray(pixels)]
     while min(levels[-1].shape[:2]) > _SMALLEST:
         height, width = levels[-1].shape[:2]
         size = (width // 2, height // 2)
         even = levels[-1][: 2 * size[1], : 2 * size[0]]
         smaller = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
-        levels.append(np.asarray(smaller, dtype=np.float32))
+        levels.append(np.asarray(smaller, dtype=np.uint8))
     return PhotoPyramid(image, camera, tuple(levels))
 
 

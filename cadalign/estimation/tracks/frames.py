@@ -63,10 +63,6 @@ class Frames(NamedTuple):
             where = f"views[{lacking.index(True)}].time"
             raise InputError("only some views have a time", where=where, fix=fix)
         for number, view in enumerate(views):
-            for name in ("mask", "image"):
-                if getattr(view, name) is not None:
-                    what = "contours are not used together with a motion"
-                    raise InputError(what, where=f"views[{number}].{name}", fix="leave it away")
             if needs_facing([view.camera]):
                 fix = "undistort the photos to a pinhole's"
                 what = "a wide lens cannot be used together with a motion"

@@ -10,12 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import DegenerateError
+from cadalign.estimation.contours import refine_with_images
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_robust import under_cauchy, whitened_lengths, with_sightings
 from cadalign.estimation.model import Model
@@ -43,6 +44,9 @@ from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.motion import MotionPrior
 from cadalign.solvers.joint.tracks import Path, moving_covariance, refine_moving
+
+if TYPE_CHECKING:
+    from cadalign.estimation.contours.fit import Refined
 
 _FIRST_ITERATIONS = 15
 _ITERATIONS = 60
@@ -76,6 +80,17 @@ class EstimatedTrack(NamedTuple):
     hypotheses: int
     correlation: float
 
+    @property
+    def minimum(self) -> Minimum:
+        """The path as a minimum of all frames' evidence."""
+        return self.minima[0]._replace(
+            inliers=self.inliers,
+            evidence=self.evidence,
+            state=self.path.state,
+            lenses=self.problem.lenses,
+            track=Track(self.motion, self.path.velocities),
+        )
+
 
 def align_track(
     model: Model | ShapeModel,
@@ -99,8 +114,12 @@ def align_track(
         frames=tuple(frames.of_view.tolist()),
     )
     found = estimate_track(problem, frames, motion, inits, ransac)
+    found, refined = _with_images(model, found, motion)
     stats = FitStats(found.iterations, found.hypotheses, perf_counter() - start)
-    return _result(model, found, frames, stats)
+    result = _result(model, found, frames, stats)
+    for each in refined:
+        result = each.noted_in(result)
+    return result
 
 
 def estimate_track(
@@ -127,6 +146,30 @@ def estimate_track(
     return EstimatedTrack(
         problem, minima, used, inliers, path, prior, spent, hypotheses, correlation
     )
+
+
+def _with_images(
+    model: Model | ShapeModel, found: EstimatedTrack, motion: Motion
+) -> tuple[EstimatedTrack, list[Refined]]:
+    """The track with the masks and photos of its frames, and what is to be noted of these.
+
+    Their outlines are sought from the smooth path, which then follows what was found.
+    """
+    problem = found.problem
+    (best, *_), refined = refine_with_images(model, problem.prior, problem.views, [found.minimum])
+    if not refined:
+        return found, refined
+    evidence, path = best.evidence, found.path._replace(state=best.state)
+    path, prior, spent = _likeliest(evidence, path, found.motion, motion)
+    # The other components' shapes lack the outlines' points.
+    track = found._replace(
+        minima=[best],
+        evidence=evidence,
+        path=path,
+        motion=prior,
+        iterations=found.iterations + spent,
+    )
+    return track, refined
 
 
 def _of_some(
@@ -309,14 +352,7 @@ def _result(
     if problem.lacks_sigma:
         widening = widening_of(max(unknowns, 1), max(redundancy, 1))
     track = Track(found.motion, path.velocities, redundancy, widening)
-    best = found.minima[0]._replace(
-        inliers=found.inliers,
-        evidence=evidence,
-        state=path.state,
-        cost=float(covariance.costs[0]),
-        lenses=problem.lenses,
-        track=track,
-    )
+    best = found.minimum._replace(cost=float(covariance.costs[0]), track=track)
     others = _of_other_components(best, found.minima)
     result = result_of_minima(model, problem, [best, *others], stats)
     wide, state = widened(evidence, path.state, problem.prior.inflation)

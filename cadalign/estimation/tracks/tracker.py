@@ -155,6 +155,11 @@ class Tracker:
         if self._views and float(view.time) <= float(self._views[-1].time or 0.0):
             what = f"{view.time} is not later than {self._views[-1].time}, that of the last view"
             raise InputError(what, where="view.time")
+        for name in ("mask", "image"):
+            if getattr(view, name) is not None:
+                what = "a tracker follows keypoints, not outlines"
+                fix = "leave it away, or align the frame from the last pose: align(..., init=)"
+                raise InputError(what, where=f"view.{name}", fix=fix)
         self._views.append(view)
         self._recent.append(view)
         if self._window is None:

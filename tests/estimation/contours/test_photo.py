@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cadalign import Alignment, Camera, Mesh, Model, View, align
+from cadalign import Alignment, Camera, Mesh, Model, Tracker, View, align
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.contours.photo_lines import bins_of, crossings_of, edges_of, regions_of
 from cadalign.estimation.result import Result
@@ -29,6 +29,7 @@ class PhotoScene(NamedTuple):
     truth: Alignment
     pixels: np.ndarray
     clicks: np.ndarray
+    mask: np.ndarray
 
     def model(self, **options: Any) -> Model:
         return Model(points_3d=self.mesh.vertices, mesh=self.mesh, **options)
@@ -38,7 +39,10 @@ class PhotoScene(NamedTuple):
         return align(self.model(stretch="none") if model is None else model, view)
 
     def error(self, result: Result) -> float:
-        return rotation_error(est=result.alignment, gt=self.truth)
+        return self.turned(result.alignment)
+
+    def turned(self, est: Alignment) -> float:
+        return rotation_error(est=est, gt=self.truth)
 
 
 def wedge() -> Mesh:
@@ -54,22 +58,42 @@ def wedge() -> Mesh:
 
 @cache
 def scene(seed: int, scale: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> PhotoScene:
-    """A red body before a patterned background, blurred and noisy, with rough clicks."""
+    """A body from anywhere in front."""
     rng = np.random.default_rng(seed)
-    mesh = wedge()
-    turn = rotation_from_vector(rng.normal(0, 0.7, 3))
-    truth = Alignment(turn, [0.1, -0.05, 3.0], np.array(scale))
-    shape = (CAMERA.height, CAMERA.width)
-    inside = cv2.GaussianBlur(
-        cast_geometry(Scene(mesh), CAMERA, truth).mask.astype(np.float32), (0, 0), 0.8
-    )[:, :, None]
+    return drawn(rng, rotation_from_vector(rng.normal(0, 0.7, 3)), [0.1, -0.05, 3.0], scale)
+
+
+def drawn(
+    rng: np.random.Generator,
+    turn: np.ndarray,
+    place: list[float],
+    scale: tuple[float, float, float],
+) -> PhotoScene:
+    """A red body before a patterned background, blurred and noisy, with rough clicks."""
+    mesh, shape = wedge(), (CAMERA.height, CAMERA.width)
+    truth = Alignment(turn, place, np.array(scale))
+    mask = cast_geometry(Scene(mesh), CAMERA, truth).mask
+    inside = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.8)[:, :, None]
     pattern = cv2.GaussianBlur(rng.uniform(0, 255, (*shape, 3)), (0, 0), 6)
     pattern = 128 + 6 * (pattern - pattern.mean())
     pattern[:, :, 0] *= 0.6
-    drawn = inside * [190, 60, 50] + (1 - inside) * pattern + rng.normal(0, 6, (*shape, 3))
-    pixels = np.clip(drawn, 0, 255).astype(np.uint8)
+    mixed = inside * [190, 60, 50] + (1 - inside) * pattern + rng.normal(0, 6, (*shape, 3))
+    pixels = np.clip(mixed, 0, 255).astype(np.uint8)
     clicks = CAMERA.project(truth.apply(mesh.vertices))
-    return PhotoScene(mesh, truth, pixels, clicks + rng.normal(0, CLICK_PX, clicks.shape))
+    noisy = clicks + rng.normal(0, CLICK_PX, clicks.shape)
+    return PhotoScene(mesh, truth, pixels, noisy, mask)
+
+
+@cache
+def frames(count: int) -> list[tuple[PhotoScene, np.ndarray]]:
+    """Frames of a clip, and the corners that are clicked in each."""
+    rng = np.random.default_rng(5)
+    axis, found = np.array([0.6, 0.64, 0.48]), []
+    for number in range(count):
+        turn = rotation_from_vector(np.radians(3 * number) * axis)
+        shown = drawn(rng, turn, [0.1 - 0.01 * number, -0.05, 3.0], (1.0, 1.2, 0.9))
+        found.append((shown, np.flatnonzero(rng.random(8) < 0.6)))
+    return found
 
 
 class TestPhoto:
@@ -202,8 +226,62 @@ class TestRefusals:
             align(shown.model(), view)
 
 
+class TestTrack:
+    """Frames of a smooth motion: three degrees further each, half of the clicks."""
+
+    @staticmethod
+    def views(count: int, *, spoilt: tuple[int, ...] = (), **shown: bool) -> list[View]:
+        views = []
+        for number, (frame, ids) in enumerate(frames(count)):
+            pixels = np.full_like(frame.pixels, 90) if number in spoilt else frame.pixels
+            images = {"image": pixels, "mask": frame.mask}
+            kept = {name: images[name] for name, is_shown in shown.items() if is_shown}
+            clicks, time = frame.clicks[ids], number / 25
+            views.append(View(CAMERA, clicks, ids=ids.tolist(), sigma=CLICK_PX, time=time, **kept))
+        return views
+
+    def test_photos_sharpen_every_frame(self) -> None:
+        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
+        errors = {}
+        for shown in (False, True):
+            result = align(model, self.views(8, image=shown), motion="smooth")
+            poses = [view.alignment for view in result.views]
+            pairs = zip(frames(8), poses, strict=True)
+            errors[shown] = [frame.turned(pose) for (frame, _), pose in pairs]
+        assert np.sqrt(np.mean(np.square(errors[True]))) < 0.4
+        assert np.mean(errors[True]) < 0.25 * np.mean(errors[False])
+        assert result.trajectory is not None
+        assert result.alignment.scale == pytest.approx([1.0, 1.2, 0.9], rel=0.02)
+        assert [each.view for each in result.evidence if each.kind == "photo"] == list(range(8))
+
+    def test_masks_do_as_well(self) -> None:
+        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
+        result = align(model, self.views(3, mask=True), motion="smooth")
+        for (frame, _), view in zip(frames(3), result.views, strict=True):
+            assert frame.turned(view.alignment) < 0.5
+
+    def test_frames_without_the_outline_are_left_out(self) -> None:
+        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
+        result = align(model, self.views(6, image=True, spoilt=(2, 4)), motion="smooth")
+        shares = {each.view: each.share for each in result.evidence if each.kind == "photo"}
+        assert [view for view, share in shares.items() if share == 0] == [2, 4]
+        for (frame, _), view in zip(frames(6), result.views, strict=True):
+            assert view.std is not None
+            assert frame.turned(view.alignment) < 3 * view.std.rotation_deg
+            assert frame.turned(view.alignment) < 3.0
+        named = [text for text in result.warnings if "is left out" in text]
+        assert [text[:14] for text in named] == ["views[2].image", "views[4].image"]
+
+    def test_a_tracker_follows_keypoints_alone(self) -> None:
+        tracker = Tracker(Model(points_3d=wedge().vertices, mesh=wedge()))
+        with pytest.raises(InputError, match=r"view\.image.*not outlines.*init="):
+            tracker.update(self.views(1, image=True)[0])
+
+
 class TestLines:
-    colors = np.where(np.arange(21)[:, None] < 12, [200.0, 40.0, 40.0], [40.0, 60.0, 200.0])[None]
+    colors = np.where(np.arange(21)[:, None] < 12, [200, 40, 40], [40, 60, 200])[None].astype(
+        np.uint8
+    )
     valid = np.ones((1, 21), dtype=bool)
 
     def regions(self) -> Any:
@@ -211,7 +289,7 @@ class TestLines:
 
     def test_a_clean_edge_is_found_in_its_place(self) -> None:
         odds = self.regions()[0][bins_of(self.colors)]
-        edges = edges_of(self.colors, self.valid, 0.5)
+        edges = edges_of(self.colors.astype(float), self.valid, 0.5)
         places, variances = crossings_of(odds, self.valid, edges)
         assert places[0] == pytest.approx(1.5, abs=0.3)
         assert variances[0] < 1.0

@@ -77,6 +77,16 @@ def test_rotation_loss_is_one_minus_the_cosine() -> None:
     np.testing.assert_allclose(loss, 1 - torch.cos(angles), atol=1e-12)
 
 
+@pytest.mark.parametrize("unit", [0.01, 1.0, 50.0])
+def test_the_loss_of_boxes_is_in_diagonals_whatever_the_unit(unit: float) -> None:
+    truth = poses(np.zeros((2, 3)))
+    bounds = unit * torch.tensor([[0.0, 0.0, 0.0], [2.0, 2.0, 1.0]]).double()
+    diagonal = float(((bounds[1] - bounds[0]) * truth.scale[0]).norm())
+    shift = torch.tensor([[0.25 * diagonal, 0.0, 0.0], [0.0, 0.0, diagonal]])
+    moved = PoseBatch(truth.rotation, truth.translation + shift.double(), truth.scale)
+    np.testing.assert_allclose(box_loss(moved, truth, bounds), [0.25, 1.0], rtol=1e-5)
+
+
 def test_descent_on_losses_through_the_fit_brings_keypoints_to_the_truth() -> None:
     problem = problem_of(3, points=10, noise_px=3.0)
     alignment = problem.alignment

@@ -19,6 +19,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.io.files import Seal
+from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import FewKeypoints, Reflection, ShapeComponent
@@ -197,6 +198,25 @@ def mirrored_across_x(rows: FloatArray, offset: float = 0.0) -> FloatArray:
     found = rows[..., [1, 0, 3, 2, 5, 4, 6, 7, 8], :] * [-1, 1, 1] + [2 * offset, 0, 0]
     found[..., [7, 8], 0] = found[..., [8, 7], 0]
     return np.asarray(found)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_a_reflection_pairs_keypoints_that_the_mirror_exchanges(axis: int) -> None:
+    """In any order, off the origin, with deviations; those on the mirror stay."""
+    rng = np.random.default_rng(3)
+    one_side = rng.uniform(0.2, 1.0, (4, 3))
+    flip = np.where(np.arange(3) == axis, -1.0, 1.0)
+    middle = rng.uniform(-0.5, 0.5, (2, 3)) * (flip > 0)
+    box = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    every = np.concatenate([one_side, one_side * flip, middle])
+    order = rng.permutation(len(every))
+    names = [f"{'left' if k < 4 else 'right'} {k % 4}" for k in range(8)] + ["top", "nose"]
+    rows = np.concatenate([every[order], box]) + 0.7 * (flip < 0)
+    models = rows + rng.normal(0, 0.01, (6, *rows.shape))
+    found = find_reflection(models, [names[k] for k in order], axis)
+    assert found.offset == pytest.approx(0.7, abs=0.02)
+    pairs = {frozenset(each) for each in found.pairs}
+    assert pairs == {frozenset((f"left {k}", f"right {k}")) for k in range(4)}
 
 
 def test_from_basis_with_a_reflection_is_symmetric(tmp_path: Path) -> None:

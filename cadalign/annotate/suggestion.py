@@ -18,7 +18,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import CadalignError
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
-from cadalign.estimation.uncertainty.advice import LENGTH_SIGMA, TURN_DEG, Advice, rank_evidence
+from cadalign.estimation.uncertainty.next_best import LENGTH_SIGMA, TURN_DEG, Advice, rank_evidence
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.tracks.motion import Motion, PoseAt, Trajectory
     from cadalign.estimation.tracks.tracker import Tracker, TrackUpdate
-    from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+    from cadalign.estimation.uncertainty.next_best import Advice, rank_evidence
     from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import (
         Contribution,

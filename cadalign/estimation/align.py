@@ -21,7 +21,7 @@ from cadalign.errors import (
     require_kind,
 )
 from cadalign.estimation.contours import refine_with_images
-from cadalign.estimation.focal import USUAL, PriorOption
+from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside
 from cadalign.estimation.model import Model
@@ -59,12 +59,12 @@ def align(
     *,
     size: Size | None = None,
     init: Alignment | Sequence[Alignment | None] | None = None,
-    loss: str = "linear",
-    loss_scale: float = 2.0,
+    loss: str = FitOptions.loss,
+    loss_scale: float = FitOptions.loss_scale,
     ransac: RansacOptions | None = None,
-    focal: str = "known",
-    focal_prior: PriorOption = USUAL,
-    principal_sigma: float | None = None,
+    focal: str = FitOptions.focal,
+    focal_prior: PriorOption = FitOptions.focal_prior,
+    principal_sigma: float | None = FitOptions.principal_sigma,
     motion: Motion | Literal["smooth"] | None = None,
 ) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
@@ -235,12 +235,12 @@ def align_batch(
     *,
     size: Size | Sequence[Size | None] | None = None,
     init: Alignment | Sequence[Alignment | None] | None = None,
-    loss: str = "linear",
-    loss_scale: float = 2.0,
+    loss: str = FitOptions.loss,
+    loss_scale: float = FitOptions.loss_scale,
     ransac: RansacOptions | None = None,
-    focal: str = "known",
-    focal_prior: PriorOption = USUAL,
-    principal_sigma: float | None = None,
+    focal: str = FitOptions.focal,
+    focal_prior: PriorOption = FitOptions.focal_prior,
+    principal_sigma: float | None = FitOptions.principal_sigma,
     workers: int = 1,
 ) -> Results:
     """Align many objects of one kind; each as `align` does, bit for bit.

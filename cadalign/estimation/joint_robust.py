@@ -15,8 +15,9 @@ from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
 from cadalign.estimation.uncertainty.evidence import seen_in_cameras
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES, UNKNOWNS
 from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, log_focals_of, points_of
-from cadalign.solvers.joint.search import ViewRays, rays_in, search_joint
+from cadalign.solvers.joint.search import keypoints_of, search_joint
 from cadalign.solvers.optimal import optimal_batch
+from cadalign.solvers.ransac import score_pose
 
 OUTLIER_COST = 5.0
 """Cost of a keypoint that is left out, beyond the square of its threshold."""
@@ -24,6 +25,7 @@ _WIDENING = 3.0  # standard deviations of a displacement that a threshold allows
 _NEAREST = 1e-9  # depth
 _INLIER_RATIO = 0.5
 _LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
+_LIMIT = 9.0  # squared whitened residual of a keypoint that speaks for a hypothesis
 _REFINED = 8
 _ROUNDS = 5
 _KEPT = 4  # minima of the robust search that are settled on their inliers
@@ -160,7 +162,7 @@ def _hypotheses(
     evidence: Evidence, view: int, ransac: RansacOptions, scores: FloatArray | None
 ) -> FloatArray:
     """Camera poses (S, 12) from small samples of one view's keypoints, the best supported first."""
-    given = rays_in(evidence, view)
+    given = keypoints_of(evidence, view)._replace(loss=LINEAR)
     count, size = len(given.points), SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
     if count < size:
         return np.empty((0, 12))
@@ -168,21 +170,21 @@ def _hypotheses(
     free = np.ones(UNKNOWNS)
     free[6:] = 0.0
     chosen = draws.ravel()
-    found, costs, *_ = optimal_batch(
+    poses, costs, *_ = optimal_batch(
         given.points[chosen],
         given.rays[chosen],
         given.whitening[chosen],
         np.arange(len(draws) + 1) * size,
-        LINEAR,
+        given.loss,
         np.ones(len(draws)),
         np.zeros(len(draws)),
         0.0,
         free,
         size,
     )
-    poses = found[np.isfinite(costs)]
-    scores = np.array([_truncated(given, pose) for pose in poses])
-    return poses[np.argsort(scores)][:_REFINED, :12]
+    poses = poses[np.isfinite(costs)]
+    supports = np.array([score_pose(given, pose, _LIMIT, np.inf, 0.0, 1.0)[0] for pose in poses])
+    return poses[np.argsort(supports)][:_REFINED, :12]
 
 
 def _draws(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
@@ -204,12 +206,3 @@ def _draws(count: int, size: int, ransac: RansacOptions, scores: FloatArray | No
         rng.choice(count, size, replace=False, p=weights if k % 2 else None) for k in range(wanted)
     ]
     return np.unique(np.sort(draws, axis=1), axis=0)
-
-
-def _truncated(given: ViewRays, pose: FloatArray) -> float:
-    """Sum of squared whitened residuals, each at most 9."""
-    seen = given.points @ pose[:9].reshape(3, 3).T + pose[9:12]
-    du = seen[:, :2] / seen[:, 2:] - given.rays
-    a, b, c = given.whitening.T
-    squares = (a * du[:, 0] + b * du[:, 1]) ** 2 + (c * du[:, 1]) ** 2
-    return float(np.where(seen[:, 2] > 0, np.minimum(squares, 9.0), 9.0).sum())

@@ -22,7 +22,7 @@ from cadalign.errors import CadalignError, DegenerateError, InputError, quote, r
 from cadalign.estimation.align import align
 from cadalign.estimation.evidence_kinds import upward
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
-from cadalign.estimation.options import RansacOptions
+from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
@@ -106,9 +106,9 @@ def align_scene(
     *,
     share: Collection[str] = ("focal",),
     tilt_sigma_deg: float = 1.0,
-    focal_prior: PriorOption = USUAL,
-    loss: str = "linear",
-    loss_scale: float = 2.0,
+    focal_prior: PriorOption = FitOptions.focal_prior,
+    loss: str = FitOptions.loss,
+    loss_scale: float = FitOptions.loss_scale,
     ransac: RansacOptions | None = None,
 ) -> AlignedScene:
     """Align several objects of one photo, which share its camera and the ground.

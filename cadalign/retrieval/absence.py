@@ -33,11 +33,11 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.problems import whitening_of
 from cadalign.estimation.uncertainty.residuals import bent
-from cadalign.geometry.rotations import by_rotation
 from cadalign.retrieval.models import LibraryModel, ModelTable
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import CandidateSet, Observed, Ranking, shared_keypoints
 from cadalign.solvers.constants import UNKNOWNS
+from cadalign.solvers.projection import ray_derivatives
 
 SAME_SHAPE = 0.01
 """Distance below which two models count as the same shape."""
@@ -103,17 +103,11 @@ def _log_likelihoods(
     white = whitening_of(covariances.reshape(-1, 2, 2), rays, observed.camera)
     a, b, c = white.reshape(count, -1, 3)[:, rows].transpose(3, 0, 1, 2)  # (t, m, n) each
     columns = poses[:, :9].reshape(-1, 3, 3) * poses[:, None, 12:]
-    turned = points_3d @ columns.swapaxes(1, 2)
-    points_cam = turned + poses[:, None, 9:12]
-    by_scale = columns[:, None, :, 1:] * points_3d[:, :, None, 1:]
-    shifts = np.broadcast_to(np.eye(3), (*turned.shape, 3))
-    by_unknown = np.concatenate([by_rotation(turned), shifts, by_scale], axis=3)  # (m, n, 3, 8)
-    projected = points_cam[..., :2] / points_cam[..., 2:]
-    errors = projected - query.rays[rows]
-    derivatives = by_unknown[:, :, :2] - projected[..., None] * by_unknown[:, :, 2:]
-    derivatives /= points_cam[..., 2, None, None]
+    points_cam = points_3d @ columns.swapaxes(1, 2) + poses[:, None, 9:12]
+    errors = points_cam[..., :2] / points_cam[..., 2:] - query.rays[rows]
     free = np.flatnonzero(query.free)
-    u, v = derivatives[:, :, 0, free], derivatives[:, :, 1, free]
+    derivatives = np.array(list(map(ray_derivatives, points_3d, poses)))[..., free]
+    u, v = derivatives[:, :, 0], derivatives[:, :, 1]
     jacobian = np.concatenate([a[..., None] * u + b[..., None] * v, c[..., None] * v], axis=2)
     across, down = a * errors[..., 0] + b * errors[..., 1], c * errors[..., 1]
     stretches = np.zeros((len(rows), UNKNOWNS))

@@ -26,6 +26,7 @@ from cadalign.solvers.linalg import (
     cholesky,
     copy_into,
     expected_decrease,
+    mirror_upper,
     solve_cholesky,
 )
 from cadalign.solvers.search import are_same, cost_at, evaluate, move, room_of, score_of, solve
@@ -57,7 +58,7 @@ def room_for(unknowns: int) -> Equations:
     return Equations(
         np.empty((unknowns, unknowns)),
         np.empty(unknowns),
-        np.empty((UNKNOWNS + 1, 2 * BLOCK)),
+        np.empty((unknowns + 1, 2 * BLOCK)),
         np.empty((unknowns, unknowns)),
     )
 
@@ -87,17 +88,23 @@ def _room_of(objective: Objective) -> tuple[Equations, Equations]:
 @borrowing
 def evaluate_alignment(objective: Objective, pose: FloatArray, equations: Equations) -> float:
     """Build the Gauss-Newton system at a pose (15,); unit rows for unknowns that are not free."""
+    return write_equations(objective, None, pose, equations)
+
+
+@inlined
+def write_equations(
+    objective: Objective, slopes: FloatArray | None, pose: FloatArray, equations: Equations
+) -> float:
+    """Build the Gauss-Newton system; returns the cost. The ``slopes`` are as in `add_keypoints`."""
     hessian, gradient = equations.hessian, equations.gradient
     hessian[:] = 0.0
     gradient[:] = 0.0
-    cost = add_keypoints(objective.keypoints, pose, equations.rows, hessian, gradient)
+    cost = add_keypoints(objective.keypoints, slopes, pose, equations.rows, hessian, gradient)
     if not cost < np.inf:
         return np.inf
     cost += add_scale_prior(objective.scale_prior, pose, hessian, gradient)
-    for k in range(UNKNOWNS):
-        for m in range(k):
-            hessian[k, m] = hessian[m, k]
-    hold_fixed(objective.free, UNKNOWNS, hessian, gradient)
+    mirror_upper(hessian)
+    hold_fixed(objective.free, gradient.shape[0], hessian, gradient)
     return cost
 
 

@@ -1,7 +1,7 @@
 """Evidence about an alignment: each block adds its part to the cost and the normal equations.
 
 A block is a NamedTuple of its data with two kernels: one returns its cost at a pose, the other also
-adds J' W J to the upper triangle of a ``hessian`` (8, 8) and J' W r to a ``gradient`` (8,), in the
+adds J' W J to the upper triangle of a ``hessian`` (U, U) and J' W r to a ``gradient`` (U,), in the
 order of `cadalign.solvers.unknowns`. `cadalign.solvers.alignment` sums the blocks.
 """
 
@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import borrowing, fast_sums, inlined, kernel
+from cadalign.compile import borrowing, inlined, kernel
 from cadalign.solvers.constants import HUBER, LINEAR, UNKNOWNS, ScalePrior
-from cadalign.solvers.linalg import Triple, copy_into
+from cadalign.solvers.linalg import Triple, add_products, copy_into
 from cadalign.solvers.projection import Scalars, project_point, scalars_of, write_derivatives
 
 BLOCK = 32
@@ -55,6 +55,7 @@ class Views(NamedTuple):
 @inlined
 def add_keypoints(
     keypoints: KeypointEvidence,
+    slopes: FloatArray | None,
     pose: FloatArray,
     rows: FloatArray,
     hessian: FloatArray,
@@ -62,25 +63,28 @@ def add_keypoints(
 ) -> float:
     """Add the keypoints' part; returns its cost, infinite if a point lies behind the camera.
 
-    ``rows`` (9, 2 * BLOCK) is scratch space.
+    With ``slopes`` (n or 0, 2) of the rays by the log focal length, that is the last unknown.
+    ``rows`` (unknowns + 1, 2 * BLOCK) is scratch space.
     """
     cost = 0.0
     for start in range(0, keypoints.points.shape[0], BLOCK):
         size = min(BLOCK, keypoints.points.shape[0] - start)
-        cost += keypoint_rows(keypoints, pose, start, size, rows)
+        cost += _write_rows(keypoints, pose, start, size, rows)
         if not cost < np.inf:
             return np.inf
+        if slopes is not None:
+            _write_focal_row(keypoints, slopes, pose, start, size, rows)
         add_products(rows, 2 * size, hessian, gradient)
     return cost
 
 
 @borrowing
-def keypoint_rows(
+def _write_rows(
     keypoints: KeypointEvidence, pose: FloatArray, start: int, size: int, rows: FloatArray
 ) -> float:
     """Write whitened, loss-weighted derivatives and residuals of a block of points.
 
-    Row k < 8 of ``rows`` is unknown k, row 8 the residual; the block's u equations stand before
+    Row k < 8 of ``rows`` is unknown k, the last the residual; the block's u equations stand before
     its v equations. Returns the block's cost, infinite if a point lies behind the camera.
     """
     points, rays, whitening = keypoints.points, keypoints.rays, keypoints.whitening
@@ -88,6 +92,7 @@ def keypoint_rows(
     loss, loss_scale = keypoints.loss, keypoints.loss_scale
     each = whitening.shape[0] > 1
     weights = (whitening[0, 0], whitening[0, 1], whitening[0, 2])
+    last = rows.shape[0] - 1
     cost = 0.0
     nearest = np.inf
     for b in range(size):
@@ -95,26 +100,64 @@ def keypoint_rows(
         point = (points[i, 0], points[i, 1], points[i, 2])
         if each:
             weights = (whitening[i, 0], whitening[i, 1], whitening[i, 2])
-        ru, rv, depth = _residual(scalars, point, rays[i, 0], rays[i, 1], weights)
+        u, v, depth = project_point(scalars, point)
         nearest = min(nearest, depth)
-        part, root = loss_and_root(loss, loss_scale, ru * ru + rv * rv)
-        cost += part
-        weighted = (root * weights[0], root * weights[1], root * weights[2])
-        write_derivatives(scalars, point, weighted, rows, b, size + b)
-        rows[UNKNOWNS, b] = root * ru
-        rows[UNKNOWNS, size + b] = root * rv
+        seen = weigh_error(weights, u - rays[i, 0], v - rays[i, 1], loss, loss_scale)
+        cost += seen.cost
+        write_derivatives(scalars, point, seen.whitening, rows, b, size + b)
+        rows[last, b] = seen.u
+        rows[last, size + b] = seen.v
     return cost if nearest > 0 else np.inf
 
 
+@borrowing
+def _write_focal_row(
+    keypoints: KeypointEvidence,
+    slopes: FloatArray,
+    pose: FloatArray,
+    start: int,
+    size: int,
+    rows: FloatArray,
+) -> None:
+    """Write the derivatives of a block of points by the log focal length.
+
+    A longer focal length moves a point's image as a smaller depth does; the distance follows it.
+    """
+    points, whitening = keypoints.points, keypoints.whitening
+    scalars = scalars_of(pose)
+    for b in range(size):
+        i = start + b
+        _, _, depth = project_point(scalars, (points[i, 0], points[i, 1], points[i, 2]))
+        nearer = pose[11] - depth
+        by_u, by_v = rows[5, b] * nearer, rows[5, size + b] * nearer
+        if slopes.shape[0] > 0:
+            weights = whitening[i if whitening.shape[0] > 1 else 0]
+            root = rows[3, b] * depth / weights[0]  # of the loss's weight
+            by_u -= root * (weights[0] * slopes[i, 0] + weights[1] * slopes[i, 1])
+            by_v -= root * weights[2] * slopes[i, 1]
+        rows[UNKNOWNS, b], rows[UNKNOWNS, size + b] = by_u, by_v
+
+
+class Weighed(NamedTuple):
+    """Cost of an error of a ray, its whitened residual (u, v), and the whitening, with its loss.
+
+    The residual and the whitening are multiplied by the ``root`` of the weight that the loss gives.
+    """
+
+    cost: float
+    root: float
+    u: float
+    v: float
+    whitening: Triple
+
+
 @inlined
-def _residual(
-    pose: Scalars, point: Triple, u: float, v: float, weights: Triple
-) -> tuple[float, float, float]:
-    """Whitened residual of a point observed at (u, v), and its depth."""
-    projected_u, projected_v, depth = project_point(pose, point)
-    du = projected_u - u
-    dv = projected_v - v
-    return weights[0] * du + weights[1] * dv, weights[2] * dv, depth
+def weigh_error(weights: Triple, du: float, dv: float, loss: int, loss_scale: float) -> Weighed:
+    """Whiten an error (du, dv) of a ray, and weigh it by its loss."""
+    u, v = weights[0] * du + weights[1] * dv, weights[2] * dv
+    cost, root = loss_and_root(loss, loss_scale, u * u + v * v)
+    whitening = root * weights[0], root * weights[1], root * weights[2]
+    return Weighed(cost, root, root * u, root * v, whitening)
 
 
 @inlined
@@ -139,20 +182,6 @@ def fall_of_weight(loss: int, scale: float, root: float, square: float) -> float
     return -0.5 / square if loss == HUBER else -1.0 / (scale * scale)
 
 
-@fast_sums
-def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray) -> None:
-    """Add the rows' inner products to the upper triangle of J' W J and to J' W r."""
-    for k in range(UNKNOWNS):
-        for m in range(k, UNKNOWNS + 1):
-            total = 0.0
-            for c in range(columns):
-                total += rows[k, c] * rows[m, c]
-            if m < UNKNOWNS:
-                hessian[k, m] += total
-            else:
-                gradient[k] += total
-
-
 @inlined
 def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
     """Squared whitened residual of keypoint i; infinite behind the camera."""
@@ -160,8 +189,9 @@ def squared_error(keypoints: KeypointEvidence, pose: Scalars, i: int) -> float:
     w = i if whitening.shape[0] > 1 else 0
     weights = (whitening[w, 0], whitening[w, 1], whitening[w, 2])
     point = (points[i, 0], points[i, 1], points[i, 2])
-    ru, rv, depth = _residual(pose, point, rays[i, 0], rays[i, 1], weights)
-    return ru * ru + rv * rv if depth > 0 else np.inf
+    u, v, depth = project_point(pose, point)
+    square = weigh_error(weights, u - rays[i, 0], v - rays[i, 1], LINEAR, 1.0).cost
+    return square if depth > 0 else np.inf
 
 
 @borrowing

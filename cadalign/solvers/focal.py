@@ -30,20 +30,12 @@ from cadalign.solvers.alignment import (
     uncenter_covariance,
     with_keypoints,
     with_points,
+    write_equations,
 )
 from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, UNOBSERVABLE
-from cadalign.solvers.evidence import (
-    BLOCK,
-    KeypointEvidence,
-    LogFocalPrior,
-    add_products,
-    add_scale_prior,
-    focal_prior_cost,
-    keypoint_rows,
-)
+from cadalign.solvers.evidence import KeypointEvidence, LogFocalPrior, focal_prior_cost
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import affine_rows
-from cadalign.solvers.projection import project_point, scalars_of
 from cadalign.solvers.search import (
     are_same,
     cost_at,
@@ -54,7 +46,7 @@ from cadalign.solvers.search import (
     score_of,
     solve,
 )
-from cadalign.solvers.unknowns import hold_fixed, leaves_bounds, move_pose
+from cadalign.solvers.unknowns import leaves_bounds, move_pose
 
 _LARGEST_STEP = 0.5
 _SAME_FOCAL = 0.01
@@ -121,49 +113,15 @@ def _room_of(system: FocalObjective) -> tuple[Equations, Equations]:
 @kernel
 def evaluate_focal(system: FocalObjective, state: FloatArray, equations: Equations) -> float:
     """Build the Gauss-Newton system of all 9 unknowns; see `FocalObjective`."""
-    rows, hessian, gradient = equations.rows, equations.hessian, equations.gradient
+    hessian, gradient = equations.hessian, equations.gradient
     log_ratio = state[POSE_SIZE]
-    ratio = np.exp(log_ratio)
     here = at_focal(system.objective, system.slopes, log_ratio)
-    points, whitening = here.keypoints.points, here.keypoints.whitening
-    hessian[:] = 0.0
-    gradient[:] = 0.0
-    by_focal = np.empty(2 * BLOCK)
-    pose = scalars_of(state)
-    cost = 0.0
-    for start in range(0, points.shape[0], BLOCK):
-        size = min(BLOCK, points.shape[0] - start)
-        cost += keypoint_rows(here.keypoints, state, start, size, rows)
-        if not cost < np.inf:
-            return np.inf
-        add_products(rows, 2 * size, hessian, gradient)
-        for b in range(size):
-            i = start + b
-            _, _, depth = project_point(pose, (points[i, 0], points[i, 1], points[i, 2]))
-            # A longer focal length moves a point's image as a smaller depth does; the distance
-            # follows it.
-            nearer = state[11] - depth
-            by_focal[b], by_focal[size + b] = rows[5, b] * nearer, rows[5, size + b] * nearer
-            if system.slopes.shape[0] > 0:
-                weighted = whitening[i if whitening.shape[0] > 1 else 0]
-                root = rows[3, b] * depth / weighted[0]  # of the loss's weight
-                dx = root * system.slopes[i, 0] / ratio
-                dy = root * system.slopes[i, 1] / ratio
-                by_focal[b] -= weighted[0] * dx + weighted[1] * dy
-                by_focal[size + b] -= weighted[2] * dy
-        for c in range(2 * size):
-            for k in range(UNKNOWNS):
-                hessian[k, UNKNOWNS] += rows[k, c] * by_focal[c]
-            hessian[UNKNOWNS, UNKNOWNS] += by_focal[c] * by_focal[c]
-            gradient[UNKNOWNS] += rows[UNKNOWNS, c] * by_focal[c]
-    cost += add_scale_prior(system.objective.scale_prior, state, hessian, gradient)
+    cost = write_equations(here, system.slopes / np.exp(log_ratio), state, equations)
+    if not cost < np.inf:
+        return np.inf
     cost += focal_prior_cost(system.prior, log_ratio)
     hessian[UNKNOWNS, UNKNOWNS] += system.prior.weight
     gradient[UNKNOWNS] += system.prior.weight * (log_ratio - system.prior.center)
-    for k in range(UNKNOWNS + 1):
-        for m in range(k):
-            hessian[k, m] = hessian[m, k]
-    hold_fixed(system.objective.free, UNKNOWNS + 1, hessian, gradient)
     if leaves_bounds(log_ratio, system.prior.low, system.prior.high, gradient[UNKNOWNS]):
         gradient[UNKNOWNS] = 0.0
         for m in range(UNKNOWNS):

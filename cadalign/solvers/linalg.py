@@ -32,6 +32,32 @@ def triple(row: FloatArray) -> Triple:
     return row[0], row[1], row[2]
 
 
+@fast_sums
+def add_products(rows: FloatArray, columns: int, hessian: FloatArray, gradient: FloatArray) -> None:
+    """Add J' J to the upper triangle of ``hessian`` (U, U), and J' r to ``gradient`` (U,).
+
+    The first U ``rows`` are J', the next one r, in the first ``columns``.
+    """
+    unknowns = gradient.shape[0]
+    for k in range(unknowns):
+        for m in range(k, unknowns + 1):
+            total = 0.0
+            for c in range(columns):
+                total += rows[k, c] * rows[m, c]
+            if m < unknowns:
+                hessian[k, m] += total
+            else:
+                gradient[k] += total
+
+
+@inlined
+def mirror_upper(matrix: FloatArray) -> None:
+    """Copy the upper triangle of a matrix to the lower one."""
+    for k in range(matrix.shape[0]):
+        for m in range(k):
+            matrix[k, m] = matrix[m, k]
+
+
 @kernel
 def cholesky(matrix: FloatArray, size: int, floor: float) -> bool:
     """Replace the lower triangle of a symmetric matrix by its Cholesky factor.

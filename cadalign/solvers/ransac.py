@@ -127,7 +127,7 @@ def ransac_kernel(
             found = _solve_sample(view.keypoints, settings.minimal, sample, memory, candidates)
             hypotheses += found
             for k in range(found):
-                score, support, seen = _score_pose(
+                score, support, seen = score_pose(
                     view.keypoints,
                     candidates[k],
                     limit,
@@ -147,7 +147,7 @@ def ransac_kernel(
                     there, moved = _optimize_locally(
                         view, settings, relative_to(focal_prior, best_focal), trial
                     )
-                    score, support, _ = _score_pose(there.keypoints, trial, limit, np.inf, 0.0, 1.0)
+                    score, support, _ = score_pose(there.keypoints, trial, limit, np.inf, 0.0, 1.0)
                     if score < best:
                         best, best_support, best_view = score, support, there
                         best_focal += moved
@@ -200,7 +200,7 @@ def _solve_sample(
 
 
 @kernel
-def _score_pose(
+def score_pose(
     keypoints: KeypointEvidence,
     pose: FloatArray,
     limit: float,
@@ -297,7 +297,7 @@ def _finish(objective: Objective, threshold: float, best: float, pose: FloatArra
         if some.keypoints.points.shape[0] < 4:
             return best
         refine(some, _FINAL_ITERATIONS, trial)
-        score, inside, _ = _score_pose(objective.keypoints, trial, limit, np.inf, 0.0, 1.0)
+        score, inside, _ = score_pose(objective.keypoints, trial, limit, np.inf, 0.0, 1.0)
         if score > best * (1.0 + 1e-9):
             return best
         copy_into(pose, trial)

@@ -12,7 +12,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
-from cadalign.estimation.focal import USUAL, PriorOption
+from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.layers import FitTask, KeypointBatch, fits_of
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import prior_of
@@ -42,13 +42,13 @@ def fit(
     *,
     sigma: Tensor | float = 1.0,
     mask: Tensor | None = None,
-    loss: str = "linear",
-    loss_scale: float = 2.0,
-    stretch: str | None = None,
-    stretch_sigma: float | None = None,
-    known_axis: str = "x",
-    focal: str = "known",
-    focal_prior: PriorOption = USUAL,
+    loss: str = FitOptions.loss,
+    loss_scale: float = FitOptions.loss_scale,
+    stretch: str | None = FitOptions.stretch,
+    stretch_sigma: float | None = FitOptions.stretch_sigma,
+    known_axis: str = FitOptions.known_axis,
+    focal: str = FitOptions.focal,
+    focal_prior: PriorOption = FitOptions.focal_prior,
     exact: bool = True,
     workers: int = -1,
 ) -> PoseBatch:
@@ -175,8 +175,8 @@ def align(
     ids: Sequence[Hashable] | None = None,
     sigma: Tensor | float = 1.0,
     mask: Tensor | None = None,
-    loss: str = "linear",
-    loss_scale: float = 2.0,
+    loss: str = FitOptions.loss,
+    loss_scale: float = FitOptions.loss_scale,
     workers: int = -1,
 ) -> PoseBatch:
     """Align a learned shape to a batch of images, as `cadalign.align` does, with gradients.

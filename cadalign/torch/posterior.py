@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from cadalign.errors import InputError
-from cadalign.estimation.options import BOUNDING_PRIOR
+from cadalign.estimation.options import BOUNDING_PRIOR, FitOptions
 from cadalign.geometry.camera import Camera
 from cadalign.torch.poses import PoseBatch, calibrations, checked, expanded, torch
 
@@ -40,8 +40,8 @@ def posterior_loss(
     *,
     sigma: Tensor | float = 1.0,
     mask: Tensor | None = None,
-    loss: str = "linear",
-    loss_scale: float = 2.0,
+    loss: str = FitOptions.loss,
+    loss_scale: float = FitOptions.loss_scale,
     samples: int = 128,
     rounds: int = 2,
     seed: int = 0,

@@ -21,7 +21,7 @@ from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.annotate.ranking import advice_state
 from cadalign.annotate.session import Session
 from cadalign.annotate.suggestion import evidence_text, left_text, rank
-from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+from cadalign.estimation.uncertainty.next_best import Advice, rank_evidence
 from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long

@@ -23,7 +23,7 @@ from cadalign import (
 )
 from cadalign.annotate.photos import PhotoFile, intrinsics_of
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.uncertainty.advice import rank_evidence
+from cadalign.estimation.uncertainty.next_best import rank_evidence
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.retrieval.options import RetrievalOptions

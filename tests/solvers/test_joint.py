@@ -182,9 +182,7 @@ def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
     seed: int, poses: tuple[int, int], focals: int, spread: float, loss: int
 ) -> None:
     spread *= poses == (0, 0)  # displacements of several poses are modes
-    evidence = with_sightings_alone(
-        evidence_of(seed, spread=spread, poses=poses, loss=loss, focals=focals)
-    )
+    evidence = evidence_of(seed, spread=spread, poses=poses, loss=loss, focals=focals)
     state = state_of(seed, max(poses) + 1, focals)
     state.displacements[:] *= spread > 0
     evidence = seen_from(evidence, state)
@@ -217,13 +215,6 @@ def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
     plain = joint_room(evidence, 6, 0)
     evaluate(Joint(evidence, False), packed(state), plain)
     return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
-
-
-def with_sightings_alone(evidence: Evidence) -> Evidence:
-    return evidence._replace(
-        offsets=Offsets(*(column[:0] for column in evidence.offsets)),
-        planes=Planes(*(column[:0] for column in evidence.planes)),
-    )
 
 
 @pytest.mark.parametrize("poses", [(0, 0), (0, 1)])

@@ -14,7 +14,14 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import fast_sums, inlined, kernel
-from cadalign.solvers.linalg import copy_into, factorize, invert_factor, solve_factor
+from cadalign.solvers.linalg import (
+    add_products,
+    copy_into,
+    factorize,
+    invert_factor,
+    mirror_upper,
+    solve_factor,
+)
 
 _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 
@@ -109,32 +116,36 @@ def add_row(arrow: Arrow, pose: int, row: FloatArray, value: float) -> None:
                 arrow.border[k - 6, m] += slope * row[6 + m]
 
 
-@fast_sums
-def add_products(
-    arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: FloatArray
-) -> None:
+@inlined
+def add_slope(arrow: Arrow, pose: int, row: FloatArray) -> None:
+    """Add a derivative (6 + b,) by one pose and the border to the gradient."""
+    first, own = border_start(arrow), arrow.blocks.shape[1] * pose
+    for k in range(row.shape[0]):
+        arrow.gradient[own + k if k < 6 else first + k - 6] += row[k]
+
+
+@kernel
+def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: FloatArray) -> None:
     """Add the equations of a pose in the first ``columns`` of ``rows`` (6 + b + 1 or more, C).
 
     Row 6 + b holds the residuals; ``products`` (6 + b + 1, 6 + b + 1) is scratch space.
     """
     unknowns = 6 + arrow.border.shape[0]
     first, own, ahead = border_start(arrow), arrow.blocks.shape[1] * pose, ahead_of(arrow)
-    for k in range(unknowns):
-        for m in range(k, unknowns + 1):
-            total = 0.0
-            for c in range(columns):
-                total += rows[k, c] * rows[m, c]
-            products[k, m] = products[m, k] = total
+    matrix, right = products[:unknowns, :unknowns], products[unknowns, :unknowns]
+    products[:] = 0.0
+    add_products(rows, columns, matrix, right)
+    mirror_upper(matrix)
     for k in range(6):
-        arrow.gradient[own + k] += products[k, unknowns]
+        arrow.gradient[own + k] += right[k]
         for m in range(6):
-            arrow.blocks[pose, k, m] += products[k, m]
+            arrow.blocks[pose, k, m] += matrix[k, m]
         for m in range(unknowns - 6):
-            arrow.coupling[pose, k, ahead + m] += products[k, 6 + m]
+            arrow.coupling[pose, k, ahead + m] += matrix[k, 6 + m]
     for k in range(unknowns - 6):
-        arrow.gradient[first + k] += products[6 + k, unknowns]
+        arrow.gradient[first + k] += right[6 + k]
         for m in range(unknowns - 6):
-            arrow.border[k, m] += products[6 + k, 6 + m]
+            arrow.border[k, m] += matrix[6 + k, 6 + m]
 
 
 @inlined

@@ -13,7 +13,8 @@ row there, and d the camera's z over the depth, half the derivative by the point
 
     h_q = -((a_q . y_q) d + (d . y_q) a_q),
 
-and that by a turn ``X_i x h_q + y_q x a_q``; stretch and focal length scale the rows as well.
+and that by a turn ``X_i x h_q + y_q x a_q``; stretch and focal length scale the rows as well. The
+equations of directions, offsets and planes move with the coefficients alone.
 """
 
 from __future__ import annotations
@@ -24,9 +25,16 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
-from cadalign.solvers.joint.arrow import Arrow, border_start, empty_arrow
+from cadalign.solvers.joint.arrow import Arrow, add_slope, border_start, empty_arrow
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, unstretched
-from cadalign.solvers.joint.rows import count_equations, exp_of, first_scale, stretched_point
+from cadalign.solvers.joint.rows import (
+    count_block_equations,
+    count_equations,
+    exp_of,
+    first_scale,
+    stretched_point,
+    write_block_row,
+)
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
 from cadalign.solvers.projection import turn, turn_back
 
@@ -194,7 +202,42 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
     _write_rows(evidence, state, equations, left, by_model, response)
     solve_factor_rows(factor, response)
     _add_slopes(evidence, state, equations, left, by_model, response, np.empty((3, 4)))
+    if modes > 0:
+        _add_block_slopes(evidence, state, equations.arrow, factor)
     return volume
+
+
+@kernel
+def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: FloatArray) -> None:
+    """Add half the derivatives that directions, offsets and planes give.
+
+    A residual is linear in the coefficients, so that the derivative of its row by these, along
+    their response to it, is the change of the row as they move by the response.
+    """
+    first, total = 6 + first_scale(evidence) + 3, count_block_equations(evidence)
+    row, moved_row = np.empty(6 + arrow.border.shape[0]), np.empty(6 + arrow.border.shape[0])
+    response = np.empty((factor.shape[0], total))
+    for q in range(total):
+        equation = write_block_row(evidence, state, q, row)
+        for k in range(factor.shape[0]):
+            response[k, q] = equation.root * row[first + k]
+    solve_factor_rows(factor, response)
+    still = state.coefficients
+    moved = State(
+        state.poses, state.log_focals, state.log_scales, still.copy(), state.displacements
+    )
+    for q in range(total):
+        equation = write_block_row(evidence, state, q, row)
+        along = 0.0
+        for k in range(factor.shape[0]):
+            moved.coefficients[k] = still[k] + response[k, q]
+            along += equation.root * row[first + k] * response[k, q]
+        write_block_row(evidence, moved, q, moved_row)
+        # A weight of a loss falls where the residual grows.
+        fall = along * equation.fall * equation.root * equation.residual
+        for k in range(row.shape[0]):
+            moved_row[k] = equation.root * (moved_row[k] - row[k] + fall * row[k])
+        add_slope(arrow, equation.pose, moved_row)
 
 
 @kernel

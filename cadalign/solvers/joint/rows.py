@@ -1,17 +1,19 @@
 """Residuals of all evidence and their derivatives, which the normal equations are made of.
 
-Sightings write rows of one pose. Each other block, of priors, directions, offsets and planes, adds
-equations about one pose and the border, by `add_row`: a row (6 + b,) of derivatives by the pose,
-the log focals, the log scales and the coefficients, and a residual. Displacements don't count.
+Sightings write rows of one pose. Directions, offsets and planes are equations about one pose and
+the border: a row (6 + b,) of derivatives by the pose, the log focals, the log scales and the
+coefficients, and a residual, which is linear in the coefficients. Displacements don't count.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, inlined, kernel
-from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root
+from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
 from cadalign.solvers.joint.arrow import Arrow, add_row, border_start
 from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State, unstretched
 from cadalign.solvers.linalg import Triple, cross, dot, triple
@@ -81,21 +83,21 @@ def write_rows(
         by_log_u, by_log_w = ratio * u - sightings.slopes[n, 0], ratio * w - sightings.slopes[n, 1]
         du = ratio * u - sightings.rays[n, 0] - log_ratio * sightings.slopes[n, 0]
         dw = ratio * w - sightings.rays[n, 1] - log_ratio * sightings.slopes[n, 1]
-        a, b, c = sightings.whitening[n, 0], sightings.whitening[n, 1], sightings.whitening[n, 2]
-        weight = sightings.depths[n, 1]
-        ru, rw, rz = a * du + b * dw, c * dw, weight * (depth - sightings.depths[n, 0])
         loss, loss_scale = sightings.loss[n], sightings.loss_scale[n]
-        part, root = loss_and_root(loss, loss_scale, ru * ru + rw * rw)
+        error = weigh_error(triple(sightings.whitening[n]), du, dw, loss, loss_scale)
+        a, b, c = error.whitening
+        weight = sightings.depths[n, 1]
+        rz = weight * (depth - sightings.depths[n, 0])
         depth_part, depth_root = loss_and_root(loss, loss_scale, rz * rz)
-        cost += part + depth_part
-        by_u, by_w = ray_slopes(place, (ratio * root * a, ratio * root * b, ratio * root * c))
+        cost += error.cost + depth_part
+        by_u, by_w = ray_slopes(place, (ratio * a, ratio * b, ratio * c))
         counts = True, c > 0.0, weight > 0.0
         slopes = by_u, by_w, (0.0, 0.0, depth_root * weight)
-        residuals = root * ru, root * rw, depth_root * rz
-        fall = fall_of_weight(loss, loss_scale, root, root * root * (ru * ru + rw * rw))
-        depth_fall = fall_of_weight(loss, loss_scale, depth_root, depth_root**2 * rz * rz)
+        residuals = error.u, error.v, depth_root * rz
+        fall = fall_of_weight(loss, loss_scale, error.root, error.u**2 + error.v**2)
+        depth_fall = fall_of_weight(loss, loss_scale, depth_root, residuals[2] ** 2)
         falls = fall, fall, depth_fall
-        by_focal = root * (a * by_log_u + b * by_log_w), root * c * by_log_w, 0.0
+        by_focal = a * by_log_u + b * by_log_w, c * by_log_w, 0.0
         for q in range(3):
             if not counts[q]:
                 continue
@@ -127,9 +129,12 @@ def write_rows(
 def add_blocks(evidence: Evidence, state: State, arrow: Arrow) -> float:
     """Add all evidence but sightings; returns its cost."""
     cost = _add_priors(evidence, state, arrow)
-    cost += _add_directions(evidence, state, arrow)
-    cost += _add_offsets(evidence, state, arrow)
-    cost += _add_planes(evidence, state, arrow)
+    row = np.empty(6 + arrow.border.shape[0])
+    for q in range(count_block_equations(evidence)):
+        equation = write_block_row(evidence, state, q, row)
+        cost += equation.cost
+        row *= equation.root
+        add_row(arrow, equation.pose, row, equation.root * equation.residual)
     return cost
 
 
@@ -187,111 +192,132 @@ def _add_priors(evidence: Evidence, state: State, arrow: Arrow) -> float:
     return cost
 
 
+class BlockEquation(NamedTuple):
+    """An equation about one pose and the border: its whitened residual and the loss on that.
+
+    The loss gives the ``cost``, the ``root`` of the residual's weight, and `fall_of_weight`.
+    """
+
+    pose: int
+    residual: float
+    cost: float
+    root: float
+    fall: float
+
+
+@inlined
+def count_block_equations(evidence: Evidence) -> int:
+    """Number of the equations that `write_block_row` writes."""
+    directions, offsets, planes = evidence.directions, evidence.offsets, evidence.planes
+    return int(3 * directions.image.shape[0] + offsets.value.shape[0] + planes.point.shape[0])
+
+
 @kernel
-def _add_directions(evidence: Evidence, state: State, arrow: Arrow) -> float:
-    """Add directions known in a camera, such as gravity.
+def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -> BlockEquation:
+    """Write derivatives (6 + b,) of the residual of direction, offset or plane number ``q``.
+
+    Directions come first, with three equations each.
+    """
+    row[:] = 0.0
+    offset = q - 3 * evidence.directions.image.shape[0]
+    plane = offset - evidence.offsets.value.shape[0]
+    if plane >= 0:
+        pose, residual = _write_plane(evidence, state, plane, row)
+        loss, loss_scale = evidence.planes.loss[plane], evidence.planes.loss_scale[plane]
+        cost, root = loss_and_root(loss, loss_scale, residual * residual)
+        fall = fall_of_weight(loss, loss_scale, root, root * root * residual * residual)
+        return BlockEquation(pose, residual, cost, root, fall)
+    if offset >= 0:
+        pose, residual = _write_offset(evidence, state, offset, row)
+    else:
+        pose, residual = _write_direction(evidence, state, q // 3, q % 3, row)
+    return BlockEquation(pose, residual, residual * residual, 1.0, 0.0)
+
+
+@inlined
+def _write_direction(
+    evidence: Evidence, state: State, d: int, w: int, row: FloatArray
+) -> tuple[int, float]:
+    """Write equation w of a direction known in a camera, such as gravity; pose and residual.
 
     The residual is the whitened difference of two unit vectors: its length is 2 sin(angle / 2).
     """
     directions, rig = evidence.directions, evidence.rig
-    row = np.zeros(6 + arrow.border.shape[0])
-    cost = 0.0
-    for d in range(directions.image.shape[0]):
-        v = directions.image[d]
-        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-        rotated = turn(pose, triple(directions.model[d]))
-        (x, y, z), known = turn(camera, rotated), directions.camera[d]
-        for w in range(3):
-            whitening = triple(directions.whitening[d, w])
-            value = dot(whitening, (x - known[0], y - known[1], z - known[2]))
-            cost += value * value
-            row[0], row[1], row[2] = cross(rotated, turn_back(camera, whitening))
-            add_row(arrow, rig.pose[v], row, value)
-    return cost
+    v = directions.image[d]
+    camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+    rotated = turn(pose, triple(directions.model[d]))
+    (x, y, z), known = turn(camera, rotated), directions.camera[d]
+    whitening = triple(directions.whitening[d, w])
+    row[0], row[1], row[2] = cross(rotated, turn_back(camera, whitening))
+    return rig.pose[v], dot(whitening, (x - known[0], y - known[1], z - known[2]))
 
 
-@kernel
-def _add_offsets(evidence: Evidence, state: State, arrow: Arrow) -> float:
-    """Add known distances along directions of the model.
+@inlined
+def _write_offset(evidence: Evidence, state: State, j: int, row: FloatArray) -> tuple[int, float]:
+    """Write the equation of a known distance along a direction of the model; pose and residual.
 
     A camera's place in the model's frame is ``-R' q``, with the pose (R, t), the camera's (C, c) in
     the rig and ``q = t + C' c``: along the direction d it is ``-(R d) . q``.
     """
     offsets, rig = evidence.offsets, evidence.rig
-    row = np.empty(6 + arrow.border.shape[0])
-    cost = 0.0
-    for j in range(offsets.value.shape[0]):
-        v, weight = offsets.image[j], offsets.weight[j]
-        p = 0 if v < 0 else rig.pose[v]
-        value = -offsets.value[j]
-        row[:] = 0.0
-        for end in range(2):
-            sign = 2.0 * end - 1.0
-            i = offsets.ends[j, end]
-            if i < 0:
-                camera, pose = rig.cam_from_rig[v], state.poses[p]
-                turned = turn(pose, triple(offsets.direction[j]))
-                q = shift(pose, turn_back(camera, triple(camera[9:])))
-                value -= sign * dot(turned, q)
-                by_turn = cross(turned, q)
-                for r in range(3):
-                    row[r] = -sign * weight * by_turn[r]
-                    row[3 + r] = -sign * weight * turned[r]
-                continue
-            for a in range(3):
-                along = sign * offsets.direction[j, a]
-                if along != 0.0:
-                    stretched = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
-                    value += along * stretched
-                    _add_shape(evidence, state, i, a, weight * along, row)
-        value *= weight
-        cost += value * value
-        add_row(arrow, p, row, value)
-    return cost
+    v, weight = offsets.image[j], offsets.weight[j]
+    p = 0 if v < 0 else rig.pose[v]
+    value = -offsets.value[j]
+    for end in range(2):
+        sign = 2.0 * end - 1.0
+        i = offsets.ends[j, end]
+        if i < 0:
+            camera, pose = rig.cam_from_rig[v], state.poses[p]
+            turned = turn(pose, triple(offsets.direction[j]))
+            q = shift(pose, turn_back(camera, triple(camera[9:])))
+            value -= sign * dot(turned, q)
+            by_turn = cross(turned, q)
+            for r in range(3):
+                row[r] = -sign * weight * by_turn[r]
+                row[3 + r] = -sign * weight * turned[r]
+            continue
+        for a in range(3):
+            along = sign * offsets.direction[j, a]
+            if along != 0.0:
+                stretched = np.exp(state.log_scales[a]) * _undisplaced(evidence, state, i, a)
+                value += along * stretched
+                _add_shape(evidence, state, i, a, weight * along, row)
+    return p, value * weight
 
 
-@kernel
-def _add_planes(evidence: Evidence, state: State, arrow: Arrow) -> float:
-    """Add points that lie in planes known in a camera.
+@inlined
+def _write_plane(evidence: Evidence, state: State, j: int, row: FloatArray) -> tuple[int, float]:
+    """Write the equation of a point in a plane known in a camera; pose and residual.
 
     The residual is ``normal . X / normal . ray - depth`` of the point X in the camera's frame, the
     depth at which the ray meets the plane through it.
     """
     planes, rig = evidence.planes, evidence.rig
-    row = np.empty(6 + arrow.border.shape[0])
     scale = exp_of(state.log_scales)
-    cost = 0.0
-    for j in range(planes.point.shape[0]):
-        v, i = planes.image[j], planes.point[j]
-        camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-        x, y, z = triple(planes.normal[j])
-        group = evidence.focals.group[v]
-        tilt = x * planes.ray[j, 0] + y * planes.ray[j, 1]
-        if group >= 0:
-            tilt *= np.exp(-state.log_focals[group])
-        along = z + tilt
-        normal = x / along, y / along, z / along
-        point = (
-            scale[0] * _undisplaced(evidence, state, i, 0),
-            scale[1] * _undisplaced(evidence, state, i, 1),
-            scale[2] * _undisplaced(evidence, state, i, 2),
-        )
-        rotated = turn(pose, point)
-        met = dot(normal, shift(camera, turn(camera, shift(pose, rotated))))
-        value = (met - planes.depth[j]) * planes.weight[j]
-        part, root = loss_and_root(planes.loss[j], planes.loss_scale[j], value * value)
-        cost += part
-        weight = root * planes.weight[j]
-        by_rig = turn_back(camera, (weight * normal[0], weight * normal[1], weight * normal[2]))
-        by_turn, by_model = cross(rotated, by_rig), turn_back(pose, by_rig)
-        row[:] = 0.0
-        if group >= 0:
-            row[6 + group] = weight * met * tilt / along
-        for k in range(3):
-            row[k], row[3 + k] = by_turn[k], by_rig[k]
-            _add_shape(evidence, state, i, k, by_model[k], row)
-        add_row(arrow, rig.pose[v], row, root * value)
-    return cost
+    v, i, weight = planes.image[j], planes.point[j], planes.weight[j]
+    camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
+    x, y, z = triple(planes.normal[j])
+    group = evidence.focals.group[v]
+    tilt = x * planes.ray[j, 0] + y * planes.ray[j, 1]
+    if group >= 0:
+        tilt *= np.exp(-state.log_focals[group])
+    along = z + tilt
+    normal = x / along, y / along, z / along
+    point = (
+        scale[0] * _undisplaced(evidence, state, i, 0),
+        scale[1] * _undisplaced(evidence, state, i, 1),
+        scale[2] * _undisplaced(evidence, state, i, 2),
+    )
+    rotated = turn(pose, point)
+    met = dot(normal, shift(camera, turn(camera, shift(pose, rotated))))
+    by_rig = turn_back(camera, (weight * normal[0], weight * normal[1], weight * normal[2]))
+    by_turn, by_model = cross(rotated, by_rig), turn_back(pose, by_rig)
+    if group >= 0:
+        row[6 + group] = weight * met * tilt / along
+    for k in range(3):
+        row[k], row[3 + k] = by_turn[k], by_rig[k]
+        _add_shape(evidence, state, i, k, by_model[k], row)
+    return rig.pose[v], (met - planes.depth[j]) * weight
 
 
 @inlined

@@ -8,7 +8,8 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import fast_sums
-from cadalign.solvers.constants import UNKNOWNS, ScalePrior
+from cadalign.solvers.constants import LINEAR, UNKNOWNS, ScalePrior
+from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed, unpacked
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
 from cadalign.solvers.optimal import optimal_batch, widen_by_shape
@@ -97,35 +98,24 @@ def score_state(evidence: Evidence, state: State) -> float:
     return float(joint_score(Joint(reduction.evidence, False), row, 0.0))
 
 
-class ViewRays(NamedTuple):
-    """Keypoints of one view: points (n, 3) of the mean, rays (n, 2), and whitening (n, 3).
-
-    ``rows`` (n,) are their numbers among all sightings.
-    """
-
-    points: FloatArray
-    rays: FloatArray
-    whitening: FloatArray
-    rows: IntArray
-
-
-def rays_in(evidence: Evidence, view: int) -> ViewRays:
-    """One view's keypoints, the shape's uncertainty in their whitening."""
+def keypoints_of(evidence: Evidence, view: int) -> KeypointEvidence:
+    """One view's keypoints of the mean shape, whose uncertainty is in their whitening."""
     sightings, shape = evidence.sightings, evidence.shape
     rows = np.flatnonzero((sightings.image == view) & (sightings.whitening[:, 2] > 0))
     point = sightings.point[rows]
-    given = ViewRays(shape.mean[point], sightings.rays[rows], sightings.whitening[rows], rows)
+    points, rays, whitening = shape.mean[point], sightings.rays[rows], sightings.whitening[rows]
+    if not len(rows):
+        return KeypointEvidence(points, rays, whitening, LINEAR, 1.0)
     variances = shape.spread[point] ** 2 + (shape.modes[:, point] ** 2).sum(axis=(0, 2)) / 3
-    if len(rows):
-        widen_by_shape(given.points, given.rays, variances, given.whitening)
-    return given
+    widen_by_shape(points, rays, variances, whitening)
+    loss, loss_scale = int(sightings.loss[rows[0]]), float(sightings.loss_scale[rows[0]])
+    return KeypointEvidence(points, rays, whitening, loss, loss_scale)
 
 
 def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
     """Camera poses (S, 12) and log scales (S, 3) from one view's keypoints, the likeliest first."""
-    given = rays_in(evidence, view)
-    sightings, scales = evidence.sightings, evidence.scales
-    if len(given.rows) < _LEAST_POINTS:
+    given, scales = keypoints_of(evidence, view), evidence.scales
+    if len(given.points) < _LEAST_POINTS:
         return np.empty((0, 12)), np.empty((0, 3))
     # The solvers' first axis is one whose scale is known; the order of the others is cyclic, since
     # it must not be a reflection.
@@ -136,9 +126,9 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
         np.ascontiguousarray(given.points[:, order]),
         given.rays,
         given.whitening,
-        np.array([0, len(given.rows)]),
-        int(sightings.loss[given.rows[0]]),
-        sightings.loss_scale[given.rows[:1]],
+        np.array([0, len(given.points)]),
+        given.loss,
+        np.array([given.loss_scale]),
         np.array([prior.weight]),
         float(prior.width),
         np.append(np.ones(UNKNOWNS - 2), scales.free[order[1:]]),

@@ -17,7 +17,7 @@ from cadalign.compile import inlined, kernel
 from cadalign.solvers.evidence import score_of_distance, whole_information
 from cadalign.solvers.joint.arrow import (
     Arrow,
-    add_products,
+    add_rows,
     border_start,
     clear,
     copy_matrix,
@@ -106,7 +106,7 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
         seen += columns
         if poses == 1:
             cost += eliminate(evidence, state, equations)
-        add_products(arrow, p, equations.rows, columns, equations.products)
+        add_rows(arrow, p, equations.rows, columns, equations.products)
     cost += add_blocks(evidence, state, arrow)
     if system.integrates:
         volume = add_log_determinant(evidence, state, equations)

@@ -35,10 +35,10 @@ from cadalign.solvers.evidence import (
     KeypointEvidence,
     fall_of_weight,
     keypoint_cost,
-    loss_and_root,
     score_of_distance,
+    weigh_error,
 )
-from cadalign.solvers.linalg import cholesky, copy_into, dot
+from cadalign.solvers.linalg import add_products, cholesky, copy_into, dot, mirror_upper, triple
 from cadalign.solvers.marginal.problem import (
     GaussianTarget,
     Seen,
@@ -181,10 +181,14 @@ def evaluate_posed(system: Posed, state: FloatArray, equations: PosedEquations) 
         _write_slopes(system, state, equations)
         _shift_mean(system, state, equations)
     whiten(equations.factor, equations.rows)
-    _write_products(equations.rows, equations.normal.hessian, equations.gradient)
+    hessian, gradient = equations.normal.hessian, equations.gradient
+    hessian[:] = 0.0
+    gradient[:] = 0.0
+    add_products(equations.rows, equations.rows.shape[1], hessian, gradient)
+    mirror_upper(hessian)
     if system.integrates:
         for k in range(POSE_UNKNOWNS):
-            equations.gradient[k] += equations.turned[k]
+            gradient[k] += equations.turned[k]
     return cost
 
 
@@ -208,18 +212,16 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
         place = see(shift(motion, turned))
         if not place[2] > 0:
             return np.inf
-        a, b, c = seen.whitening[i, 0], seen.whitening[i, 1], seen.whitening[i, 2]
         du, dv = place[0] - seen.rays[i, 0], place[1] - seen.rays[i, 1]
-        ru, rv = a * du + b * dv, c * dv
-        part, root = loss_and_root(seen.loss, seen.loss_scale, ru * ru + rv * rv)
-        cost += part
-        own = root * root * (ru * ru + rv * rv)
+        error = weigh_error(triple(seen.whitening[i]), du, dv, seen.loss, seen.loss_scale)
+        cost += error.cost
+        own = error.u * error.u + error.v * error.v
         square += own
         points[i, 0] = place[2]
-        fall = fall_of_weight(seen.loss, seen.loss_scale, root, own)
-        points[i, 1], points[i, 2] = fall * root * ru, fall * root * rv
-        slopes = ray_slopes(place, (root * a, root * b, root * c))
-        residuals = root * ru, root * rv
+        fall = fall_of_weight(seen.loss, seen.loss_scale, error.root, own)
+        points[i, 1], points[i, 2] = fall * error.u, fall * error.v
+        slopes = ray_slopes(place, error.whitening)
+        residuals = error.u, error.v
         for q in range(2):
             column = 2 * i + q
             write_motion(turned, slopes[q], rows, column)
@@ -228,20 +230,6 @@ def _write_rows(system: Posed, state: FloatArray, equations: PosedEquations) -> 
             rows[_RESIDUAL, column] = residuals[q] - dot(by_point, offset)
     equations.sums[0] = square + prior
     return cost + prior
-
-
-@fast_sums
-def _write_products(rows: FloatArray, hessian: FloatArray, gradient: FloatArray) -> None:
-    """Write the normal equations of whitened rows."""
-    for k in range(POSE_UNKNOWNS):
-        for m in range(k, POSE_UNKNOWNS + 1):
-            total = 0.0
-            for c in range(rows.shape[1]):
-                total += rows[k, c] * rows[m, c]
-            if m < POSE_UNKNOWNS:
-                hessian[k, m] = hessian[m, k] = total
-            else:
-                gradient[k] = total
 
 
 @fast_sums

@@ -10,7 +10,7 @@ from support.refusals import refusal_text
 from support.scenes import CAMERA, around, in_camera, keypoints, rig, seen, truth_of
 
 from cadalign import Alignment, Mesh, Model, ShapeModel, Size, View, align
-from cadalign.estimation.uncertainty.advice import Advice, rank_evidence
+from cadalign.estimation.uncertainty.next_best import Advice, rank_evidence
 from cadalign.render import Scene, cast_geometry
 
 POINTS = keypoints(8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,17 @@ def test_a_size_that_one_image_leaves_open_is_not_warned_of() -> None:
     apart = deviations(np.diag(common**2))
     texts = weaknesses_of_keypoints(points, POSE, apart, **given)
     assert [text[:3] for text in texts] == ["s_y", "s_z"]
+
+
+def test_keypoints_beyond_their_sigma_are_warned_of_beside_other_evidence() -> None:
+    """By a number, where no piece contradicts the others; not where their sigma is right."""
+    for noise, sigma in ((4.0, 1.0), (1.0, 1.0), (4.0, 4.0)):
+        problem = problem_of(4, points=14, noise_px=noise)
+        up = problem.alignment.rotation[:, 1]
+        view = View(problem.camera, problem.points_2d, sigma=sigma, up=up, up_sigma_deg=1.0)
+        told = align(Model(points_3d=problem.points_3d), view).warnings
+        warned = [text for text in told if re.search(r"residuals are \S+ times as large", text)]
+        assert len(warned) == (noise > sigma)
 
 
 def test_fit_names_another_pose_that_its_deviations_do_not_reach() -> None:

@@ -13,6 +13,7 @@ from cadalign.estimation.contours.contour import (
     SPACING,
     Contour,
     contour_of,
+    crossings,
     mask_contour,
 )
 from cadalign.estimation.contours.view_contour import (
@@ -127,3 +128,13 @@ def test_an_offset_has_the_deviation_that_its_own_place_shows(
     assert learned.offset == pytest.approx(max(np.sqrt(max(place**2 - 0.36, 0.0)), 0.1))
     assert moved[0, 0] * learned.offset == pytest.approx(own[0, 0])
     assert moved[0, 1:] == pytest.approx(own[0, 1:])
+
+
+@pytest.mark.parametrize("shift", [-0.3, -0.1, 0.1, 0.3])
+def test_the_nearest_of_two_lines_is_taken_on_either_side(shift: float) -> None:
+    """Lines at which the level falls along the normal, beside an offset from the point."""
+    columns = np.where(np.isin(np.arange(40), [*range(20), 21]), 1.0, 0.0)
+    level = np.tile(columns.astype(np.float32), (5, 1))  # falls at 19.5 and 21.5
+    place, normal = np.array([[18.5 + shift, 2.0]]), np.array([[1.0, 0.0]])
+    found = crossings(level, place, normal, np.array([2.0]))
+    assert found == pytest.approx([(19.5 if shift < 0 else 21.5) - place[0, 0]], abs=0.02)

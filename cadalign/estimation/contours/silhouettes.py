@@ -40,8 +40,8 @@ _CELL_VARIANCE = 1e-3  # that every silhouette has at least
 _CUT_EVERY = 2  # directions, of which the silhouettes are cut
 _CUT_SHARES = (0.15, 0.3)  # of the area that lies beyond a line
 _CUT_ANGLES = 12
-_OUTLINE_CELLS = 40
-_OUTLINE_EVERY = 2  # directions, and rings and turns
+_OUTLINE_CELLS = 60
+_OUTLINE_EVERY = 2  # directions
 _LINE_ANGLES = 16  # of what hides a part
 _HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
 _LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
@@ -110,15 +110,8 @@ def atlas_of(mesh: Mesh, *, is_cut: bool = False) -> Atlas:
 
 
 def outline_of(mesh: Mesh) -> Whitened:
-    """Coarse silhouettes of a mesh, to be compared with many others' by `coarse` ones."""
-    return coarse(_atlas(mesh, _OUTLINE_EVERY, _uncut, cells=_OUTLINE_CELLS).views)
-
-
-def coarse(views: Whitened) -> Whitened:
-    """Silhouettes with fewer rings and turns: means of neighbours."""
-    count, rings, turns = len(views.rings), _RINGS // _OUTLINE_EVERY, _TURNS // _OUTLINE_EVERY
-    parts = views.rings.reshape(count, rings, _OUTLINE_EVERY, turns, _OUTLINE_EVERY)
-    return views._replace(rings=np.rint(parts.mean(axis=(2, 4))).astype(np.uint8))
+    """The silhouettes of a mesh along fewer directions, to be compared with many others'."""
+    return _atlas(mesh, _OUTLINE_EVERY, _uncut, cells=_OUTLINE_CELLS).views
 
 
 def _atlas(
@@ -248,9 +241,9 @@ def resembling_poses(
 
 
 def outline_of_mask(mask: FloatArray | BoolArray, camera: Camera) -> Whitened:
-    """A mask (h, w) in the form of the outlines of `cadalign.estimation.contours.silhouettes`."""
+    """The silhouette of a mask (h, w), to be compared with those of `outline_of`."""
     view = _facing(mask, camera)
-    return coarse(whitened(view.image, view.corner, view.cell))
+    return whitened(view.image, view.corner, view.cell)
 
 
 class _Facing(NamedTuple):

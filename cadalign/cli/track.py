@@ -166,9 +166,11 @@ class TrackCommand(CameraOptions):
                 continue
             found.append(FoundTrack(track, result, nearest_mesh(result)))
             inliers = int(result.inliers.sum())
+            shares = [each.share for each in result.evidence if each.kind == "photo"]
+            pictures = f", {sum(map(bool, shares))} of {len(shares)} pictures" if shares else ""
             answer(
                 f"track {track.name}: {len(track.views)} frames, {inliers} of "
-                f"{len(result.inliers)} keypoints, rms {result.rms:.3g} px"
+                f"{len(result.inliers)} keypoints, rms {result.rms:.3g} px{pictures}"
             )
         return found, failures
 

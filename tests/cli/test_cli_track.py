@@ -152,7 +152,7 @@ def test_a_video_of_another_size_is_refused(
 
 
 @pytest.mark.long
-def test_pictures_are_evidence(tmp_path: Path) -> None:
+def test_pictures_are_evidence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A car that turns before a grey wall, with rough keypoints."""
     dataset = KeypointNet(write_sample_dataset(tmp_path / "sample", per_category=5))
     cars = [dataset[key] for key in sorted(dataset.ids()) if key[0] == "car"]
@@ -184,6 +184,7 @@ def test_pictures_are_evidence(tmp_path: Path) -> None:
         pairs = zip(poses, truths, strict=True)
         errors.append(np.mean([angle_between(est, truth.rotation) for est, truth in pairs]))
     assert errors[1] < 0.9 * errors[0], errors
+    assert re.search(r"rms .* px, [456] of 6 pictures", capsys.readouterr().out)
 
 
 def test_csv_with_tracks_is_read(video: tuple[Path, list[SimulatedTrack]], tmp_path: Path) -> None:

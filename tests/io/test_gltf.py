@@ -17,6 +17,7 @@ from support.timing import reference_seconds, timed
 from cadalign.datasets import load_mesh
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.meshes.materials import WHITE
 
 VIEWS = [
     {"buffer": 0, "byteLength": 48},
@@ -70,6 +71,17 @@ def test_nodes_are_placed_from_the_root_down(tmp_path: Path) -> None:
 )
 def test_lists_strips_and_fans(tmp_path: Path, mode: int, expected: list[list[int]]) -> None:
     assert read(tmp_path, meshes=primitive(mode=mode)).faces.tolist() == expected
+
+
+def test_colours_of_vertices_without_a_material_are_not_tinted(tmp_path: Path) -> None:
+    """Nor are grey surfaces without either made white."""
+    colored = read(tmp_path, meshes=primitive(attributes={"POSITION": 0, "COLOR_0": 0}))
+    assert colored.vertex_colors is not None
+    np.testing.assert_allclose(colored.vertex_colors[:, :2], SQUARE[:, :2])
+    assert colored.materials[0].color == WHITE
+    plain = read(tmp_path, meshes=primitive())
+    assert plain.vertex_colors is None
+    assert plain.materials[0].color != WHITE
 
 
 @pytest.mark.parametrize("mode", [0, 1, 3])

@@ -318,3 +318,13 @@ def test_scores_without_ransac_are_refused() -> None:
         run(problems, scores=[np.ones(8), np.ones(9)])
     with pytest.raises(InputError, match="scores: 2 problems but 1 sets"):
         run(problems, scores=[np.ones(8)], ransac=RansacOptions())
+
+
+@pytest.mark.parametrize("fewer", ["points_3d", "points_2d"])
+def test_arrays_of_problems_with_unequal_numbers_of_points_are_refused(fewer: str) -> None:
+    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+    models = np.random.default_rng(0).uniform(-1, 1, (3, 8, 3))
+    images = camera.project((models + [0, 0, 5]).reshape(-1, 3)).reshape(3, 8, 2)
+    models, images = (models[:, :7], images) if fewer == "points_3d" else (models, images[:, :7])
+    with pytest.raises(InputError, match=r"points_2d\[0\]: . model points but . image points"):
+        fit_batch(models, images, camera)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -100,11 +101,11 @@ def errors_of_fit(problem: Problem, rng: np.random.Generator, **options: Any) ->
 @pytest.mark.parametrize(
     ("count", "options"),
     [
-        (500, {}),
-        (150, {"loss": "cauchy"}),
-        (150, {"loss": "huber"}),
-        (30, {"focal": "estimate"}),
-        (100, {"stretch": "y", "known_axis": "z", "stretch_sigma": 0.1}),
+        (120, {}),
+        (50, {"loss": "cauchy"}),
+        (50, {"loss": "huber"}),
+        (20, {"focal": "estimate"}),
+        (40, {"stretch": "y", "known_axis": "z", "stretch_sigma": 0.1}),
     ],
     ids=lambda value: str(value),
 )
@@ -140,6 +141,7 @@ FISHEYE = Camera(640, 480, 300, 300, 319.5, 239.5, (0.02, -0.01, 0.0, 0.0), lens
 N = 9
 
 
+@cache
 def learned(n: int) -> tuple[ShapeModel, np.ndarray]:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (n, 3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -159,6 +160,7 @@ def test_gauss_newton_gradients_are_near_those_of_the_hessian() -> None:
     np.testing.assert_allclose(both[0], both[1], rtol=0.05, atol=1e-2)
 
 
+@cache
 def shapes(n: int = 9) -> tuple[ShapeModel, Any, Camera]:
     """A learned shape, images (B, n, 2) of objects, and the camera."""
     rng = np.random.default_rng(0)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser
 from support.annotating import Case, make_case, served
 from support.panels import AXE, WATCH_SHIFTS, Keyboard, open_page, prepare, shifts
 from support.web import axe_script
@@ -15,11 +16,13 @@ from cadalign.datasets import write_sample_dataset
 
 DESKTOP, PHONE = (1440, 900), (390, 844)
 SERIOUS = ("serious", "critical")
+COLOURS = ["color-contrast", "link-in-text-block"]
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return write_sample_dataset(tmp_path_factory.mktemp("data") / "sample", per_category=3)
+    folder = tmp_path_factory.mktemp("data") / "sample"
+    return write_sample_dataset(folder, per_category=3, categories=["chair"])
 
 
 @pytest.fixture(scope="module")
@@ -27,56 +30,57 @@ def original(root: Any, tmp_path_factory: pytest.TempPathFactory) -> Case:
     return make_case(root, tmp_path_factory.mktemp("annotate"))
 
 
-@pytest.fixture
-def address(case: Case, root: Any) -> Iterator[str]:
-    with served(prepare(case, root)) as access:
-        yield access.url
+@dataclass(frozen=True)
+class Used:
+    """What a session of keys alone met in a window of one size, in both colour schemes."""
+
+    visited: list[str]
+    errors: list[str]
+    moved: list[dict[str, Any]]
+    found: dict[str, Any]
 
 
-def opened(
-    browser: Browser, address: str, size: tuple[int, int], scheme: str, *scripts: str
-) -> Page:
-    width, height = size
-    return open_page(browser, address, width=width, height=height, scheme=scheme, scripts=scripts)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("size", "scheme"), [(DESKTOP, "light"), (PHONE, "dark")])
-def test_nothing_moves_in_a_session_of_keys_alone(
-    browser: Browser, address: str, size: tuple[int, int], scheme: str
-) -> None:
-    page = opened(browser, address, size, scheme, WATCH_SHIFTS)
-    errors: list[str] = []
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    keyboard = Keyboard(page)
-    keyboard.session()
-    assert len(set(keyboard.visited)) == 22
-    moved = list(shifts(page, also_after_input=False))
-    assert sum(each["value"] for each in moved) == 0, moved
-    assert errors == []
-    page.context.close()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("size", "scheme"), [(DESKTOP, "light"), (DESKTOP, "dark"), (PHONE, "light")]
-)
-def test_axe_finds_nothing_serious_in_any_panel(
+@pytest.fixture(scope="module", params=[DESKTOP, PHONE], ids=["desktop", "phone"])
+def used(
+    request: pytest.FixtureRequest,
     browser: Browser,
-    address: str,
-    size: tuple[int, int],
-    scheme: str,
+    original: Case,
+    root: Any,
     tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    page = opened(browser, address, size, scheme)
-    page.evaluate(axe_script(tmp_path_factory.mktemp("web")))
-    found: dict[str, Any] = {}
+) -> Iterator[Used]:
+    """One session for all tests: what it takes is the way through the panels, not what is asked."""
+    folder = tmp_path_factory.mktemp("used")
+    width, height = request.param
+    with served(prepare(original.copied_to(folder / "photos"), root)) as access:
+        page = open_page(
+            browser, access.url, width=width, height=height, scheme="light", scripts=(WATCH_SHIFTS,)
+        )
+        errors: list[str] = []
+        found: dict[str, Any] = {}
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.evaluate(axe_script(folder))
 
-    def check(panel: str) -> None:
-        for each in page.evaluate(AXE):
-            if each["impact"] in SERIOUS:
-                found.setdefault(each["id"], (panel, each["nodes"]))
+        def check(panel: str) -> None:
+            # What has not to do with colours is the same in both schemes.
+            for scheme, rules in (("dark", COLOURS), ("light", None)):
+                page.emulate_media(color_scheme=scheme)
+                for each in page.evaluate(AXE, rules):
+                    if each["impact"] in SERIOUS:
+                        found.setdefault(each["id"], (scheme, panel, each["nodes"]))
 
-    Keyboard(page, check).session()
-    assert found == {}
-    page.context.close()
+        keyboard = Keyboard(page, check)
+        keyboard.session()
+        yield Used(keyboard.visited, errors, list(shifts(page, also_after_input=False)), found)
+        page.context.close()
+
+
+@pytest.mark.long
+def test_nothing_moves_in_a_session_of_keys_alone(used: Used) -> None:
+    assert len(set(used.visited)) == 22
+    assert sum(each["value"] for each in used.moved) == 0, used.moved
+    assert used.errors == []
+
+
+@pytest.mark.long
+def test_axe_finds_nothing_serious_in_any_panel(used: Used) -> None:
+    assert used.found == {}

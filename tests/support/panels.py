@@ -31,8 +31,9 @@ new PerformanceObserver((list) => {
 """
 """Script that collects all layout shifts, those after an input by the user included."""
 
-AXE = """async () => {
-    const { violations } = await axe.run(document, { resultTypes: ["violations"] });
+AXE = """async (runOnly) => {
+    const rules = runOnly ? { runOnly } : {};
+    const { violations } = await axe.run(document, { resultTypes: ["violations"], ...rules });
     return violations.map(({ id, impact, nodes }) =>
         ({ id, impact, nodes: nodes.map((each) => `${each.html}: ${each.failureSummary}`) }));
 }"""

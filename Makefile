@@ -24,7 +24,7 @@ PARALLEL := -n $(or $(WORKERS),logical) --maxprocesses 8 --dist loadfile --no-lo
 
 test: $(VENV)/.installed-dev  ## run the whole test suite (WORKERS=2)
 	$(BIN)/python -m pytest $(PARALLEL) -m "not timing" --durations=20; status=$$?; \
-	$(BIN)/python -m pytest -m timing && exit $$status
+	$(BIN)/python -m pytest -m timing $$(grep -rl mark.timing tests --include="test_*.py") && exit $$status
 
 test-fast: $(VENV)/.installed-dev  ## run the 3,300 tests that take a minute together
 	$(BIN)/python -m pytest $(PARALLEL) -m "not slow and not long and not timing"

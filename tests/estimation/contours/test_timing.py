@@ -47,4 +47,6 @@ def test_a_mask_takes_at_most_half_a_second() -> None:
     (residuals,) = align(model, view).mask_residuals  # compiles the kernels, too
     assert residuals is not None
     assert residuals.is_used
-    assert reference_seconds(timed(lambda: align(model, view)), below=0.5) < 0.5
+    measure = timed(lambda: align(model, view))
+    # What is known to fail is not waited for as long as what a busy machine may have delayed.
+    assert reference_seconds(measure, below=0.5, patience=5) < 0.5

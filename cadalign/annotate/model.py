@@ -370,8 +370,8 @@ class MirrorPlanes:
         axes = []
         for axis in _MIRROR_AXES:
             image = _reflect(points[:_MIRROR_TESTED], axis, center)
-            gaps, _ = tree.query(image)
-            if np.mean(gaps <= _MIRROR_NEAR * diagonal) >= _MIRROR_SHARE:
+            gaps, _ = tree.query(image, distance_upper_bound=_MIRROR_NEAR * diagonal)
+            if np.isfinite(gaps).mean() >= _MIRROR_SHARE:
                 axes.append(axis)
         return cls(triangles, center, diagonal, tuple(axes), tree, number)
 

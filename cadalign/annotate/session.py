@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -80,17 +81,13 @@ class Session:
         return [state for states in self.objects for state in states]
 
     def warm_up(self) -> None:
-        """Compile or load the solvers by aligning a synthetic problem, and prepare the model."""
+        """Compile or load the solvers, and prepare the models."""
         try:
-            problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
-            points, pixels, camera = problem.points_3d, problem.points_2d, problem.camera
             marked = (state for state in self.states if state.document.complete_pairs)
             joint = self.shape is not None or not all(
                 state.observation().is_plain for state in marked
             )
-            warm_up(points, pixels, camera, joint=joint)
-            if not joint:
-                warm_up_advice(points, View(camera, pixels), problem.alignment)
+            _load_solvers(joint=joint)
             for model in self.models.opened:
                 model.prepare(has_shape=self.shape is not None)
         finally:  # an error here occurs again, and is reported, when the user aligns
@@ -321,3 +318,13 @@ class Session:
         """
         live, _ = self.live(state)
         state.files.write_fit(None if live.provisional else live.result)
+
+
+@cache
+def _load_solvers(*, joint: bool) -> None:
+    """Compile or load the solvers, once in a process, by aligning a synthetic problem."""
+    problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
+    points, pixels, camera = problem.points_3d, problem.points_2d, problem.camera
+    warm_up(points, pixels, camera, joint=joint)
+    if not joint:
+        warm_up_advice(points, View(camera, pixels), problem.alignment)

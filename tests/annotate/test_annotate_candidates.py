@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.annotating import IDLE, Case, make_case, opened_page, place_of_pixel, wait
+from support.annotating import (
+    IDLE,
+    Case,
+    make_case,
+    masks_searched_once,
+    opened_page,
+    place_of_pixel,
+    wait,
+)
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.candidates import best_click, clicks_needed, updated
@@ -45,6 +54,12 @@ def test_a_click_rules_out_what_predicts_it_elsewhere() -> None:
     assert (updated(EQUAL, *first, np.array([[35.0, 0.0]]))[0] > 1 / 3).all()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _searched_once() -> Iterator[None]:
+    with masks_searched_once():
+        yield
+
+
 @dataclass(frozen=True)
 class Similar:
     """A photo of a chair, and another chair's model with the keypoints that both have."""
@@ -63,7 +78,8 @@ class Similar:
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Similar:
-    root = write_sample_dataset(tmp_path_factory.mktemp("pair") / "sample", per_category=2)
+    folder = tmp_path_factory.mktemp("pair") / "sample"
+    root = write_sample_dataset(folder, per_category=2, categories=["chair"])
     case = make_case(root, tmp_path_factory.mktemp("annotate"))
     other = KeypointNet(root)["chair", "sample_chair_001"]
     assert other.mesh_path is not None

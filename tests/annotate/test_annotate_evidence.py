@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, flat, place_all
+from support.annotating import Case, flat, place, place_all
 
 from cadalign import Size, Symmetry, View, align
 from cadalign.annotate.actions import perform
@@ -169,8 +169,10 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
     whole = observed(case, "mask", "size")
     assert whole.size is not None
     mask = whole.evidence.mask
+    place_all(case.open(), case, count=len(case.clicks) - 1)
     session = case.open(mask=mask, size=whole.size.given)
-    state = place_all(session, case)
+    place(session, *case.clicks[-1])
+    state = page_state(session, 0)
     assert state["alignment"]["also_used"] == "mask, known width and height"
     assert stored(case)["mask"] == "m.mask.png"
     assert stored(case)["size"] == whole.size.given

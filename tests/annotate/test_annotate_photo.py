@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from support.annotating import Case, flat, place_all
+from support.annotating import Case, flat, masks_searched_once, place_all
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.evidence import encode_runs
@@ -18,6 +19,12 @@ from cadalign.metrics import rotation_error
 from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _searched_once() -> Iterator[None]:
+    with masks_searched_once():
+        yield
 
 
 def draw_true_mask(session: Session, case: Case) -> None:

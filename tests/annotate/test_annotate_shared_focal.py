@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, fitted, flat
+from support.annotating import Case, aligned_once, fitted, flat
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
@@ -33,11 +33,12 @@ def put(
     inside = camera.contains(camera.project(pose.apply([point.xyz for point in samples])))
     chosen = [point for point, is_in in zip(samples, inside, strict=True) if is_in][:12]
     pixels = camera.project(pose.apply([point.xyz for point in chosen]))
-    for point, uv in zip(chosen, pixels + 0.5 * rng.normal(size=pixels.shape), strict=True):
-        known = session.registry.find(point.xyz, tolerance=1e-6)
-        keypoint = session.registry.add(point) if known is None else known
-        perform(session, 0, {"do": "place_uv", "uv": uv.tolist()}, slot=slot)
-        perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)
+    with aligned_once(session):
+        for point, uv in zip(chosen, pixels + 0.5 * rng.normal(size=pixels.shape), strict=True):
+            known = session.registry.find(point.xyz, tolerance=1e-6)
+            keypoint = session.registry.add(point) if known is None else known
+            perform(session, 0, {"do": "place_uv", "uv": uv.tolist()}, slot=slot)
+            perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)
 
 
 def aligned(session: Session, slot: int) -> Result:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 import threading
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
+from cadalign import Result, View, align
 from cadalign.annotate.actions import perform
 from cadalign.annotate.guard import Access
 from cadalign.annotate.opening import open_session
@@ -116,9 +118,19 @@ def place(session: Session, keypoint: int, uv: list[float], *, image: int = 0) -
 
 def place_all(session: Session, case: Case, *, count: int | None = None) -> dict[str, Any]:
     """Place the first of the visible keypoints; gives the state."""
-    for keypoint, uv in case.clicks[:count]:
-        place(session, keypoint, uv)
+    with aligned_once(session):
+        for keypoint, uv in case.clicks[:count]:
+            place(session, keypoint, uv)
     return page_state(session, 0)
+
+
+@contextmanager
+def aligned_once(session: Session) -> Iterator[None]:
+    """Align what is placed when all of it is, as a session does while it loads its solvers."""
+    ready, session.ready = session.ready, False
+    yield
+    if ready:
+        session.warm_up()
 
 
 def place_twenty(session: Session, case: Case) -> None:
@@ -206,6 +218,24 @@ def place_of_pixel(page: Page, uv: Sequence[float]) -> tuple[float, float]:
         list(uv),
     )
     return x, y
+
+
+@contextmanager
+def masks_searched_once() -> Iterator[None]:
+    """Keep what a mask alone allows for all sessions: it is the same search of many seconds."""
+    found: dict[bytes, Result] = {}
+
+    def align_once(model: Any, views: Any, **options: Any) -> Result:
+        if not isinstance(views, View):  # with keypoints
+            return align(model, views, **options)
+        key = pickle.dumps((model, views, options))
+        if key not in found:
+            found[key] = align(model, views, **options)
+        return found[key]
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("cadalign.annotate.problem.align", align_once)
+        yield
 
 
 def fitted(

@@ -15,6 +15,7 @@ from playwright.sync_api import Browser, Error, expect
 from support.chromium import chromium
 
 from cadalign.datasets import write_sample_dataset
+from cadalign.evaluation.plots import STYLE
 
 # The same cases on every run: a failure can be seen again, and a pass is not luck.
 settings.register_profile(
@@ -61,6 +62,18 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, Any, Any]:
             if name in reason.lower():
                 report.outcome, report.longrepr = "failed", f"{name} is required: {reason}"
     return report
+
+
+@pytest.fixture(scope="session", autouse=True)
+def font_type() -> Iterator[int]:
+    """Draw the letters of PDF files: to pick them out of a TrueType font takes half of a figure.
+
+    Gives the setting that figures have otherwise.
+    """
+    with pytest.MonkeyPatch.context() as patched:
+        usual = STYLE["pdf.fonttype"]
+        patched.setitem(STYLE, "pdf.fonttype", 3)
+        yield usual
 
 
 @pytest.fixture(scope="session")

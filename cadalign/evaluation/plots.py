@@ -130,29 +130,32 @@ def look_of(method: str) -> Look:
     return Look(label, COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")
 
 
+STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "axes.grid": True,
+    "axes.grid.which": "both",
+    "grid.color": "0.9",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "lines.linewidth": 1.8,
+    "lines.markersize": 5,
+    "pdf.fonttype": 42,  # TrueType, which publishers ask for
+    "figure.dpi": 160,
+}
+"""Settings of matplotlib that all figures share."""
+
+
 @contextmanager
 def new_figure(**options: Any) -> Iterator[Figure]:
     """A figure in the project's style, drawn without a display."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    settings: Any = {
-        "font.size": 10,
-        "axes.grid": True,
-        "axes.grid.which": "both",
-        "grid.color": "0.9",
-        "grid.linewidth": 0.6,
-        "axes.axisbelow": True,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "legend.frameon": False,
-        "legend.fontsize": 9,
-        "lines.linewidth": 1.8,
-        "lines.markersize": 5,
-        "pdf.fonttype": 42,
-        "figure.dpi": 160,
-    }
-    with rc_context(settings):
+    with rc_context(STYLE):
         yield Figure(layout="constrained", **options)
 
 
@@ -176,6 +179,7 @@ def save_figure(figure: Figure, path: Path) -> list[Path]:
         # Without its date a PDF is the same in every run.
         metadata: Any = {"CreationDate": None} if file.suffix == ".pdf" else {"Software": None}
         write_whole(file, partial(figure.savefig, metadata=metadata))
+        figure.set_layout_engine("none")  # the first file's is the second's
     return files
 
 

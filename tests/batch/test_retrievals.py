@@ -154,7 +154,7 @@ def test_killed_and_shared_among_workers_it_gives_the_same_bytes(
     case: Case, tmp_path: Path
 ) -> None:
     queries = tmp_path / "q.jsonl"
-    queries.write_text(10 * case.queries.read_text())
+    queries.write_text(4 * case.queries.read_text())
     arguments = ["retrieve", str(queries), *case.arguments[1:], "--no-picture"]
     code = "import sys; from cadalign.cli import main; sys.exit(main())"
     calm, hit, two = (RunFolder(tmp_path / name) for name in ("calm", "hit", "two"))

@@ -126,7 +126,7 @@ def test_ten_thousand_records_take_little_memory_and_time(root):
     assert (summary.records, summary.photos, len(summary.problems)) == (count, 9900, 100)
     tracemalloc.start()
     dataset = Pix3D(root)
-    for number in range(0, count, 20):
+    for number in range(0, count, 100):
         dataset[number]
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()

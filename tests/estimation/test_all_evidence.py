@@ -58,7 +58,8 @@ class Case(NamedTuple):
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_sample_dataset(tmp_path_factory.mktemp("evidence") / "sample", per_category=16)
+    folder = tmp_path_factory.mktemp("evidence") / "sample"
+    return write_sample_dataset(folder, per_category=16, categories=["bottle"])
 
 
 @cache

@@ -60,7 +60,7 @@ class Simulated:
 def test_objects_share_their_focal_length_and_it_is_as_uncertain_as_stated() -> None:
     errors: dict[int, list[float]] = {1: [], 2: [], 4: []}
     stated: dict[int, list[float]] = {1: [], 2: [], 4: []}
-    for seed in range(60):
+    for seed in range(30):
         for count, found in errors.items():
             scene = align_scene(Simulated(seed, count).objects(UNKNOWN))
             assert not scene.warnings

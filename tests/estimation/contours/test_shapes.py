@@ -24,7 +24,7 @@ CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
 @pytest.fixture(scope="module")
 def bottles(tmp_path_factory: pytest.TempPathFactory) -> tuple[AnnotatedModel, ...]:
     root = tmp_path_factory.mktemp("bottles") / "sample"
-    dataset = KeypointNet(write_sample_dataset(root, per_category=16))
+    dataset = KeypointNet(write_sample_dataset(root, per_category=16, categories=["bottle"]))
     return dataset["bottle"]
 
 

@@ -1,8 +1,10 @@
-"""A new user: an environment with the wheel alone, what it lists, and the documents' snippets."""
+"""A new user: an environment with the wheel alone, what it lists, and what the documents run."""
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ import cadalign
 pytestmark = pytest.mark.long
 
 DOCS = ROOT / "docs"
+EXTRAS = ("torch", "jax")
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.py"))
 PAGES = [
     page
@@ -103,17 +106,48 @@ def test_ipython_completes_names(user: Environment, use_jedi: bool) -> None:
     assert {"fit", "fit_batch", "datasets"} <= set(found)
 
 
+def needs(page: Path, extra: str) -> bool:
+    text = page.read_text(encoding="utf-8")
+    return f"cadalign.{extra}" in "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+
+
 @pytest.mark.long
-def test_snippets_of_readme_and_site_run(user: Environment) -> None:
+@pytest.mark.parametrize("extra", ["", *EXTRAS])
+def test_snippets_of_readme_and_site_run(user: Environment, extra: str) -> None:
     readme.write_files(user.home)
-    ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, PAGES)])
-    assert ran.count("ran ") >= len(PAGES) > 5
+    if extra:
+        pytest.importorskip(extra, reason=f'needs pip install -e ".[{extra}]"')
+        pages = [page for page in PAGES if needs(page, extra)]
+    else:
+        pages = [page for page in PAGES if not any(needs(page, each) for each in EXTRAS)]
+        assert len(pages) > 5
+    ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, pages)])
+    assert [line for line in ran.splitlines() if line.startswith("ran ")] == [
+        f"ran {page}" for page in pages
+    ]
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
-def test_tutorials_run(user: Environment, tutorial: Path) -> None:
-    user.run("python", [str(tutorial)])
+def test_site_builds_with_its_tutorials_and_its_schemas_accept_the_examples(
+    user: Environment, tmp_path: Path
+) -> None:
+    """The tutorials run for it, and a warning or an error of one of them fails."""
+    pytest.importorskip("sphinx_gallery", reason='needs pip install -e ".[docs]"')
+    jsonschema = pytest.importorskip("jsonschema")
+    # A copy, since tutorials leave what they made beside their sources.
+    source, site = tmp_path / "docs", tmp_path / "site"
+    shutil.copytree(DOCS, source, ignore=shutil.ignore_patterns("_build", "auto_tutorials"))
+    options = ["-W", "--keep-going", "-q", "-b", "html"]
+    user.run("python", ["-m", "sphinx", *options, str(source), str(site)], timeout=900)
+    for tutorial in TUTORIALS:
+        assert (site / "auto_tutorials" / f"{tutorial.stem}.html").is_file()
+    for name in ("observation", "model_keypoints"):
+        schema = json.loads((site / "schemas" / f"{name}.schema.json").read_text(encoding="utf-8"))
+        page = (DOCS / "formats" / f"{name}.md").read_text(encoding="utf-8")
+        example = page.partition("```json\n")[2].partition("```")[0]
+        jsonschema.validate(json.loads(example), schema)
+    fetched = r'(?:src|href)="(?:https?:)?//[^"]+\.(?:js|css|woff2?)"'
+    assert not re.search(fetched, (site / "index.html").read_text(encoding="utf-8"))
 
 
 @pytest.mark.long

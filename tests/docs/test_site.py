@@ -1,12 +1,9 @@
-"""The documentation site: snippets run, examples are valid, it builds without a warning."""
+"""The documentation site: its commands, links and examples; it is built in `test_new_user`."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +34,6 @@ def blocks(page: Path, language: str) -> list[str]:
 
 def named(page: Path) -> str:
     return page.relative_to(DOCS).as_posix()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("page", [p for p in pages() if blocks(p, "python")], ids=named)
-def test_snippets_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for extra in ("torch", "jax"):
-        if any(f"cadalign.{extra}" in block for block in blocks(page, "python")):
-            pytest.importorskip(extra, reason=f'needs pip install -e ".[{extra}]"')
-    monkeypatch.chdir(tmp_path)  # where some of them write
-    names: dict[str, Any] = {}
-    for block in blocks(page, "python"):
-        exec(compile(block, named(page), "exec"), names)
 
 
 @pytest.mark.parametrize("page", pages(), ids=named)
@@ -89,26 +74,3 @@ def test_examples_of_formats_are_read(tmp_path: Path) -> None:
     model["keypoints"] = model["keypoints"][:1]  # the other one needs the mesh
     path.write_text(json.dumps(model), encoding="utf-8")
     assert ModelKeypoints.load(path).names == ("seat, front left",)
-
-
-@pytest.mark.long
-def test_site_builds_and_its_schemas_accept_the_examples(tmp_path: Path) -> None:
-    pytest.importorskip("sphinx_gallery", reason='needs pip install -e ".[docs]"')
-    jsonschema = pytest.importorskip("jsonschema")
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html"]
-    # A copy, since tutorials leave what they made beside their sources.
-    source = tmp_path / "docs"
-    subprocess.run(["cp", "-r", str(DOCS), str(source)], check=True)
-    built = subprocess.run(
-        [*command, str(source), str(tmp_path / "site")],
-        env={**os.environ, "MPLBACKEND": "agg", "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True,
-        text=True,
-        timeout=900,
-    )
-    assert built.returncode == 0, built.stderr[-3000:]
-    for name in ("observation", "model_keypoints"):
-        text = (tmp_path / "site" / "schemas" / f"{name}.schema.json").read_text(encoding="utf-8")
-        jsonschema.validate(example(name), json.loads(text))
-    fetched = r'(?:src|href)="(?:https?:)?//[^"]+\.(?:js|css|woff2?)"'
-    assert not re.search(fetched, (tmp_path / "site" / "index.html").read_text(encoding="utf-8"))

@@ -412,7 +412,7 @@ def test_of_real_chairs_the_stretch_buys_better_boxes(real_data: Path, tmp_path:
         noises_px=(1.0,),
         keypoints=(8,),
         methods=("optimal", "epnp"),
-        max_models=60,
+        max_models=30,
     )
     folder = RunFolder(tmp_path / "run")
     run(options, folder, workers=None, dask=None)

@@ -33,6 +33,7 @@ _FALSE_CAMERA_ALARMS = 1e-5
 _SCALES = 2  # unknown ones, of an alignment without constraints
 _WORTH_A_SEARCH = 4.0  # linearised decrease of the sum
 _TESTED_TO = 0.1  # relative standard deviation to which a held scale must be tested
+_MOST_ROUNDS = 100  # of a forward search, each of which fits all inliers
 _MOST_OUTLIERS = 1 / 3  # of the keypoints; more are no outliers
 # Hands click to about 2 px, and shapes differ by as much: weight of that, as of so many equations.
 _CLICK, _CLICK_EQUATIONS = 2.0, 4
@@ -105,14 +106,13 @@ def find_outliers(
 
     try:
         robust = residuals_of(fit_rows(np.arange(count), True))
-        rows = nearest(_squares(robust, covariances))
-        for _ in range(2 * count):
+        rows, known = nearest(_squares(robust, covariances)), set[bytes]()
+        # The search may come back to a set instead of coming to rest.
+        while rows.tobytes() not in known and len(known) < _MOST_ROUNDS:
+            known.add(rows.tobytes())
             values, quantile = statistic(rows)
             agreed = np.flatnonzero(values <= quantile)
-            agreed = agreed if len(agreed) >= start else nearest(values)
-            if np.array_equal(agreed, rows):
-                break
-            rows = agreed
+            rows = agreed if len(agreed) >= start else nearest(values)
         outliers = np.setdiff1d(np.arange(count), rows)
         if not len(outliers):
             return {}

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +52,7 @@ class Session:
     just_deleted: set[int] = field(default_factory=set)  # photos where this was the last change
 
     def __post_init__(self) -> None:
-        self.lock = threading.RLock()
+        self.lock, self.ended = threading.RLock(), threading.Event()
         self._pixels: tuple[Path, npt.NDArray[np.uint8]] | None = None
 
     @property
@@ -81,20 +81,24 @@ class Session:
         return [state for states in self.objects for state in states]
 
     def warm_up(self) -> None:
-        """Compile or load the solvers, and prepare the models."""
+        """Compile or load the solvers, and prepare the models, until the session has ``ended``."""
         try:
             marked = (state for state in self.states if state.document.complete_pairs)
             joint = self.shape is not None or not all(
                 state.observation().is_plain for state in marked
             )
-            _load_solvers(joint=joint)
-            for model in self.models.opened:
-                model.prepare(has_shape=self.shape is not None)
+            has_shape = self.shape is not None
+            steps = [partial(_load_solvers, joint=joint)]
+            steps += [partial(model.prepare, has_shape=has_shape) for model in self.models.opened]
+            for step in steps:
+                if self.ended.is_set():
+                    return
+                step()
         finally:  # an error here occurs again, and is reported, when the user aligns
             self.ready = True
             with self.lock:
                 for state in self.states:
-                    if state.fit_pending:
+                    if state.fit_pending and not self.ended.is_set():
                         self.save(state)
 
     def photo_state(self, number: int, slot: int | None = None) -> PhotoState:

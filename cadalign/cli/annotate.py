@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import signal
 import tempfile
 import threading
@@ -130,34 +129,24 @@ class Annotate(FileOptions):
                 )
             warming = threading.Thread(target=session.warm_up, daemon=True)
             warming.start()
-            opened.callback(_end, warming)
-            # Ends as Ctrl+C does, with everything saved and unlocked.
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
-            answer(access.url)
+            # An extension in C++ that works on while the interpreter ends aborts the process.
+            opened.callback(warming.join)
+            opened.callback(session.ended.set)
             reach = (
                 "It works on this machine only, and for this session."
                 if self.host == LOOPBACK
                 else "Whoever has it and reaches this machine can see and change everything, "
                 "unencrypted: give it to your team only."
             )
-            say(f"Open this address in a browser; end with Ctrl+C. {reach}")
-            if not self.no_open:
-                webbrowser.open(access.url)
             with suppress(KeyboardInterrupt):
+                # Ends as Ctrl+C does, with everything saved and unlocked.
+                signal.signal(signal.SIGTERM, signal.default_int_handler)
+                answer(access.url)
+                say(f"Open this address in a browser; end with Ctrl+C. {reach}")
+                if not self.no_open:
+                    webbrowser.open(access.url)
                 serve(make_app(session, access), listener)
             return _save_and_say_where(session)
-
-
-def _end(thread: threading.Thread) -> None:
-    """End a thread at its next line of Python, and wait for that.
-
-    Where an extension in C++ works on while the interpreter ends, it cannot return to it, and the
-    process is aborted.
-    """
-    if thread.ident is not None:
-        number, error = ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit)
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(number, error)
-    thread.join()
 
 
 def _export(options: SessionOptions, to: Path, form: str) -> int:

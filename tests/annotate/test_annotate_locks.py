@@ -34,7 +34,7 @@ import numpy as np
 from cadalign.annotate.session import Session
 
 def warm_up(session):
-    while True:
+    while not session.ended.is_set():
         cv2.GaussianBlur(np.zeros((300, 300, 3), np.uint8), (0, 0), 15)
 
 Session.warm_up = warm_up

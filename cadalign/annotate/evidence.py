@@ -16,7 +16,6 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.gravity import direction_of_edges
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.evidence import LENGTHS, ImageEvidence, ObservedImage, Size
 from cadalign.io.images import read_grey
@@ -31,7 +30,6 @@ _SHIFT = 4  # bits of parts of a pixel in OpenCV's drawing
 _LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
 _LEAST_BOX = 4.0  # [px]
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
-_PITCH_SIGMA = 30.0  # of the camera about the horizon [degrees]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
 _MOST_UP_SIGMA = 20.0  # [degrees]
 
@@ -230,8 +228,9 @@ class MarkedEvidence:
 def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray, float] | None:
     """Direction of vertical edges in the camera, upwards, and its standard deviation [degrees].
 
-    See `cadalign.geometry.up_from_vertical_edges`; edges that agree less than their ends' noise
-    explains widen it. None for fewer than two edges, or edges that don't determine it.
+    Each edge and the camera's centre span a plane that holds the direction: it is the least
+    singular vector of the planes' normals, weighted by the edges' lengths. None for fewer than two
+    edges, or edges that don't determine it.
 
     Examples
     --------
@@ -243,15 +242,25 @@ def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray,
     """
     if len(verticals) < 2:
         return None
-    try:
-        found = direction_of_edges(camera, np.array(verticals), _END_SIGMA, _PITCH_SIGMA)
-    except InputError:
+    ends = np.array(verticals, dtype=float)
+    rays = np.ones((len(ends), 2, 3))
+    rays[:, :, :2] = camera.normalize(ends.reshape(-1, 2)).reshape(-1, 2, 2)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    normals = np.cross(rays[:, 0], rays[:, 1])
+    angle = np.linalg.norm(normals, axis=1, keepdims=True)
+    # A plane turns about its edge by the noise of both ends over the edge's length.
+    sigma = math.sqrt(2) * _END_SIGMA / camera.fx / np.maximum(angle, 1e-12)
+    _, values, directions = np.linalg.svd(normals / np.maximum(angle, 1e-12) / sigma)
+    redundancy = len(ends) - 2
+    if len(values) < 2 or not values[1] > 0:
         return None
-    up, covariance, squares = found
-    redundancy = len(verticals) - 2
-    factor = max(1.0, squares / redundancy) if redundancy else 1.0
-    up_sigma = math.sqrt(factor * np.linalg.eigvalsh(covariance)[-1])
-    return None if up_sigma > _MOST_UP_SIGMA else (up, max(_LEAST_UP_SIGMA, up_sigma))
+    least = values[2] if len(values) > 2 else 0.0
+    factor = math.sqrt(max(1.0, least**2 / redundancy)) if redundancy else 1.0
+    up_sigma = max(_LEAST_UP_SIGMA, math.degrees(factor / values[1]))
+    if up_sigma > _MOST_UP_SIGMA:
+        return None
+    up = directions[2] * (-1.0 if directions[2][1] > 0 else 1.0)
+    return up, float(up_sigma)
 
 
 def draw_mask(drawing: MaskDrawing, width: int, height: int) -> BoolArray:

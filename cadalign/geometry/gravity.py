@@ -161,15 +161,7 @@ def up_from_vertical_edges(
     clicks = as_floats(edges, name="edges", shape=shape).reshape(-1, 2, 2)
     if not len(clicks):
         raise InputError("none is given", where="edges")
-    up, covariance, _ = direction_of_edges(camera, clicks, sigma, pitch_sigma_deg)
-    return up + 0.0, covariance
-
-
-def direction_of_edges(
-    camera: Camera, edges: FloatArray, sigma: float, pitch_sigma_deg: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Direction and covariance as `up_from_vertical_edges`, and the edges' whitened squares."""
-    found = [_plane(camera, ends, sigma, number) for number, ends in enumerate(edges)]
+    found = [_plane(camera, ends, sigma, number) for number, ends in enumerate(clicks)]
     normals, deviations = zip(*found, strict=True)
     # The forward direction is level to within the pitch's sigma: a plane like those of edges.
     rows = np.array([*normals, [0.0, 0.0, 1.0]])
@@ -184,7 +176,7 @@ def direction_of_edges(
         fix = "give edges at different places in the photo"
         raise InputError("the edges have no one direction in common", where="edges", fix=fix)
     across = vectors[:, 1:] / np.sqrt(values[1:])
-    return up, np.asarray(np.degrees(np.degrees(across @ across.T))), float(values[0])
+    return up + 0.0, np.asarray(np.degrees(np.degrees(across @ across.T)))
 
 
 def _plane(

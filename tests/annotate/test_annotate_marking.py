@@ -23,7 +23,6 @@ from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.errors import CadalignError
-from cadalign.geometry import up_from_vertical_edges
 from cadalign.io.images import read_grey
 from cadalign.render import cast_geometry
 
@@ -181,14 +180,6 @@ def test_direction_and_deviation_of_vertical_edges() -> None:
     # Deviations are of the worst direction, and not below half a degree.
     assert 0.2 < np.sqrt(np.mean(np.square(errors))) < 1.2
     assert find_up(((((100.0, 100.0)), (100.0, 300.0)),) * 2, camera) is None
-
-
-def test_vertical_edges_give_the_direction_that_the_library_gives() -> None:
-    camera = Camera.from_fov(640, 480, fov_x=60.0)
-    edges = (((300.0, 100.0), (310.0, 350.0)), ((360.0, 90.0), (355.0, 300.0)))
-    found = find_up(edges, camera)
-    assert found is not None
-    assert np.array_equal(found[0], up_from_vertical_edges(camera, edges)[0])
 
 
 def test_known_length_is_used(case: Case, capsys: pytest.CaptureFixture[str]) -> None:

@@ -95,8 +95,9 @@ def minima_of_mask(
             where="views[0].camera",
             fix="give a calibrated camera, or keypoints",
         )
-    contour, pixel = _rough_contour(view, camera)
     is_exact = is_exact_model(model)
+    # The likelihoods of a similar model's proposals are calibrated for the mask itself.
+    contour, pixel = _rough_contour(view, camera, _ROUGH_SIZE if is_exact else np.inf)
     searches = _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR
     proposals, steps, starts = _searched(problem, model, contour, searches)
     if not proposals:
@@ -152,7 +153,7 @@ def align_outline(model: Model, view: View) -> WholeOutline | None:
     """
     lenses = Lenses.of([view], "known", None)
     problem = JointProblem(prior_of(model), [view], None, FitOptions(), lenses)
-    contour, pixel = _rough_contour(view, lenses.cameras[0])
+    contour, pixel = _rough_contour(view, lenses.cameras[0], _ROUGH_SIZE)
     proposals, *_ = _searched(problem, model, contour, _SEARCHES[:1])
     if not proposals:
         return None
@@ -192,10 +193,13 @@ def _met_by(contour: ViewContour) -> float:
     return float(np.log(sigma) + (1 + np.log(2 * np.pi)) / 2)
 
 
-def _rough_contour(view: View, camera: Camera) -> tuple[ViewContour, float]:
-    """The contour of a view's mask or of a smaller copy, whose pixels are so many of the mask's."""
+def _rough_contour(view: View, camera: Camera, size: float) -> tuple[ViewContour, float]:
+    """The contour of a view's mask, or of a copy of a ``size`` [px] where it is larger.
+
+    Then how many of the mask's pixels one of the copy is.
+    """
     contour = contour_view(0, view, _WHERE, camera)
-    pixel = contour.contour.size / _ROUGH_SIZE
+    pixel = contour.contour.size / size
     if pixel < _LEAST_PIXEL:
         return contour, 1.0
     mask = np.asarray(view.mask_image, dtype=np.float32)

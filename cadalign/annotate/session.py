@@ -52,7 +52,8 @@ class Session:
     just_deleted: set[int] = field(default_factory=set)  # photos where this was the last change
 
     def __post_init__(self) -> None:
-        self.lock, self.ended = threading.RLock(), threading.Event()
+        self.lock = threading.RLock()
+        self.ended = threading.Event()
         self._pixels: tuple[Path, npt.NDArray[np.uint8]] | None = None
 
     @property

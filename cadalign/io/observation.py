@@ -186,7 +186,8 @@ class Observation(ObservedImage):
 
     def save(self, path: str | Path) -> None:
         """Write an observation file; paths are written relative to it."""
-        write_json(as_path(path), self.to_dict(folder=as_path(path).parent, states_origins=True))
+        path = as_path(path)
+        write_json(path, self.to_dict(folder=path.parent, states_origins=True))
 
 
 def with_lens(camera: Camera, focal: float | None = None, *, fov: float | None = None) -> Camera:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import Any
@@ -310,13 +310,10 @@ class _Clip:
     truths: list[Alignment]
     pictures: list[np.ndarray]
 
-    def errors(self, poses: Sequence[Alignment]) -> list[float]:
-        """Rotation [deg] of poses of the frames, up to the model's symmetry."""
-        found = []
-        for est, truth in zip(poses, self.truths, strict=True):
-            nearest = nearest_truth(est=est, gt=truth, symmetry=self.model.symmetry)
-            found.append(rotation_error(est=est, gt=nearest))
-        return found
+    def error(self, number: int, est: Alignment) -> float:
+        """Rotation [deg] of a frame's pose, up to the model's symmetry."""
+        truth, symmetry = self.truths[number], self.model.symmetry
+        return rotation_error(est=est, gt=nearest_truth(est=est, gt=truth, symmetry=symmetry))
 
 
 def _clips(given: BenchmarkData, frames: int) -> Iterator[_Clip]:
@@ -343,22 +340,21 @@ def _clips(given: BenchmarkData, frames: int) -> Iterator[_Clip]:
 def _frame_row(clip: _Clip) -> Row:
     """The time of a frame by its photo alone, from the pose of the last, and its errors."""
     own, last = Model(mesh=clip.mesh, stretch="none"), clip.first
-    times, poses = [], []
-    for truth, picture in zip(clip.truths, clip.pictures, strict=True):
+    times, errors = [], []
+    for number, (truth, picture) in enumerate(zip(clip.truths, clip.pictures, strict=True)):
         photo = View(_CAMERA, image=picture)
         _, busy, result = section.clocked(partial(section.attempt, align, own, photo, init=last))
         last = truth if result is None else result.alignment
         times.append(1e3 * busy)
-        poses.append(last)
-        nearest = nearest_truth(est=last, gt=truth, symmetry=clip.model.symmetry)
-        if rotation_error(est=last, gt=nearest) > _LOST_DEG:
+        errors.append(clip.error(number, last))
+        if errors[-1] > _LOST_DEG:
             last = truth
-    errors = clip.errors(poses)[1:]  # the first frame prepares the mesh
+    times, errors = times[1:], errors[1:]  # the first frame prepares the mesh
     return {
         "model": clip.model.category,
         "frames": len(errors),
-        "ms": float(np.median(times[1:])),
-        "ms, 90 %": float(np.percentile(times[1:], 90)),
+        "ms": float(np.median(times)),
+        "ms, 90 %": float(np.percentile(times, 90)),
         "R": float(np.median(errors)),
         "lost": int((np.array(errors) > _LOST_DEG).sum()),
     }
@@ -380,7 +376,7 @@ def _smooth_row(given: BenchmarkData, clip: _Clip) -> Row:
             for number, ((pixels, ids), picture) in enumerate(zip(seen, pictures, strict=True))
         ]
         _, busy, result = section.clocked(partial(align, own, views, motion="smooth"))
-        errors = clip.errors([view.alignment for view in result.views])
+        errors = [clip.error(k, view.alignment) for k, view in enumerate(result.views)]
         row[name] = float(np.sqrt(np.mean(np.square(errors))))
         row[f"s a frame, {name}"] = busy / len(seen)
     return row

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.contour import Image, sampled
-from cadalign.estimation.contours.surface import caster_of, corners_of
+from cadalign.estimation.contours.surface import RigidSurface, rigid_surface
 from cadalign.estimation.facing import turned_alignment
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
@@ -106,23 +106,24 @@ def _radii(count: int) -> FloatArray:
 @lru_cache(maxsize=32)
 def atlas_of(mesh: Mesh, *, is_cut: bool = False) -> Atlas:
     """The silhouettes of a mesh, whole or the parts that lines leave, rendered once."""
-    return _atlas(mesh, _CUT_EVERY, _cuts) if is_cut else _atlas(mesh, 1, _uncut)
+    surface = rigid_surface(mesh)
+    return _atlas(surface, _CUT_EVERY, _cuts) if is_cut else _atlas(surface, 1, _uncut)
 
 
 def outline_of(mesh: Mesh) -> Whitened:
     """The silhouettes of a mesh along fewer directions, to be compared with many others'."""
-    return _atlas(mesh, _OUTLINE_EVERY, _uncut, cells=_OUTLINE_CELLS).views
+    return _atlas(RigidSurface(mesh), _OUTLINE_EVERY, _uncut, cells=_OUTLINE_CELLS).views
 
 
 def _atlas(
-    mesh: Mesh,
+    surface: RigidSurface,
     every: int,
     parts_of: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     *,
     cells: int = _CELLS,
 ) -> Atlas:
     """Silhouettes along directions, and the parts of each by their moments and lines."""
-    caster, corners = caster_of(mesh), corners_of(mesh)
+    caster, corners = surface.caster, surface.corners
     middle = corners.mean(axis=0)
     reach = float(np.linalg.norm(corners - middle, axis=1).max())
     bases, views = [], []

@@ -110,7 +110,8 @@ class Warped:
         return points - np.tensordot(self.coefficients, modes, axes=1), modes
 
 
-_rigid = lru_cache(maxsize=32)(RigidSurface)  # one object, whose rays are prepared once
+rigid_surface = lru_cache(maxsize=32)(RigidSurface)
+"""The surface of a mesh that is met again, its rays prepared once."""
 
 PosedSurface = RigidSurface | Warped
 """A surface at one state of the shape, before its stretch."""
@@ -168,7 +169,7 @@ def surfaces_of(model: Model | ShapeModel, points_3d: FloatArray, where: str) ->
             fix = "give it: Model(..., mesh=cadalign.load_mesh(path))"
             raise InputError(f"the model has no mesh, which {wanting} needs", where=where, fix=fix)
         if model.shape_sigma is None:
-            return SurfaceChoice([_rigid(model.mesh)], [])
+            return SurfaceChoice([rigid_surface(model.mesh)], [])
         points = cast(FloatArray, model.points_3d)
         return _warped([(model.mesh, points, np.arange(len(points)))])
     return _warped(_nearest_with_mesh(model, points_3d, where, wanting))

@@ -240,13 +240,16 @@ def _with_estimated_sigmas(
 ) -> Solutions:
     """Search with the standard deviations that the residuals have.
 
-    They matter to the optimum where there is something beside the keypoints.
+    They matter to the optimum where there is something beside the keypoints. Rounds end where they
+    converge, or go in circles: of two optima, each may be the better one at the other's noise.
     """
-    sigmas = np.ones(len(problems))
+    sigmas, earlier = np.ones(len(problems)), list[FloatArray]()
     for _ in range(rounds):
         found = search(sigmas)
-        previous, sigmas = sigmas, _estimate_sigmas(problems, options, points, found)
-        if rounds == 1 or np.allclose(sigmas, previous, rtol=_SIGMA_TOLERANCE, atol=0):
+        earlier.append(sigmas)
+        sigmas = _estimate_sigmas(problems, options, points, found)
+        repeats = [np.allclose(sigmas, one, rtol=_SIGMA_TOLERANCE, atol=0) for one in earlier]
+        if rounds == 1 or any(repeats):
             break
     assert found.covariances is not None
     covariances = found.covariances * (sigmas**2)[:, None, None]

@@ -6,7 +6,7 @@ import json
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from typing import Any
 
@@ -19,6 +19,7 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, Mesh, Model, Result, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, load_mesh
+from cadalign.estimation.contours.photo_lines import bins_of, regions_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
@@ -36,6 +37,8 @@ _CLICKS = 6
 _CLICK_SHARE = 4.0 / 640.0  # standard deviation of a click, relative to the photo's width
 _STRETCH_SIGMA = 0.3
 _WORSE_DEG = 1.0
+_LOOKS = ("contrast", "texture")
+_AROUND = 12  # [px], of the background that contrast is about
 _INNER = 0.95  # probability of the regions whose coverage is counted
 
 
@@ -44,8 +47,9 @@ def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> T
 
     Six clicks with an error of 4 px in a photo 640 px wide. Composites are models of ShapeNet and
     of the sample dataset, rendered before real photos with varied light, blur and noise, a quarter
-    of them partly hidden; their truth is exact. Real photos are those of HANDAL, LINEMOD and
-    Linemod-Occluded, whose stated truth is off by some pixels in places.
+    of them partly hidden; their truth is exact. They are listed by thirds of their contrast and
+    texture as well. Real photos are those of HANDAL, LINEMOD and Linemod-Occluded, whose stated
+    truth is off by some pixels in places.
 
     Parameters
     ----------
@@ -62,8 +66,13 @@ def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> T
         for number, (case, times) in enumerate(cases):
             for draw in range(times):
                 rng = np.random.default_rng([given.seed, 3, number, draw])
-                clicks = case.clicked(rng, stretched=stretched)
-                rows[f"{case.group} {case.kind}"].append(_compared(clicks))
+                row = _compared(case.clicked(rng, stretched=stretched)) | case.looks
+                rows[f"{case.group} {case.kind}"].append(row)
+        made = [row for name, found in rows.items() if "composite" in name for row in found]
+        for look in _LOOKS:
+            thirds = np.array_split(sorted(made, key=lambda row: row[look]), 3)
+            for name, third in zip(("low", "middle", "high"), thirds, strict=True):
+                rows[f"composite, {name} {look}"] = list(third)
         title = "an unknown stretch" if stretched else "a rigid model"
         table = [{"photos": name, **section.summary(found)} for name, found in rows.items()]
         yield f"photos beside rough clicks, {title}: medians", table
@@ -130,6 +139,7 @@ class PhotoCase:
     truth: Alignment
     kind: str = ""
     symmetry: Symmetry | None = None
+    looks: Row = field(default_factory=dict)
 
     def clicked(
         self, rng: np.random.Generator, *, stretched: bool, count: int = _CLICKS
@@ -290,8 +300,21 @@ def _composites(given: BenchmarkData, count: int, camera: Camera = _CAMERA) -> I
         if is_hidden:
             drawn = _hidden(drawn, frame.mask, behind[rng.integers(len(behind))], rng)
         photo = _blurred(drawn, rng)
-        kind = "hidden" if is_hidden else "clear"
-        yield PhotoCase("composite", camera, photo, scene.mesh, truth, kind, model.symmetry)
+        kind, looks = "hidden" if is_hidden else "clear", _looks_of(photo, frame.mask)
+        yield PhotoCase("composite", camera, photo, scene.mesh, truth, kind, model.symmetry, looks)
+
+
+def _looks_of(photo: np.ndarray, mask: np.ndarray) -> Row:
+    """Contrast of the object with what is around it [nats], and its texture [grey levels].
+
+    The texture is the root mean square of what a blur by 3 px takes away, noise included.
+    """
+    around = cv2.dilate(mask.astype(np.uint8), np.ones((2 * _AROUND + 1,) * 2, np.uint8)) > 0
+    _, contrast = regions_of(bins_of(photo[mask]), bins_of(photo[around & ~mask]))
+    gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    details = (gray - cv2.GaussianBlur(gray, (0, 0), 3.0))[inside if inside.any() else mask]
+    return dict(zip(_LOOKS, (contrast, float(np.sqrt((details**2).mean()))), strict=True))
 
 
 def _blurred(drawn: np.ndarray, rng: np.random.Generator) -> np.ndarray:

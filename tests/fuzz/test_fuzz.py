@@ -10,6 +10,8 @@ from fuzz import fits, mutations, readers
 from fuzz.failures import LONGEST_FIT, fit_outcome
 from fuzz.fit_cases import draw_case, draw_cases
 
+from cadalign.estimation import solve
+
 pytestmark = pytest.mark.long
 
 
@@ -40,9 +42,19 @@ def test_files_are_read_and_mutated_ones_read_or_refused(name: str, tmp_path: Pa
 
 def test_seeds_that_once_failed() -> None:
     # Equally good minima; numbers whose squares overflow; likelihoods beyond 1e16; no solution of
-    # LAPACK's; tiny and huge sigmas.
-    for seed in (29687, 32890, 38825, 46483, 5020788, 5040797, 5053209, 5099758, 5117344):
+    # LAPACK's; tiny and huge sigmas; keypoints whose variance overflows.
+    seeds = (29687, 32890, 38825, 46483, 859002, 5020788, 5040797, 5053209, 5099758, 5117344)
+    for seed in seeds:
         fits.run_case(draw_case(seed))
+
+
+def test_rounds_of_sigma_that_go_in_circles_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimated, calls = solve._estimate_sigmas, []
+    monkeypatch.setattr(
+        solve, "_estimate_sigmas", lambda *given: calls.append(1) or estimated(*given)
+    )
+    fits.run_case(draw_case(806635))  # two optima of a lens that nothing explains: 20 rounds
+    assert 2 <= len(calls) <= 4
 
 
 def test_failures_name_their_seed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,6 +56,7 @@ _SIDEWAYS = 1.5  # standard deviations of these
 _LEAST_TURN, _MOST_TURN = np.radians(2.0), np.radians(40.0)  # of a further start
 _SAME_TURN = np.radians(1.0)
 _LEAST_SUPPORT = 0.5  # share of the outline that must be found
+_LEAST_CONTRAST = 2.0  # [nats], that colours must give the silhouette: noise gives one
 _GOOD_SUPPORT = 0.75  # below which a warning says so
 _MOST_RMS = 1.75  # of the lines found, in standard deviations, above which a warning says so
 _LEAST_PROBABILITY = 1e-3  # of such a rise of the other residuals by chance
@@ -251,7 +252,11 @@ def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> list[tuple[P
     """
     if not best:
         return [(photos[0], "it shows no part of the model's outline")]
-    shares = [each.share for each in best[0].supports]
+    supports = best[0].supports
+    alike = [k for k, each in enumerate(supports) if each.contrast < _LEAST_CONTRAST]
+    if alike:
+        return [(photos[k], "the object has the colours of what is around it") for k in alike]
+    shares = [each.share for each in supports]
     lacking = [k for k in np.argsort(shares).tolist() if shares[k] < _LEAST_SUPPORT]
     if lacking:
         worse = lacking[: -(-len(lacking) // 2)]

@@ -46,6 +46,8 @@ _LEAST_PIXELS = 30
 _RIM_REACH = 2.0  # cells
 _BORDER = 2.0  # [px]
 _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other things
+_NEIGHBOUR = 0.36  # weight of a neighbour's log likelihoods
+_STRAY = 1e-3  # probability of a crossing anywhere on a line, beside its colours
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
@@ -85,24 +87,45 @@ def regions_of(inside: IntArray, outside: IntArray) -> tuple[FloatArray, float]:
     return (own - other) / (2 * both), float(contrast)
 
 
-def crossings_of(
-    odds: FloatArray, valid: BoolArray, edges: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Find where the colours along lines change from the object's to the background's.
-
-    Returns places (S,), in steps outwards from the lines' middles, and their variances.
+def changes_of(odds: FloatArray, valid: BoolArray) -> FloatArray:
+    """Log likelihoods (S, 2 K + 1) of a change from the object's colours to others at each step.
 
     ``odds`` (S, 2 K + 1) are those of `regions_of` at steps from the inside outwards, of which
-    ``valid`` ones count; ``edges`` (S, 2 K + 1) are further log likelihoods of the places. The
-    posterior is taken relative to the uniform prior on the line, so that a line without contrast
-    has an infinite variance, and one with several crossings a large one.
+    ``valid`` ones count.
     """
-    count = odds.shape[1]
-    steps = np.arange(count) - count // 2
+    steps = np.arange(odds.shape[1])
     gaps = steps[:, None] - steps  # of the crossing (rows) from the pixels (columns)
     step = _AMPLITUDE * np.tanh(gaps / (2 * _SLOPE))
     known = np.where(valid, odds, 0.0)
-    logs = edges + np.log(0.5 + step * known[:, None, :]).sum(axis=2)
+    return np.asarray(np.log(0.5 + step * known[:, None, :]).sum(axis=2))
+
+
+def with_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
+    """Add a share of the log likelihoods (S, 2 K + 1) of the next lines along the outline.
+
+    Near its place, an outline is displaced by nearly the same at neighbouring lines, so that these
+    help to choose between several crossings. ``are_neighbours`` (S - 1,) is true where a line and
+    the next one are.
+    """
+    highest = logs.max(axis=1, keepdims=True)
+    total = np.exp(logs - highest).sum(axis=1, keepdims=True)
+    bounded = np.logaddexp(logs - highest - np.log(total), np.log(_STRAY / logs.shape[1]))
+    shares = _NEIGHBOUR * are_neighbours[:, None]
+    found = bounded.copy()
+    found[1:] += shares * bounded[:-1]
+    found[:-1] += shares * bounded[1:]
+    return np.asarray(found)
+
+
+def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Find the places where lines leave the object from the log likelihoods (S, 2 K + 1) of these.
+
+    Returns places (S,), in steps outwards from the lines' middles, and their variances. The
+    posterior is taken relative to the uniform prior on the line, so that a line without contrast
+    has an infinite variance, and one with several crossings a large one.
+    """
+    count = logs.shape[1]
+    steps = np.arange(count) - count // 2
     likely = np.exp(logs - logs.max(axis=1, keepdims=True))
     likely /= likely.sum(axis=1, keepdims=True)
     mean = likely @ steps
@@ -309,10 +332,11 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     pixels = contour.points[:, None] + steps[:, None] * contour.normals[:, None]
     colors = photo.colors(pixels.reshape(-1, 2), step).reshape(*pixels.shape[:2], 3)
     valid = _on_own_side(photo, silhouette, pixels)
-    edges = np.zeros(valid.shape)
+    logs = changes_of(odds[bins_of(colors)], valid)
     if step <= _EDGE_STEP:
-        edges = edges_of(colors.astype(np.float64), valid, step)
-    places, variances = crossings_of(odds[bins_of(colors)], valid, edges)
+        logs += edges_of(colors.astype(np.float64), valid, step)
+        logs = with_neighbours(logs, contour.neighbours(np.ones(len(logs), dtype=bool)))
+    places, variances = crossings_of(logs)
     return Outline(silhouette, step * places, step * np.sqrt(variances), contrast, reach)
 
 

@@ -336,7 +336,8 @@ def unexplained(sigma: float, points_2d: Sequence[FloatArray]) -> tuple[str, ...
     In 98 % of pairs of a category's models it is a smaller share, of keypoints in random order in
     2 %.
     """
-    spread = max(float(points.std(axis=0).max()) for points in points_2d if len(points))
+    with np.errstate(over="ignore"):  # of keypoints beyond all images
+        spread = max(float(points.std(axis=0).max()) for points in points_2d if len(points))
     if sigma <= _LARGEST_SHARE * spread:
         return ()
     share = f"{sigma:.3g} px, {100 * sigma / spread:.0f} % of the keypoints' standard deviation"

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
+from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any
 
+from cadalign.errors import InputError, unknown
 from cadalign.evaluation.methods.registry import register_method
 from cadalign.evaluation.metrics.registry import register_metric
 from cadalign.evaluation.options import ExperimentOptions, tuples
@@ -81,7 +84,9 @@ def evaluate(
     for name, register in (("methods", register_method), ("metrics", register_metric)):
         if options.get(name) is not None:
             options[name] = names_of(options[name], register, where=name)
-    chosen = spec_named(experiment).options(*source, **tuples(options))
+    kind = spec_named(experiment).options
+    _check_given(kind, experiment, source, options)
+    chosen = kind(*source, **tuples(options))
     with ExitStack() as stack:
         if out is None:
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
@@ -90,6 +95,24 @@ def evaluate(
         done = Run.open(folder.path)
         frame: pd.DataFrame = done.results.to_pandas()
         return frame.assign(seconds=done.cells["seconds"])
+
+
+def _check_given(
+    kind: type[ExperimentOptions], experiment: str, source: Sequence[object], given: Collection[str]
+) -> None:
+    """Check that all options of an experiment that it needs are given, and no others."""
+    own = [each for each in fields(kind) if each.init]
+    for name in given:
+        if name not in {each.name for each in own}:
+            known = tuple(sorted(each.name for each in own))
+            raise unknown(f"option of {experiment}", name, known, where=f"evaluate({name}=)")
+    placed = [each for each in own if not each.kw_only]
+    if len(source) > len(placed):
+        raise InputError(f"{experiment} has no dataset", where="root", fix="leave it out")
+    for each in placed[len(source) :]:
+        if each.name not in given and each.default is MISSING:
+            fix = f"{experiment} cannot do without"
+            raise InputError("is not given", where=each.name, fix=fix)
 
 
 def simulate(sweep: str, **options: Any) -> pd.DataFrame:

@@ -67,8 +67,12 @@ def test_what_is_wrong_is_named(tmp_path: Path) -> None:
         evaluate(tmp_path, "brewing")
     with pytest.raises(DataError, match="no such folder"):
         evaluate(tmp_path / "none", "correspondences")
-    with pytest.raises(TypeError, match="nois_px"):
+    with pytest.raises(InputError, match="unknown option of keypointnet 'nois_px', did you mean"):
         evaluate(tmp_path, nois_px=1.0)
+    with pytest.raises(InputError, match="root: is not given; keypointnet cannot do without"):
+        evaluate(None)
+    with pytest.raises(InputError, match="sweep: is not given"):
+        evaluate(experiment="simulate")
 
 
 def test_translation_errors_are_in_diagonals_of_the_model(sample_root: Path) -> None:

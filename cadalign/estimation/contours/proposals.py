@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.contours.descent import Masked, approached
-from cadalign.estimation.contours.silhouettes import differ, resembling_poses
+from cadalign.estimation.contours.silhouettes import distinct, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import (
     ViewContour,
@@ -29,6 +29,7 @@ from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import TrainingShapes
 
@@ -119,7 +120,7 @@ def minima_of_mask(
             f"{_WHERE}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
             "average: the object may be partly hidden, the model another, or the pose wrong"
         )
-    chosen = _chosen(proposals)
+    chosen = _chosen(proposals, _symmetry_of(model))
     if is_exact:
         return [each.minimum for each in chosen], steps, starts, mistake
     scores = [each.over(chosen[0]) for each in chosen]
@@ -217,12 +218,16 @@ def _resembling(
     (view,), camera = problem.views, problem.lenses.cameras[0]
     free = np.asarray(problem.prior.scales.free > 0)
     mask = cast(FloatArray, view.mask_image)
+    how: dict[str, Any] = {
+        "free": free,
+        "count": count,
+        "is_cut": is_cut,
+        "symmetry": _symmetry_of(model),
+    }
     found = [
         (each, surface)
         for surface in _surfaces_of(model)
-        for each in resembling_poses(
-            surface.mesh, mask, camera, free=free, count=count, is_cut=is_cut
-        )
+        for each in resembling_poses(surface.mesh, mask, camera, **how)
     ]
     best = sorted(found, key=lambda pair: -pair[0][0])[:count]
     return [(alignment, surface) for (_, alignment), surface in best]
@@ -244,6 +249,11 @@ def _approached(
     cost, every = cost_of_contour(residuals, reach), np.ones(len(residuals), dtype=bool)
     alike = correlation_length(contour.contour, residuals, every)
     return _Proposal(best._replace(state=state), residuals, cost, alike), iterations
+
+
+def _symmetry_of(model: Model | ShapeModel) -> Symmetry | None:
+    """The symmetry under which alignments are equal; a learned shape's mirror is none."""
+    return model.symmetry if isinstance(model, Model) else None
 
 
 def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:
@@ -272,14 +282,8 @@ def _varied(training: TrainingShapes, mean: FloatArray) -> list[int]:
     return [rows[k] for k in chosen]
 
 
-def _chosen(proposals: list[_Proposal]) -> list[_Proposal]:
+def _chosen(proposals: list[_Proposal], symmetry: Symmetry | None) -> list[_Proposal]:
     """The distinct ones of sorted proposals that are about as likely as the best."""
-    kept: list[_Proposal] = []
-    for each in proposals:
-        if kept and each.cost > kept[0].cost + _CLOSE:
-            break
-        (pose,) = poses_of(each.minimum.evidence, each.minimum.state)
-        known = [poses_of(other.minimum.evidence, other.minimum.state)[0] for other in kept]
-        if all(differ(pose, other) for other in known):
-            kept.append(each)
-    return kept[:_MOST_PROPOSALS]
+    likely = [each for each in proposals if each.cost <= proposals[0].cost + _CLOSE]
+    poses = [poses_of(each.minimum.evidence, each.minimum.state)[0] for each in likely]
+    return distinct(zip(poses, likely, strict=True), _MOST_PROPOSALS, symmetry)

@@ -12,9 +12,9 @@ follows by two linear equations in the inverse squares of its scales.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -29,6 +29,8 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
 from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.symmetry import Symmetry
+from cadalign.geometry.symmetry_group import group_of
 
 _DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
 _CELLS = 80  # of a silhouette's or a mask's image
@@ -52,6 +54,8 @@ _MOST_LOG = 1.3
 _MARGIN = 1.5  # of the image in which silhouettes are compared, relative to the mask's
 _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
+
+T = TypeVar("T")
 
 
 class Whitened(NamedTuple):
@@ -222,22 +226,20 @@ def resembling_poses(
     free: BoolArray,
     count: int,
     is_cut: bool = False,
+    symmetry: Symmetry | None = None,
 ) -> list[tuple[float, Alignment]]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
     Each comes after the intersection over union of its silhouette, or a part, and the mask.
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
-    lies beyond a line.
+    lies beyond a line. Of alignments that are equal under the ``symmetry`` one is kept.
     """
     atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
     query = whitened(view.image, view.corner, view.cell)
     poses = _poses_of(*_affine_cameras(atlas, query), atlas, free)
     found = [(_overlap(atlas, view, pose, is_cut=is_cut), pose) for pose in poses]
     found.sort(key=lambda each: -each[0])
-    kept: list[tuple[float, Alignment]] = []
-    for iou, pose in found:
-        if len(kept) < count and all(differ(pose, other) for _, other in kept):
-            kept.append((iou, pose))
+    kept = distinct(((pose, (iou, pose)) for iou, pose in found), count, symmetry)
     return [(iou, turned_alignment(pose, view.camera_from_facing)) for iou, pose in kept]
 
 
@@ -388,7 +390,29 @@ def _overlap(atlas: Atlas, view: _Facing, pose: Alignment, *, is_cut: bool) -> f
     return best
 
 
-def differ(one: Alignment, other: Alignment) -> bool:
+def distinct(
+    found: Iterable[tuple[Alignment, T]], count: int, symmetry: Symmetry | None
+) -> list[T]:
+    """The first ones, so many at most, whose alignments are too far apart for a common minimum.
+
+    Of alignments that are equal under the symmetry the canonical ones are compared.
+    """
+    group = None if symmetry is None else group_of(symmetry)
+    poses: list[Alignment] = []
+    kept: list[T] = []
+    for given, each in found:
+        pose = given
+        if group is not None and not group.is_trivial:
+            pose = group.canonical(given, tolerance=_DISTINCT_STRETCH).alignment
+        if all(_differ(pose, other) for other in poses):
+            poses.append(pose)
+            kept.append(each)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _differ(one: Alignment, other: Alignment) -> bool:
     """True if rotations or scales are too far apart for one start to lead to both."""
     turn = angle_between(one.rotation, other.rotation)
     stretch = np.abs(np.log(one.scale / other.scale)).max()

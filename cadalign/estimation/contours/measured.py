@@ -123,13 +123,16 @@ def shift_to(place: FloatArray, other: FloatArray) -> FloatArray:
 class Sought(NamedTuple, Generic[Shown]):
     """Evidence, of so many keypoints, and the surface that is sought in ``views``.
 
-    These are contours of masks, photos or depths.
+    These are contours of masks, photos or depths. ``is_one_camera`` says that all contours have
+    their own modes in common, as the pictures of a video do: otherwise a fit takes time with the
+    square of their number.
     """
 
     evidence: Evidence
     keypoints: int
     views: list[Shown]
     surface: Surface
+    is_one_camera: bool = False
 
     def at(self, state: State) -> tuple[PosedSurface, list[Alignment]]:
         """The surface, and the alignments in all views."""
@@ -144,14 +147,14 @@ class Sought(NamedTuple, Generic[Shown]):
 
     def joined(self, place: Place, rows: Sequence[Measured]) -> Joined:
         """The evidence with what was measured at a place."""
-        return Joined.of(self.evidence, self.keypoints, rows, place)
+        return Joined.of(self.evidence, self.keypoints, rows, place, self.is_one_camera)
 
 
 class Joined(NamedTuple):
     """Evidence with what was measured at points of a surface.
 
     The ``state`` of this evidence is that of the ``place``, with ``points`` more points after the
-    keypoints.
+    keypoints; the rows of the place's own modes are equal if they are ``is_one_camera``'s.
     """
 
     evidence: Evidence
@@ -159,16 +162,27 @@ class Joined(NamedTuple):
     place: Place
     keypoints: int
     points: int
+    is_one_camera: bool = False
 
     @classmethod
     def of(
-        cls, evidence: Evidence, keypoints: int, rows: Sequence[Measured], place: Place
+        cls,
+        evidence: Evidence,
+        keypoints: int,
+        rows: Sequence[Measured],
+        place: Place,
+        is_one_camera: bool = False,
     ) -> Joined:
         """The evidence with ``rows``; the modes of a contour's own are the last ones."""
         points = sum(len(each.mean) for each in rows)
-        full = _with_measured(evidence, keypoints, rows, points)
-        bare = cls(full, place.state, place, keypoints, points)
+        full = _with_measured(evidence, keypoints, rows, points, is_one_camera)
+        bare = cls(full, place.state, place, keypoints, points, is_one_camera)
         return bare._replace(state=bare.at(place))
+
+    @property
+    def _own(self) -> FloatArray:
+        """The distinct rows of the place's own modes."""
+        return self.place.own[:1] if self.is_one_camera else self.place.own
 
     def at(self, place: Place) -> State:
         """Another place as a state of this evidence."""
@@ -178,7 +192,7 @@ class Joined(NamedTuple):
             state.poses.copy(),
             state.log_focals.copy(),
             state.log_scales.copy(),
-            np.concatenate([state.coefficients, place.own.ravel()]),
+            np.concatenate([state.coefficients, self._replace(place=place)._own.ravel()]),
             np.concatenate([still[:first], none, still[first:]]),
         )
 
@@ -189,22 +203,27 @@ class Joined(NamedTuple):
             return None
         still, first = state.displacements, self.keypoints
         coefficients, own = np.split(
-            state.coefficients.copy(), [len(state.coefficients) - self.place.own.size]
+            state.coefficients.copy(), [len(state.coefficients) - self._own.size]
         )
         bare = state._replace(
             coefficients=coefficients,
             displacements=np.concatenate([still[:first], still[first + self.points :]]),
         )
-        place = Place(bare, own.reshape(self.place.own.shape))
-        return cost, self._replace(state=state, place=place)
+        rows = np.broadcast_to(own.reshape(self._own.shape), self.place.own.shape)
+        return cost, self._replace(state=state, place=Place(bare, rows.copy()))
 
 
 def _with_measured(
-    evidence: Evidence, keypoints: int, measured: Sequence[Measured], total: int
+    evidence: Evidence,
+    keypoints: int,
+    measured: Sequence[Measured],
+    total: int,
+    is_one_camera: bool,
 ) -> Evidence:
     """The evidence with what was measured at ``total`` points."""
     shape, last = evidence.shape, len(evidence.shape.modes)
-    further = sum(len(each.own) for each in measured if each.own is not None)
+    counts = [len(each.own) for each in measured if each.own is not None]
+    further = max(counts, default=0) if is_one_camera else sum(counts)
     end = keypoints + total
     mean = np.concatenate([shape.mean[:keypoints], np.zeros((total, 3)), shape.mean[keypoints:]])
     modes = np.zeros((last + further, len(mean), 3))
@@ -225,7 +244,7 @@ def _with_measured(
         modes[: len(own_modes), there] = own_modes  # none for a rigid surface
         if own is not None:
             modes[last : last + len(own), there] = own
-            last += len(own)
+            last += 0 if is_one_camera else len(own)
         name = "sightings" if isinstance(table, Sightings) else "planes"
         tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
         first = there.stop

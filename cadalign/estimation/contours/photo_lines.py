@@ -46,7 +46,7 @@ _LEAST_PIXELS = 30
 _RIM_REACH = 2.0  # cells
 _BORDER = 2.0  # [px]
 _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other things
-_NEIGHBOUR = 0.36  # weight of a neighbour's log likelihoods
+_NEIGHBOUR = 0.45  # weight of a neighbour's log likelihoods
 _STRAY = 1e-3  # probability of a crossing anywhere on a line, beside its colours
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 

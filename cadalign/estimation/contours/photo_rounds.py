@@ -40,7 +40,7 @@ _LAST_ROUNDS = 3  # with the noise that is learned, at most
 _FORESIGHT = 4.0  # reach of lines that a step may need, relative to the last one
 _FINE_REACH = 0.05  # below which silhouettes have more cells
 _CELLS, _COARSE_CELLS = 220, 80  # along the longer side of a silhouette
-_ITERATIONS = 4  # of a round, whose outline is not that of its end
+_ITERATIONS = 8  # of a round, whose outline is not that of its end
 _FIRST_CORRELATION = 4.0  # lines
 _LEAST_CORRELATION = 12.0  # lines: pixels and blur displace neighbours alike
 _LEAST_FACTOR = 0.7
@@ -137,6 +137,8 @@ def _round(
         return None
     own, (_, joined) = np.zeros_like(place.own), refined
     own[shown] = joined.place.own
+    if pictured.is_one_camera:
+        own[:] = joined.place.own[0]
     there = Place(joined.place.state, own)
     return Approach(there, tuple(outlines), joined, _step(pictured, outlines, rows, there.state))
 

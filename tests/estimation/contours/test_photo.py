@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
+from support.timing import Measure, ratio, timed
 
 from cadalign import Alignment, Camera, Mesh, Model, Tracker, View, align
 from cadalign.errors import DataError, InputError
@@ -262,6 +263,17 @@ class TestTrack:
         assert result.trajectory is not None
         assert result.alignment.scale == pytest.approx([1.0, 1.2, 0.9], rel=0.02)
         assert [each.view for each in result.evidence if each.kind == "photo"] == list(range(8))
+
+    @pytest.mark.timing
+    def test_time_grows_with_the_number_of_pictures(self) -> None:
+        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
+
+        def aligning(count: int) -> Measure:
+            views = self.views(count, image=True)
+            return timed(lambda: align(model, views, motion="smooth"))
+
+        # Four times as many: 16 times where each picture has unknowns in common with all frames.
+        assert ratio(aligning(40), aligning(10), below=8.0, rounds=1) < 8.0
 
     def test_masks_do_as_well(self) -> None:
         model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)

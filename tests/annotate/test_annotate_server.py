@@ -8,12 +8,15 @@ import json
 import socket
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from support.annotating import Case, served
+from support.files import TETRAHEDRON
 
 from cadalign.annotate import guard
 from cadalign.annotate.guard import MAX_BODY, Access
+from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.server import listen
 from cadalign.errors import InputError
 
@@ -66,6 +69,21 @@ def test_with_the_token_everything_is_served(access: Access, path: str) -> None:
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     assert headers["Cache-Control"] == "no-store"
     assert "Access-Control-Allow-Origin" not in headers
+
+
+def test_the_model_of_each_number_is_served(original: Case, tmp_path: Path) -> None:
+    other = tmp_path / "other.obj"
+    other.write_text(TETRAHEDRON)
+    session = original.open(models=(other,), prepared=False)
+    with served(session) as opened:
+        for number in (0, 1):
+            model = session.models[number]
+            creases = model.wireframe.creases
+            for path, content in (
+                ("/model", display_bytes(model.cad)),
+                ("/details", detail_bytes(model.cad, creases)),
+            ):
+                assert ask(opened, f"{path}?number={number}")[::2] == (200, content)
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/nowhere", "/?token=", "/?token=wrong"])

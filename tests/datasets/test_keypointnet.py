@@ -202,6 +202,23 @@ def test_mesh_that_does_not_belong_to_the_annotation_is_refused(root):
         model.load_mesh()
 
 
+@pytest.mark.parametrize(("off", "is_refused"), [(1e-3, False), (3e-3, True)])
+def test_annotations_may_be_a_thousandth_of_the_diagonal_off(tmp_path, off, is_refused):
+    centered = entry("a")
+    for number, keypoint in enumerate(centered["keypoints"]):
+        keypoint["xyz"] = (np.array(keypoint["xyz"]) - 0.5 + [0, 0, off * (number == 2)]).tolist()
+    write_json(tmp_path / "annotations/chair.json", [centered])
+    path = write_obj(tmp_path / f"models/{CHAIR}/a/models/model_normalized.obj")
+    rows = [f"v {x} {y} {z}" for x, y, z in CORNERS - 0.5]
+    path.write_text("\n".join([*rows, *(r for r in TETRAHEDRON.splitlines() if r[0] == "f")]))
+    model = KeypointNet(tmp_path)["chair", "a"]
+    if is_refused:
+        with pytest.raises(DataError, match=r"keypoints\[2\] lies 0\.003 off"):
+            model.load_mesh()
+    else:
+        assert len(model.load_mesh().faces) == 4
+
+
 # --- malformed annotations
 
 

@@ -151,8 +151,9 @@ def test_sigma_may_be_a_numpy_number(sigma: Any) -> None:
     assert (run(RAGGED, sigma=sigma).scale == run(RAGGED, sigma=2.0).scale).all()
 
 
-def test_problem_without_solution_gets_its_error_and_the_rest_goes_on() -> None:
-    problems = problems_of([10, 3, 8, 12])
+@pytest.mark.parametrize("lens", [None, LENS])
+def test_problem_without_solution_gets_its_error_and_the_rest_goes_on(lens: Camera | None) -> None:
+    problems = problems_of([10, 3, 8, 12], **({} if lens is None else {"camera": lens}))
     flat = problems[2].points_3d.copy()
     flat[:, 2] = 0.1
     batch = fit_batch(

@@ -94,6 +94,17 @@ def test_threads_do_not_change_the_result() -> None:
     np.testing.assert_array_equal(one.rotation, two.rotation)
 
 
+@pytest.mark.parametrize("shape", ["sigmas", "covariances"])
+def test_keypoints_with_their_own_sigmas_have_the_threshold_of_these(shape: str) -> None:
+    problem, points_2d, _ = spoiled(4, points=60, outliers=20, noise_px=2.0)
+    own = np.full(60, 2.0) if shape == "sigmas" else np.tile(4.0 * np.eye(2), (60, 1, 1))
+    given = problem.points_3d, points_2d, CAMERA
+    one = fit(*given, sigma=2.0, ransac=RansacOptions())
+    each = fit(*given, sigma=own, ransac=RansacOptions())
+    assert (each.inliers == one.inliers).all()
+    np.testing.assert_allclose(each.alignment.packed, one.alignment.packed, atol=1e-6)
+
+
 def test_order_of_the_keypoints_does_not_matter() -> None:
     problem, points_2d, wrong = spoiled(6, points=120, outliers=70)
     order = np.random.default_rng(0).permutation(120)

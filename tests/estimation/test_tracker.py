@@ -102,6 +102,7 @@ def test_an_object_that_is_gone_is_lost_and_found_again() -> None:
     updates = [tracker.update(view) for view in views]
     assert updates[99].is_lost
     assert not updates[105].is_lost
+    assert not any(update.is_lost for update in updates if update.is_new)
     assert errors(updates, track)[105:].max() < 5.0
     in_gap, before = updates[60].pose, updates[39].pose
     assert in_gap is not None

@@ -34,3 +34,15 @@ def test_dashes_are_spread_over_a_line_and_end_with_it() -> None:
     assert (begins[0], ends[-1]) == pytest.approx((10.0, 110.0))
     np.testing.assert_allclose(np.subtract(begins[1:], ends[:-1]), 4.0)
     np.testing.assert_allclose(np.diff(begins), 10.4)
+
+
+@pytest.mark.parametrize("size", [(480, 640), (1920, 2560)])
+def test_a_cross_is_as_large_as_its_radius_in_any_photo(size: tuple[int, int]) -> None:
+    canvas = Canvas(np.zeros((*size, 3), np.uint8))
+    canvas.cross(canvas.place(np.array([[200.0, 150.0]]))[0], RED, radius=8.0)
+    picture = canvas.finished().astype(int)
+    rows, columns = np.nonzero(picture[:, :, 0] - picture[:, :, 1] > 100)  # without its casing
+    reach = 8.0 * size[0] / 480
+    ends = columns.min(), columns.max(), rows.min(), rows.max()
+    wanted = 200 - reach, 200 + reach, 150 - reach, 150 + reach
+    np.testing.assert_allclose(ends, wanted, atol=3.0)

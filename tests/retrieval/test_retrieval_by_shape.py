@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from support.refusals import refusal_line
@@ -16,7 +17,9 @@ from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.io.observation import Observation
+from cadalign.render.scene import LIGHT_GREY
 from cadalign.retrieval import LibraryModel
+from cadalign.retrieval.page import draw_match
 from cadalign.shapes.examples import Example
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
@@ -347,4 +350,10 @@ def test_command_estimates_a_focal_length_with_the_shape_alone(
     out = ["--shape", str(tmp_path / "table.shape"), "--out", str(tmp_path / "out")]
     assert main([*command, *out, "--top", "2"]) == 0
     assert "Focal length: estimated as" in capsys.readouterr().err
-    assert (tmp_path / "out" / "index.html").exists()
+    # The overlays are drawn with the estimated focal length.
+    found = LIBRARY.retrieve(seen(model), model.ids, UNKNOWN, shape=SHAPE, top=2)
+    camera, grey = found[0].camera, np.full((480, 640, 3), LIGHT_GREY, np.uint8)
+    assert camera is not None
+    assert camera.focal_known
+    overlay = cv2.imread(str(tmp_path / "out" / "overlay_01.png"))[..., ::-1]
+    np.testing.assert_array_equal(overlay, draw_match(grey, camera, found[0]))

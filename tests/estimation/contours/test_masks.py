@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -264,6 +265,13 @@ class TestBadInput:
         path.write_text("no picture")
         with pytest.raises(DataError, match=r"mask\.png"):
             chair(sample_root).view(mask=path)
+
+    def test_a_bound_without_a_mask_or_an_exact_model(self, sample_root: Path) -> None:
+        case = chair(sample_root)
+        similar = replace(case.model, shape_sigma=0.02)
+        for model, view in ((case.model, case.view()), (similar, case.view(mask=case.mask))):
+            with pytest.raises(InputError, match="expected a view with a mask, and an exact model"):
+                contour_bound(model, view, case.truth)
 
     def test_a_model_without_a_mesh_is_told_what_to_do(self, sample_root: Path) -> None:
         case = chair(sample_root)

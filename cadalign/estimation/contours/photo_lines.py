@@ -104,17 +104,19 @@ def with_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
     """Add a share of the log likelihoods (S, 2 K + 1) of the next lines along the outline.
 
     Near its place, an outline is displaced by nearly the same at neighbouring lines, so that these
-    help to choose between several crossings. ``are_neighbours`` (S - 1,) is true where a line and
-    the next one are.
+    help to choose between several crossings. Their colours are independent in part: the sum counts
+    by the root of its weights. ``are_neighbours`` (S - 1,) is true where a line and the next one
+    are.
     """
     highest = logs.max(axis=1, keepdims=True)
     total = np.exp(logs - highest).sum(axis=1, keepdims=True)
     bounded = np.logaddexp(logs - highest - np.log(total), np.log(_STRAY / logs.shape[1]))
     shares = _NEIGHBOUR * are_neighbours[:, None]
-    found = bounded.copy()
-    found[1:] += shares * bounded[:-1]
-    found[:-1] += shares * bounded[1:]
-    return np.asarray(found)
+    found, weights = bounded.copy(), np.ones((len(bounded), 1))
+    for own, other in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):
+        found[own] += shares * bounded[other]
+        weights[own] += shares
+    return np.asarray(found / np.sqrt(weights))
 
 
 def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:

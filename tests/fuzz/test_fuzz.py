@@ -42,8 +42,9 @@ def test_files_are_read_and_mutated_ones_read_or_refused(name: str, tmp_path: Pa
 
 def test_seeds_that_once_failed() -> None:
     # Equally good minima; numbers whose squares overflow; likelihoods beyond 1e16; no solution of
-    # LAPACK's; tiny and huge sigmas; keypoints whose variance overflows.
-    seeds = (29687, 32890, 38825, 46483, 859002, 5020788, 5040797, 5053209, 5099758, 5117344)
+    # LAPACK's; tiny and huge sigmas; keypoints whose variance overflows; variances that underflow.
+    seeds = (29687, 32890, 38825, 46483, 859002, 931296)
+    seeds += (5020788, 5040797, 5053209, 5099758, 5117344)
     for seed in seeds:
         fits.run_case(draw_case(seed))
 

@@ -169,6 +169,7 @@ def _within_prior(covariance: FloatArray, result: FittedKeypoints) -> FloatArray
             left = own * (most / variance)  # exact, where the difference below is of large numbers
             covariance = covariance - np.outer(own / variance, own) * (1 - most / variance)
             covariance[axis], covariance[:, axis] = left, left
+            np.fill_diagonal(covariance, np.maximum(covariance.diagonal(), 0.0))  # but for rounding
     return covariance
 
 

@@ -215,9 +215,8 @@ def _rank_category(
     deviation = known.deviation
     if options.shape_sigma > 0:
         deviation = options.shape_sigma * _extent(shape)
-    logs = log_likelihoods(
-        placed.reshape(len(models), -1), _widened(posterior, estimate, deviation)
-    )
+    vectors = Vectors(placed.reshape(len(models), -1), np.ones(len(models)))
+    logs = log_likelihoods(vectors, _widened(posterior, estimate, deviation))
     shown = set(view.keypoint_ids)
     seen = np.array([label in shown for label in shape.ids])
     has = known.has[models]
@@ -306,7 +305,7 @@ def _completed(values: FloatArray, prior: Gaussians) -> FloatArray:
     vectors = Vectors(values, np.ones(len(values)))
     every = zip(prior.weights, prior.means, prior.covariances, strict=True)
     parts = [Gaussians(*(np.array([value]) for value in each)) for each in every]
-    logs = np.array([log_likelihoods(values, part) for part in parts])
+    logs = np.array([log_likelihoods(vectors, part) for part in parts])
     shares = np.exp(logs - np.logaddexp.reduce(logs, axis=0))
     pairs = zip(shares, parts, strict=True)
     return np.asarray(sum(share[:, None] * vectors.completed(part) for share, part in pairs))

@@ -155,36 +155,39 @@ class _Posterior(NamedTuple):
 
 
 def _posterior(view: _View, mean: FloatArray, covariance: FloatArray, sigma: float) -> _Posterior:
-    """Generalised least squares for the pose, whose prior is flat, then the shape given it."""
-    squares = (_FACTORS**2)[:, None, None]
+    """Generalised least squares for the pose, whose prior is flat, then the shape given it.
+
+    In the eigenvectors of the shape's covariance in the image, the covariances by all factors,
+    noise included, are diagonal. The factors' powers are multiplied last.
+    """
+    n, squares = len(mean) // 3, _FACTORS**2
     across = view.by_shape @ covariance
-    noise = sigma**2 * np.eye(len(view.seen))
-    roots = np.linalg.cholesky(squares * (across @ view.by_shape.T) + noise)
+    values, vectors = np.linalg.eigh(across @ view.by_shape.T)
+    precisions = 1 / (squares[:, None] * np.maximum(values, 0.0) + sigma**2)  # (F, 2 g)
     known = np.column_stack([view.seen - view.by_shape @ mean, view.by_pose])
-    right = np.concatenate(
-        [np.broadcast_to(known, (len(roots), *known.shape)), squares * across], axis=2
-    )
-    whitened = np.linalg.solve(roots, right)
-    by_pose, gain = whitened[:, :, 1 : 1 + _POSE], whitened[:, :, 1 + _POSE :]
-    of_pose = np.linalg.inv(by_pose.swapaxes(1, 2) @ by_pose)
-    left = gain - by_pose @ (of_pose @ (by_pose.swapaxes(1, 2) @ gain))
-    n = len(mean) // 3
-    parts = (-1, gain.shape[1], n, 3)
+    known, across = vectors.T @ known, vectors.T @ across
+    gap, by_pose = known[:, 0], known[:, 1:]
+    weighted = by_pose.T * precisions[:, None]  # (F, 6, 2 g)
+    of_pose = np.linalg.inv(weighted @ by_pose)
+    gain = weighted @ across  # (F, 6, 3 n)
+    blocks = across.reshape(-1, n, 3)
+    pairs = (blocks[..., :, None] * blocks[..., None, :]).reshape(len(across), -1)
+    told = (precisions @ pairs).reshape(-1, n, 3, 3)
+    by_point = (-1, _POSE, n, 3)
+    left = (of_pose @ gain).reshape(by_point).transpose(0, 2, 3, 1)
+    told -= left @ gain.reshape(by_point).transpose(0, 2, 1, 3)
     own = np.einsum("iaib->iab", covariance.reshape(n, 3, n, 3))
-    told = np.einsum("fria,frib->fiab", gain.reshape(parts), left.reshape(parts))
-    gap = whitened[0, :, 0]  # without a factor, as estimates are
-    pose = of_pose[0] @ (by_pose[0].T @ gap)
-    rest = gap - by_pose[0] @ pose
+    first = precisions[0]  # without a factor, as estimates are
+    pose = of_pose[0] @ (weighted[0] @ gap)
+    gap = gap - by_pose @ pose
+    rest = first * gap
+    each = squares[:, None, None, None]
     return _Posterior(
         pose,
-        (mean + gain[0].T @ rest).reshape(-1, 3),
+        (mean + rest @ across).reshape(-1, 3),
         of_pose[:, :3, :3],
-        squares[..., None] * own - told,
-        float(
-            np.linalg.slogdet(of_pose[0])[1] / 2
-            - np.log(roots[0].diagonal()).sum()
-            - (rest @ rest) / 2
-        ),
+        each * own - each**2 * told,
+        float(np.linalg.slogdet(of_pose[0])[1] / 2 + np.log(first).sum() / 2 - rest @ gap / 2),
     )
 
 

@@ -8,13 +8,14 @@ components of few vectors keep sensible covariances.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 
 _UNSEEN = 1e-6  # weight of the previous mean: a component without vectors stays where it is
 
@@ -37,16 +38,24 @@ Prior = tuple[FloatArray, float, float]
 standard deviation that no direction falls below."""
 
 
-class Pattern(NamedTuple):
-    """Vectors, by their ``rows`` (r,), that have the same entries ``seen`` (n,), and no others.
-
-    ``values`` (r, n) are what they have, ``missing`` (d - n,) the entries that they lack.
-    """
+class Gap(NamedTuple):
+    """Vectors, by their ``rows`` (r, 1), that lack the entries ``missing`` (l,), and no others."""
 
     rows: IntArray
-    seen: IntArray
     missing: IntArray
-    values: FloatArray
+
+
+class Given(NamedTuple):
+    """What a Gaussian says of vectors, by the entries that these have.
+
+    The lower ``root`` (d, d) of its covariance, and ``offsets`` (N, d) from its mean, 0 for what is
+    missing. Of each of the vectors' `Gap`, the root of the inverse covariance of its l missing
+    entries, given the others, and how far below the mean these are expected, (l, r).
+    """
+
+    root: FloatArray
+    offsets: FloatArray
+    gaps: tuple[tuple[FloatArray, FloatArray], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,26 +66,30 @@ class Vectors:
     weights: FloatArray  # (N,), how often each vector counts
 
     @cached_property
-    def patterns(self) -> tuple[Pattern, ...]:
-        """The vectors grouped by the entries that they have."""
-        has = ~np.isnan(self.values)
-        if has.all():  # saves the sorting
-            kinds, kind_of = has[:1], np.zeros(len(has), dtype=np.int64)
-        else:
-            kinds, kind_of = np.unique(has, axis=0, return_inverse=True)
-        found = []
-        for number, kind in enumerate(kinds):
-            rows, seen = np.flatnonzero(kind_of.ravel() == number), np.flatnonzero(kind)
-            values = self.values[np.ix_(rows, seen)]
-            found.append(Pattern(rows, seen, np.flatnonzero(~kind), values))
-        return tuple(found)
+    def has(self) -> BoolArray:
+        """Which entries are not missing, (N, d)."""
+        return ~np.isnan(self.values)
+
+    @cached_property
+    def gaps(self) -> tuple[Gap, ...]:
+        """The vectors that lack entries, grouped by which these are."""
+        lacking = np.flatnonzero(~self.has.all(axis=1))
+        bits = np.packbits(self.has[lacking], axis=1)  # sorted faster than the entries themselves
+        _, first, kind_of = np.unique(bits, axis=0, return_index=True, return_inverse=True)
+        return tuple(
+            Gap(lacking[kind_of.ravel() == kind][:, None], np.flatnonzero(~self.has[row]))
+            for kind, row in enumerate(lacking[first].tolist())
+        )
+
+    def offsets(self, mean: FloatArray) -> FloatArray:
+        """Distances of the entries from a mean (d,), 0 for what is missing."""
+        return np.where(self.has, self.values - mean, 0.0)
 
     @cached_property
     def mean(self) -> FloatArray:
         """Mean of each entry; of the entries that no vector has, the mean of all entries."""
-        missing = np.isnan(self.values)
-        totals = np.where(missing, 0.0, self.weights[:, None]).sum(axis=0)
-        sums = (self.weights[:, None] * np.where(missing, 0.0, self.values)).sum(axis=0)
+        totals = np.where(self.has, self.weights[:, None], 0.0).sum(axis=0)
+        sums = (self.weights[:, None] * np.where(self.has, self.values, 0.0)).sum(axis=0)
         overall = sums.sum() / totals.sum()
         return np.asarray(np.where(totals > 0, sums / np.where(totals > 0, totals, 1.0), overall))
 
@@ -87,12 +100,12 @@ class Vectors:
 
     def completed(self, model: Gaussians) -> FloatArray:
         """The vectors with their expected missing entries under the first component, (N, d)."""
-        return _expect(self, np.zeros(len(self.values)), model, 0)[0]
+        return _expect(self, np.zeros(len(self.values)), model.means[0], _given(self, model)[0])[0]
 
 
-def log_likelihoods(values: FloatArray, model: Gaussians) -> FloatArray:
-    """Log density of the entries of vectors, (N, d) float, under a mixture; (N,) float."""
-    densities = _log_densities(Vectors(values, np.ones(len(values))), model)
+def log_likelihoods(vectors: Vectors, model: Gaussians) -> FloatArray:
+    """Log density of the entries of every vector under a mixture, (N,) float."""
+    densities = _log_densities(vectors, model, _given(vectors, model))
     return np.asarray(np.logaddexp.reduce(densities, axis=1))
 
 
@@ -103,7 +116,7 @@ def learn_gaussian(vectors: Vectors, *, strength: float, floor: float, rounds: i
     model, prior = start, (width, strength, floor)
     shares = vectors.weights[:, None]
     for _ in range(rounds):
-        model = _maximise(vectors, shares, model, prior)
+        model = _maximise(vectors, shares, model, _given(vectors, model), prior)
     return model
 
 
@@ -130,56 +143,69 @@ def learn_mixture(
     )
     responsibilities = np.eye(count)[labels]
     for turn in range(rounds):
+        given = _given(vectors, model)
         if turn:
-            densities = _log_densities(vectors, model)
+            densities = _log_densities(vectors, model, given)
             densities -= np.logaddexp.reduce(densities, axis=1, keepdims=True)
             responsibilities = np.exp(densities)
         within = np.einsum("g,gij->ij", model.weights, model.covariances)
         shares = vectors.weights[:, None] * responsibilities
-        model = _maximise(vectors, shares, model, (within, strength, floor))
+        model = _maximise(vectors, shares, model, given, (within, strength, floor))
     return model
 
 
-def _log_densities(vectors: Vectors, model: Gaussians) -> FloatArray:
+def _given(vectors: Vectors, model: Gaussians) -> list[Given]:
+    """What every component says of the vectors."""
+    found = []
+    for mean, covariance in zip(model.means, model.covariances, strict=True):
+        root, offsets, gaps = _root(covariance), vectors.offsets(mean), []
+        if vectors.gaps:
+            precision = _symmetric(_inverse(root))
+            pulled = offsets @ precision
+            for rows, missing in vectors.gaps:
+                of_gap = _root(precision[missing[:, None], missing])
+                gaps.append((of_gap, _solve(of_gap, pulled[rows, missing].T, twice=True)))
+        found.append(Given(root, offsets, tuple(gaps)))
+    return found
+
+
+def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Given]) -> FloatArray:
     """Log of weight times density of every vector under every component, (N, g) float."""
     found = np.empty((len(vectors.values), len(model.weights)))
-    for pattern in vectors.patterns:
-        seen = pattern.seen
-        constant = len(seen) / 2 * math.log(2 * math.pi)
-        for number, weight in enumerate(model.weights):
-            root = _root(model.covariances[number][seen[:, None], seen])
-            whitened = _solve(root, (pattern.values - model.means[number][seen]).T)
-            volume = np.log(root.diagonal()).sum() + constant
-            squares = np.einsum("nr,nr->r", whitened, whitened)
-            found[pattern.rows, number] = math.log(max(weight, 1e-300)) - volume - squares / 2
+    constants = vectors.has.sum(axis=1) / 2 * math.log(2 * math.pi)
+    for number, (root, offsets, gaps) in enumerate(given):
+        whitened = _solve(root, offsets.T)
+        squares = np.einsum("nr,nr->r", whitened, whitened)
+        volumes = constants + np.log(root.diagonal()).sum()
+        # The density of all entries, integrated over those that are missing.
+        for (rows, _), (of_gap, below) in zip(vectors.gaps, gaps, strict=True):
+            pulled = of_gap.T @ below
+            squares[rows[:, 0]] -= np.einsum("lr,lr->r", pulled, pulled)
+            volumes[rows[:, 0]] += np.log(of_gap.diagonal()).sum()
+        weight = max(float(model.weights[number]), 1e-300)
+        found[:, number] = math.log(weight) - volumes - squares / 2
     return found
 
 
 def _expect(
-    vectors: Vectors, shares: FloatArray, model: Gaussians, number: int
+    vectors: Vectors, shares: FloatArray, mean: FloatArray, given: Given
 ) -> tuple[FloatArray, FloatArray]:
     """Expected vectors, and the covariance of what is missing, summed with shares as weights."""
-    mean, covariance = model.means[number], model.covariances[number]
-    completed, spread = vectors.values.copy(), np.zeros_like(covariance)
-    for pattern in vectors.patterns:
-        seen, missing = pattern.seen, pattern.missing
-        if not len(missing):
-            continue
-        root = _root(covariance[seen[:, None], seen])
-        whitened = _solve(root, (pattern.values - mean[seen]).T)
-        across = _solve(root, covariance[seen[:, None], missing])
-        completed[pattern.rows[:, None], missing] = mean[missing] + whitened.T @ across
-        rest = covariance[missing[:, None], missing] - across.T @ across
-        spread[missing[:, None], missing] += shares[pattern.rows].sum() * rest
-    return completed, spread
+    completed, spread = vectors.values.copy(), np.zeros_like(given.root)
+    for (rows, missing), (of_gap, below) in zip(vectors.gaps, given.gaps, strict=True):
+        completed[rows, missing] = mean[missing] - below.T
+        spread[missing[:, None], missing] += shares[rows].sum() * _inverse(of_gap)
+    return completed, _symmetric(spread)
 
 
-def _maximise(vectors: Vectors, shares: FloatArray, model: Gaussians, prior: Prior) -> Gaussians:
+def _maximise(
+    vectors: Vectors, shares: FloatArray, model: Gaussians, given: Sequence[Given], prior: Prior
+) -> Gaussians:
     """One round: the mixture that makes the completed vectors most likely."""
     means, covariances = [], []
     towards, strength, floor = prior
     for number, share in enumerate(shares.T):
-        completed, spread = _expect(vectors, share, model, number)
+        completed, spread = _expect(vectors, share, model.means[number], given[number])
         mean = share @ completed + _UNSEEN * model.means[number]
         mean /= share.sum() + _UNSEEN
         offsets = completed - mean
@@ -203,8 +229,22 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(root)
 
 
-def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
-    from scipy.linalg.lapack import dtrtrs
+def _solve(root: FloatArray, right: FloatArray, *, twice: bool = False) -> FloatArray:
+    """The quotient by the root, or, ``twice``, by the matrix that has it."""
+    from scipy.linalg.lapack import dpotrs, dtrtrs
 
-    solution, _ = dtrtrs(root, right, lower=1)
+    solution, _ = (dpotrs if twice else dtrtrs)(root, right, lower=1)
     return np.asarray(solution)
+
+
+def _inverse(root: FloatArray) -> FloatArray:
+    """The lower half of the inverse of the matrix that has the root, zeros above."""
+    from scipy.linalg.lapack import dpotri
+
+    lower, _ = dpotri(root, lower=1)
+    return np.asarray(lower)
+
+
+def _symmetric(lower: FloatArray) -> FloatArray:
+    """The matrix with that lower half."""
+    return lower + np.tril(lower, -1).T

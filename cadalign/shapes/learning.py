@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from importlib import import_module
 from typing import NamedTuple, cast
 
@@ -72,22 +73,37 @@ class _Models:
     ids: Sequence[KeypointId]  # (m,) int or str
     rows: FloatArray  # (N, m + 2, 3), keypoints and box corners, NaN where missing
     size: float  # their median diagonal
+    _known: dict[_Recipe, tuple[Vectors, Gaussians]] = field(default_factory=dict)
 
     def some(self, chosen: BoolArray) -> _Models:
         """A part of the models."""
-        return replace(self, rows=self.rows[chosen])
+        return _Models(self.ids, self.rows[chosen], self.size)
+
+    @cached_property
+    def vectors(self) -> Vectors:
+        """The models, without mirror images."""
+        return _vectors(self.rows, None, self.ids)
 
     def completed(self) -> FloatArray:
         """The models with their expected missing keypoints, (N, m + 2, 3) float."""
-        vectors = _vectors(self.rows, None, self.ids)
-        common = learn_gaussian(vectors, strength=0.0, floor=_FLOOR * self.size, rounds=_ROUNDS)
-        return vectors.completed(common).reshape(self.rows.shape)
+        common = self.common(_Recipe(strength=0.0))[1]
+        return self.vectors.completed(common).reshape(self.rows.shape)
+
+    def common(self, recipe: _Recipe) -> tuple[Vectors, Gaussians]:
+        """What is learned from, and the Gaussian of all, which recipes of mixtures share."""
+        single = replace(recipe, components=1)
+        if single not in self._known:
+            vectors = self.vectors
+            if recipe.reflection is not None:
+                vectors = _vectors(self.rows, recipe.reflection, self.ids)
+            floor, strength = _FLOOR * self.size, recipe.strength
+            gaussian = learn_gaussian(vectors, strength=strength, floor=floor, rounds=_ROUNDS)
+            self._known[single] = vectors, gaussian
+        return self._known[single]
 
     def mixture(self, recipe: _Recipe) -> Gaussians:
         """Learn by a recipe."""
-        vectors = _vectors(self.rows, recipe.reflection, self.ids)
-        floor = _FLOOR * self.size
-        common = learn_gaussian(vectors, strength=recipe.strength, floor=floor, rounds=_ROUNDS)
+        vectors, common = self.common(recipe)
         if recipe.components == 1:
             return common
         return learn_mixture(
@@ -95,7 +111,7 @@ class _Models:
             _clusters(vectors, common, recipe.components),
             common,
             strength=_MIXTURE_STRENGTH,
-            floor=floor,
+            floor=_FLOOR * self.size,
             rounds=_ROUNDS,
         )
 
@@ -105,14 +121,13 @@ class _Models:
         One model in a hundred is taken as unlike any other, so that a few of these, whose
         likelihood may be of any order, don't decide between mixtures.
         """
-        values = self.rows.reshape(len(self.rows), -1)
-        common = log_likelihoods(values, mixture.widened(_RESOLUTION * self.size))
+        common = log_likelihoods(self.vectors, mixture.widened(_RESOLUTION * self.size))
         broad = Gaussians(
             np.ones(1),
             mixture.means.mean(axis=0)[None],
-            self.size**2 * np.eye(values.shape[1])[None],
+            self.size**2 * np.eye(mixture.means.shape[1])[None],
         )
-        unlike = log_likelihoods(values, broad)
+        unlike = log_likelihoods(self.vectors, broad)
         return np.logaddexp(math.log1p(-_UNLIKE) + common, math.log(_UNLIKE) + unlike)
 
 
@@ -140,6 +155,8 @@ class _CrossValidation:
     def __init__(self, models: _Models, on_progress: Callable[[int, int], object]) -> None:
         self._models = models
         self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
+        self._kept = [models.some(self._folds != fold) for fold in range(_FOLDS)]
+        self._held_out = [models.some(self._folds == fold) for fold in range(_FOLDS)]
         self._on_progress, self._done = on_progress, 0
 
     def choose(self, components: int | None, modes: int | None, reflection: bool) -> Choice:
@@ -190,8 +207,8 @@ class _CrossValidation:
 
     def _try(self, recipe: _Recipe) -> _Trial:
         learned = []
-        for fold in range(_FOLDS):
-            learned.append(self._models.some(self._folds != fold).mixture(recipe))
+        for kept in self._kept:
+            learned.append(kept.mixture(recipe))
             self._done += 1
             self._on_progress(min(self._done, _STEPS - 1), _STEPS)
         return _Trial(recipe, tuple(learned), self._scores(learned))
@@ -199,8 +216,7 @@ class _CrossValidation:
     def _scores(self, learned: Sequence[Gaussians]) -> FloatArray:
         found = np.empty(len(self._folds))
         for fold, mixture in enumerate(learned):
-            held_out = self._folds == fold
-            found[held_out] = self._models.some(held_out).log_likelihoods(mixture)
+            found[self._folds == fold] = self._held_out[fold].log_likelihoods(mixture)
         return found
 
 

@@ -11,6 +11,7 @@ import logging
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import overload
 
@@ -185,7 +186,9 @@ class KeypointNet:
         """
         if name not in self.splits:
             raise unknown("split", name, self.splits, where=str(self.root / "splits"))
-        return _read_split(self.root / "splits" / f"{name}.txt")
+        path = self.root / "splits" / f"{name}.txt"
+        state = path.stat()
+        return _read_split(path, state.st_mtime_ns, state.st_size)
 
     def subset(
         self,
@@ -335,7 +338,9 @@ class KeypointNet:
         return models
 
 
-def _read_split(path: Path) -> frozenset[ModelKey]:
+@lru_cache(maxsize=16)
+def _read_split(path: Path, _modified: int, _size: int) -> frozenset[ModelKey]:
+    """The members of a split, whose file is read once as long as it does not change."""
     members = set()
     lines = read_text(path, errors="replace").splitlines()
     for number, line in enumerate(lines, start=1):

@@ -140,6 +140,7 @@ def test_splits(root):
     dataset = KeypointNet(root)
     assert dataset.splits == ("test", "train")
     assert dataset.split("test") == {("chair", "z")}
+    assert dataset.split("test") is KeypointNet(root).split("test")  # read once
     assert [model.key for model in dataset.subset(split="train")] == [("chair", "a"), ("mug", "m")]
     with pytest.raises(InputError, match="unknown split 'val'; known are test, train"):
         KeypointNet(root).split("val")

@@ -45,7 +45,7 @@ def test_log_likelihoods_are_the_marginal_densities(seed: int) -> None:
     values = rng.normal(size=(12, 4))
     values[rng.random(values.shape) < 0.4] = np.nan
     values[:, 0] = 0.5
-    for value, found in zip(values, log_likelihoods(values, model), strict=True):
+    for value, found in zip(values, log_likelihoods(vectors_of(values), model), strict=True):
         seen = np.flatnonzero(~np.isnan(value))
         density = sum(
             weight * multivariate_normal(mean[seen], each[np.ix_(seen, seen)]).pdf(value[seen])
@@ -73,9 +73,10 @@ def test_every_round_makes_the_vectors_more_likely() -> None:
     values = correlated(rng, 100, 5)
     values[:60, 4] = np.nan
     values[30:90, 2] = np.nan
+    vectors = vectors_of(values)
     totals = [
         log_likelihoods(
-            values, learn_gaussian(vectors_of(values), strength=0.0, floor=0.0, rounds=rounds)
+            vectors, learn_gaussian(vectors, strength=0.0, floor=0.0, rounds=rounds)
         ).sum()
         for rounds in range(2, 12)
     ]

@@ -83,15 +83,6 @@ def test_corner_of_a_photo_is_found_to_parts_of_a_pixel() -> None:
     assert nearest_corner(np.zeros((80, 90, 3), dtype=np.uint8), (1, 1), reach=8) is None
 
 
-@pytest.mark.parametrize("off", [(9, 0), (-9, 0), (0, 9), (0, -9)])
-def test_corner_of_a_photo_is_found_on_any_side(off: tuple[int, int]) -> None:
-    photo = np.full((80, 90, 3), 30, np.uint8)
-    photo[40:, 45:] = 230
-    found = nearest_corner(photo, (44.5 + off[0], 39.5 + off[1]), reach=10)
-    assert found is not None
-    np.testing.assert_allclose(found, (44.5, 39.5), atol=0.5)
-
-
 def test_snapped_photo_points_are_placed_and_moved(case: Case) -> None:
     session = case.open()
     perform(session, 0, {"do": "place_uv", "uv": [200, 200], "snap": 60})

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tyro
@@ -99,6 +100,13 @@ def test_masks_of_objects_are_apart_and_no_photos(two: Session, case: Case) -> N
     assert not two.objects[0][0].document.evidence.mask
     session = case.open(image=case.folder)
     assert [each["name"] for each in worklist_state(session)] == ["photo.png"]
+
+
+def test_a_mask_that_the_options_give_is_of_the_first_object(two: Session, case: Case) -> None:
+    mask = case.folder / "given.png"
+    cv2.imwrite(str(mask), np.full((480, 640), 255, np.uint8))
+    again = case.open(mask=mask, prepared=False)
+    assert [each.further.image.mask for each in again.objects[0]] == [mask.resolve(), None]
 
 
 def test_a_deleted_object_is_brought_back(two: Session, case: Case) -> None:

@@ -19,6 +19,18 @@ def test_texts_of_a_legend_stand_beside_their_samples() -> None:
     assert np.flatnonzero(light).min() > np.flatnonzero(red).max()
 
 
+@pytest.mark.parametrize(("right", "below"), [(False, False), (True, False), (False, True)])
+def test_a_legend_stands_in_the_corner_that_is_free(right: bool, below: bool) -> None:
+    canvas = Canvas(np.zeros((480, 640, 3), np.uint8))
+    x, y = np.meshgrid(np.arange(0, 640, 8.0), np.arange(0, 480, 8.0))
+    free = ((x > 320) == right) & ((y > 240) == below)
+    drawn = np.stack([x[~free], y[~free]], axis=1)
+    canvas.legend([("found", RED, "line")], keep_clear=canvas.place(drawn))
+    rows, columns = np.nonzero(canvas.finished().any(axis=2))
+    assert ((columns > 320) == right).all()
+    assert ((rows > 240) == below).all()
+
+
 @pytest.mark.parametrize("size", [(40, 640), (640, 40)])
 def test_a_legend_that_has_no_room_is_left_out(size: tuple[int, int]) -> None:
     before = np.full((*size, 3), 90, np.uint8)

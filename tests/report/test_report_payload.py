@@ -34,6 +34,7 @@ from cadalign.evaluation.runs.tables import read_table
 from cadalign.geometry.metrics import alignment_box_iou, rotation_error
 from cadalign.report import write_report
 from cadalign.report.instances import INLINE_LIMIT, compact
+from cadalign.report.page import line_dict
 from cadalign.retrieval import LibraryModel
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "limit")
@@ -699,3 +700,12 @@ def test_a_page_that_cannot_be_written_is_an_error(drawn: Path, tmp_path: Path) 
     (tmp_path / "folder").mkdir()
     with pytest.raises(DataError, match="cannot be written"):
         write_report([drawn], tmp_path / "folder")
+
+
+def test_a_colour_on_a_dark_ground_is_itself_if_it_is_light_and_else_a_lighter_one() -> None:
+    assert line_dict("a", "a", "#e0c060")["color_dark"] == "#e0c060"
+    lighter = line_dict("a", "a", "#102060")["color_dark"]
+    red, green, blue = (int(lighter[place : place + 2], 16) for place in (1, 3, 5))
+    assert len(lighter) == 7
+    assert 0x10 < red < green < blue
+    assert blue > 0x60

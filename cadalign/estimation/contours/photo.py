@@ -58,7 +58,7 @@ _SAME_TURN = np.radians(1.0)
 _LEAST_SUPPORT = 0.5  # share of the outline that must be found
 _LEAST_CONTRAST = 2.0  # [nats], that colours must give the silhouette: noise gives one
 _GOOD_SUPPORT = 0.75  # below which a warning says so
-_MOST_RMS = 1.75  # of the lines found, in standard deviations, above which a warning says so
+_MOST_RMS = 1.4  # of the lines found, in standard deviations, above which a warning says so
 _LEAST_PROBABILITY = 1e-3  # of such a rise of the other residuals by chance
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
 from cadalign.estimation.uncertainty.evidence import seen_in_cameras
@@ -197,12 +198,20 @@ def _draws(count: int, size: int, ransac: RansacOptions, scores: FloatArray | No
     wanted = min(max(math.ceil(without), ransac.min_iterations), ransac.max_iterations)
     if math.comb(count, size) <= wanted:
         return np.array(list(combinations(range(count), size)))
-    rng = np.random.default_rng(ransac.seed)
+    told = None if scores is None or not scores.sum() > 0 else tuple(scores.tolist())
+    return _drawn(count, size, wanted, ransac.seed, told)
+
+
+@lru_cache(maxsize=16)  # the same at every focal length, and with every mistake undone
+def _drawn(
+    count: int, size: int, wanted: int, seed: int, scores: tuple[float, ...] | None
+) -> IntArray:
+    rng = np.random.default_rng(seed)
     weights = None
-    if scores is not None and scores.sum() > 0:
-        weights = scores + _LEAST_CONFIDENCE * scores.max()
+    if scores is not None:
+        weights = np.array(scores) + _LEAST_CONFIDENCE * max(scores)
         weights = weights / weights.sum()
     draws = [
         rng.choice(count, size, replace=False, p=weights if k % 2 else None) for k in range(wanted)
     ]
-    return np.unique(np.sort(draws, axis=1), axis=0)
+    return read_only(np.unique(np.sort(draws, axis=1), axis=0))

@@ -38,8 +38,8 @@ _LEAST_REACH = 5.0  # [px]
 _ROUNDS = 3  # of every reach, at most
 _LAST_ROUNDS = 3  # with the noise that is learned, at most
 _FORESIGHT = 4.0  # reach of lines that a step may need, relative to the last one
-_FINE_REACH = 0.05  # below which silhouettes have more cells
-_CELLS, _COARSE_CELLS = 220, 80  # along the longer side of a silhouette
+_REACH_CELLS = 6.4  # of a silhouette in which lines are sought, that these reach across
+_FEWEST_CELLS, _MOST_CELLS = 80, 220  # along the longer side of a silhouette
 _ITERATIONS = 8  # of a round, whose outline is not that of its end
 _FIRST_CORRELATION = 4.0  # lines
 _LEAST_CORRELATION = 12.0  # lines: pixels and blur displace neighbours alike
@@ -115,7 +115,7 @@ def _round(
 ) -> Approach | None:
     """One step, with the outline that the present state has."""
     posed, poses = pictured.at(place.state)
-    cells = _CELLS if share < _FINE_REACH else _COARSE_CELLS
+    cells = round(min(max(_REACH_CELLS / share, _FEWEST_CELLS), _MOST_CELLS))
     outlines: list[Outline | None] = []
     rows = []
     for photo, noise in zip(pictured.views, noises, strict=True):

@@ -45,8 +45,8 @@ class Gap(NamedTuple):
     missing: IntArray
 
 
-class Given(NamedTuple):
-    """What a Gaussian says of vectors, by the entries that these have.
+class Conditional(NamedTuple):
+    """A Gaussian of vectors, given the entries that these have.
 
     The lower ``root`` (d, d) of its covariance, and ``offsets`` (N, d) from its mean, 0 for what is
     missing. Of each of the vectors' `Gap`, the root of the inverse covariance of its l missing
@@ -67,7 +67,7 @@ class Vectors:
 
     @cached_property
     def has(self) -> BoolArray:
-        """Which entries are not missing, (N, d)."""
+        """Mark the entries that are not missing, (N, d)."""
         return ~np.isnan(self.values)
 
     @cached_property
@@ -100,12 +100,14 @@ class Vectors:
 
     def completed(self, model: Gaussians) -> FloatArray:
         """The vectors with their expected missing entries under the first component, (N, d)."""
-        return _expect(self, np.zeros(len(self.values)), model.means[0], _given(self, model)[0])[0]
+        return _expect(
+            self, np.zeros(len(self.values)), model.means[0], _conditionals(self, model)[0]
+        )[0]
 
 
 def log_likelihoods(vectors: Vectors, model: Gaussians) -> FloatArray:
     """Log density of the entries of every vector under a mixture, (N,) float."""
-    densities = _log_densities(vectors, model, _given(vectors, model))
+    densities = _log_densities(vectors, model, _conditionals(vectors, model))
     return np.asarray(np.logaddexp.reduce(densities, axis=1))
 
 
@@ -116,7 +118,7 @@ def learn_gaussian(vectors: Vectors, *, strength: float, floor: float, rounds: i
     model, prior = start, (width, strength, floor)
     shares = vectors.weights[:, None]
     for _ in range(rounds):
-        model = _maximise(vectors, shares, model, _given(vectors, model), prior)
+        model = _maximise(vectors, shares, model, _conditionals(vectors, model), prior)
     return model
 
 
@@ -143,7 +145,7 @@ def learn_mixture(
     )
     responsibilities = np.eye(count)[labels]
     for turn in range(rounds):
-        given = _given(vectors, model)
+        given = _conditionals(vectors, model)
         if turn:
             densities = _log_densities(vectors, model, given)
             densities -= np.logaddexp.reduce(densities, axis=1, keepdims=True)
@@ -154,8 +156,8 @@ def learn_mixture(
     return model
 
 
-def _given(vectors: Vectors, model: Gaussians) -> list[Given]:
-    """What every component says of the vectors."""
+def _conditionals(vectors: Vectors, model: Gaussians) -> list[Conditional]:
+    """Every component, given the entries that the vectors have."""
     found = []
     for mean, covariance in zip(model.means, model.covariances, strict=True):
         root, offsets, gaps = _root(covariance), vectors.offsets(mean), []
@@ -165,11 +167,11 @@ def _given(vectors: Vectors, model: Gaussians) -> list[Given]:
             for rows, missing in vectors.gaps:
                 of_gap = _root(precision[missing[:, None], missing])
                 gaps.append((of_gap, _solve(of_gap, pulled[rows, missing].T, twice=True)))
-        found.append(Given(root, offsets, tuple(gaps)))
+        found.append(Conditional(root, offsets, tuple(gaps)))
     return found
 
 
-def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Given]) -> FloatArray:
+def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Conditional]) -> FloatArray:
     """Log of weight times density of every vector under every component, (N, g) float."""
     found = np.empty((len(vectors.values), len(model.weights)))
     constants = vectors.has.sum(axis=1) / 2 * math.log(2 * math.pi)
@@ -188,7 +190,7 @@ def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Given]) -
 
 
 def _expect(
-    vectors: Vectors, shares: FloatArray, mean: FloatArray, given: Given
+    vectors: Vectors, shares: FloatArray, mean: FloatArray, given: Conditional
 ) -> tuple[FloatArray, FloatArray]:
     """Expected vectors, and the covariance of what is missing, summed with shares as weights."""
     completed, spread = vectors.values.copy(), np.zeros_like(given.root)
@@ -199,7 +201,11 @@ def _expect(
 
 
 def _maximise(
-    vectors: Vectors, shares: FloatArray, model: Gaussians, given: Sequence[Given], prior: Prior
+    vectors: Vectors,
+    shares: FloatArray,
+    model: Gaussians,
+    given: Sequence[Conditional],
+    prior: Prior,
 ) -> Gaussians:
     """One round: the mixture that makes the completed vectors most likely."""
     means, covariances = [], []

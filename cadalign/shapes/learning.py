@@ -90,7 +90,7 @@ class _Models:
         return self.vectors.completed(common).reshape(self.rows.shape)
 
     def common(self, recipe: _Recipe) -> tuple[Vectors, Gaussians]:
-        """What is learned from, and the Gaussian of all, which recipes of mixtures share."""
+        """Vectors to learn from, and the Gaussian of all, which recipes of mixtures share."""
         single = replace(recipe, components=1)
         if single not in self._known:
             vectors = self.vectors

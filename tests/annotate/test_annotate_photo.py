@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.annotating import Case, flat, masks_searched_once, place_all
 
+from cadalign import ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.evidence import encode_runs
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main
+from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.metrics import rotation_error
 from cadalign.render import cast_geometry
+from cadalign.shapes.examples import Example
 
 pytestmark = pytest.mark.long
 
@@ -68,6 +72,27 @@ def test_a_mask_alone_is_aligned_and_a_candidate_chosen(
     assert not page_state(session, 0)["by_mask"]["chosen"]
     with pytest.raises(InputError, match="candidate: there is no candidate 9; reload the page"):
         perform(session, 0, {"do": "begin_at", "candidate": 9})
+
+
+@pytest.mark.parametrize("meshes", [True, False])
+def test_a_mask_alone_tells_of_a_learned_shape_with_meshes_only(
+    case: Case, sample_root: Path, *, meshes: bool
+) -> None:
+    model, rng = KeypointNet(sample_root)["chair", "sample_chair_000"], np.random.default_rng(0)
+    ids, points, bounds = (
+        model.keypoints.ids.tolist(),
+        model.keypoints.xyz,
+        model.load_mesh().bounds,
+    )
+    mesh = model.mesh_path if meshes else None
+    noises = rng.normal(0, 1e-3, (6, *points.shape))
+    examples = [Example(str(k), ids, points + each, bounds, mesh) for k, each in enumerate(noises)]
+    path = case.folder / "chair.shape"
+    ShapeModel.learn(examples, category="chair", up_axis="y").save(path)
+    session = case.open(shape=path)
+    draw_true_mask(session, case)
+    alignment = page_state(session, 0)["alignment"]
+    assert alignment["status"] == ("done" if meshes else "none"), alignment["message"]
 
 
 def test_the_photo_takes_the_place_of_a_mask(

@@ -6,6 +6,7 @@ import json
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,12 +25,13 @@ from support.photo_sets import (
 from support.refusals import refusal_line, refusal_text
 
 import cadalign.datasets
-from cadalign import Alignment
+from cadalign import Alignment, Camera
 from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.evaluation.api import evaluate, run
 from cadalign.evaluation.experiments.photos import SPEC, PhotosOptions
 from cadalign.evaluation.photos.given import score_poses, summarize_rows
+from cadalign.evaluation.photos.objects import _around
 from cadalign.evaluation.photos.target import farthest_points, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.opened import Run
@@ -392,3 +394,18 @@ def test_a_folder_without_photos_is_refused(
 ) -> None:
     text = refusal_line(capsys, "evaluate", "photos", tmp_path, "--out", tmp_path / "run")
     assert "no data set of photos is recognised in this folder" in text
+
+
+def test_a_thumb_shows_an_object_with_a_margin_and_has_its_camera() -> None:
+    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+    photo = np.zeros((480, 640, 3), np.uint8)
+    photo[200:261, 300:401] = 255
+    corners = np.array([[300.0, 200.0], [400.0, 260.0]])
+    sighting: Any = SimpleNamespace(target=SimpleNamespace(gt_box=None))
+    thumb, near = _around(photo, camera, sighting, corners)
+    assert (near.width, near.height) == thumb.shape[1::-1]
+    rows, columns = np.nonzero(thumb[..., 0] > 128)
+    assert (columns.max() - columns.min()) / near.width == pytest.approx(1 / 1.4, abs=0.02)
+    seen = (corners - (camera.cx, camera.cy)) * near.fx / camera.fx + (near.cx, near.cy)
+    found = [(columns.min(), rows.min()), (columns.max(), rows.max())]
+    np.testing.assert_allclose(found, seen, atol=3)

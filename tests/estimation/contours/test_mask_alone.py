@@ -12,7 +12,7 @@ import pytest
 from cadalign import Alignment, Camera, Mesh, Model, Symmetry, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DegenerateError
-from cadalign.estimation.contours.silhouettes import atlas_of, resembling_poses
+from cadalign.estimation.contours.silhouettes import atlas_of, distinct, resembling_poses
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
@@ -53,6 +53,17 @@ def posed(seed: int, scale: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Ali
 
 def mask_of(mesh: Mesh, pose: Alignment) -> np.ndarray:
     return np.asarray(cast_geometry(Scene(mesh), CAMERA, pose).mask)
+
+
+def test_of_equal_poses_one_is_a_start() -> None:
+    about = Symmetry.around([0, 1, 0], fold=None)
+    turns = [posed(0).rotation @ rotation_from_vector([0, angle, 0]) for angle in (0, 0.7, 1.5)]
+    other = rotation_from_vector([0.6, 0, 0]) @ posed(0).rotation
+    poses = [Alignment(turn, [0, 0, 3], np.ones(3)) for turn in (*turns, other)]
+    found = list(zip(poses, range(4), strict=True))
+    assert distinct(found, 4, None) == [0, 1, 2, 3]
+    assert distinct(found, 4, about) == [0, 3]
+    assert distinct(found, 2, None) == [0, 1]
 
 
 class TestOwnModel:

@@ -54,7 +54,7 @@ class TrackUpdate:
     is_lost : bool
         The keypoints contradict the track, or there were none for long: the pose is a guess.
     is_new : bool
-        The track begins with this frame, or was found again.
+        The track begins with this frame, or begins anew where the keypoints alone place the object.
     """
 
     pose: PoseAt | None

@@ -248,7 +248,7 @@ def _with_estimated_sigmas(
         found = search(sigmas)
         earlier.append(sigmas)
         sigmas = _estimate_sigmas(problems, options, points, found)
-        repeats = [np.allclose(sigmas, one, rtol=_SIGMA_TOLERANCE, atol=0) for one in earlier]
+        repeats = (np.allclose(sigmas, one, rtol=_SIGMA_TOLERANCE, atol=0) for one in earlier)
         if rounds == 1 or any(repeats):
             break
     assert found.covariances is not None

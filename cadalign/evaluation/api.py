@@ -101,12 +101,11 @@ def _check_given(
     kind: type[ExperimentOptions], experiment: str, source: Sequence[object], given: Collection[str]
 ) -> None:
     """Check that all options of an experiment that it needs are given, and no others."""
-    own = [each for each in fields(kind) if each.init]
+    own = {each.name: each for each in fields(kind) if each.init}
     for name in given:
-        if name not in {each.name for each in own}:
-            known = tuple(sorted(each.name for each in own))
-            raise unknown(f"option of {experiment}", name, known, where=f"evaluate({name}=)")
-    placed = [each for each in own if not each.kw_only]
+        if name not in own:
+            raise unknown(f"option of {experiment}", name, sorted(own), where=f"evaluate({name}=)")
+    placed = [each for each in own.values() if not each.kw_only]
     if len(source) > len(placed):
         raise InputError(f"{experiment} has no dataset", where="root", fix="leave it out")
     for each in placed[len(source) :]:

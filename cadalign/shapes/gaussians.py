@@ -100,9 +100,8 @@ class Vectors:
 
     def completed(self, model: Gaussians) -> FloatArray:
         """The vectors with their expected missing entries under the first component, (N, d)."""
-        return _expect(
-            self, np.zeros(len(self.values)), model.means[0], _conditionals(self, model)[0]
-        )[0]
+        unweighted, given = np.zeros(len(self.values)), _conditionals(self, model)[0]
+        return _expect(self, unweighted, model.means[0], given)[0]
 
 
 def log_likelihoods(vectors: Vectors, model: Gaussians) -> FloatArray:

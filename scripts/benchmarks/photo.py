@@ -37,7 +37,6 @@ _CLICKS = 6
 _CLICK_SHARE = 4.0 / 640.0  # standard deviation of a click, relative to the photo's width
 _STRETCH_SIGMA = 0.3
 _WORSE_DEG = 1.0
-_LOOKS = ("contrast", "texture")
 _AROUND = 12  # [px], of the background that contrast is about
 _INNER = 0.95  # probability of the regions whose coverage is counted
 
@@ -69,7 +68,7 @@ def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> T
                 row = _compared(case.clicked(rng, stretched=stretched)) | case.looks
                 rows[f"{case.group} {case.kind}"].append(row)
         made = [row for name, found in rows.items() if "composite" in name for row in found]
-        for look in _LOOKS:
+        for look in ("contrast", "texture"):
             thirds = np.array_split(sorted(made, key=lambda row: row[look]), 3)
             for name, third in zip(("low", "middle", "high"), thirds, strict=True):
                 rows[f"composite, {name} {look}"] = list(third)
@@ -314,7 +313,7 @@ def _looks_of(photo: np.ndarray, mask: np.ndarray) -> Row:
     gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
     inside = cv2.erode(mask.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     details = (gray - cv2.GaussianBlur(gray, (0, 0), 3.0))[inside if inside.any() else mask]
-    return dict(zip(_LOOKS, (contrast, float(np.sqrt((details**2).mean()))), strict=True))
+    return {"contrast": contrast, "texture": float(np.sqrt((details**2).mean()))}
 
 
 def _blurred(drawn: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -53,6 +53,9 @@ class Measured(NamedTuple):
 class Place(NamedTuple):
     """A state of the evidence, and the coefficients (V, 3) of the contours' own modes.
 
+    One row (1, 3) is that of all contours, as the pictures of a video have: rows of their own for
+    each make a fit take time with the square of their number.
+
     Steps change the directions and the logarithms of the distances of objects: where the size is
     hardly known, distance and stretch rise by one factor, which is no straight line otherwise.
     """
@@ -64,6 +67,10 @@ class Place(NamedTuple):
     def of(cls, state: State, contours: int = 0) -> Place:
         """The place of a state, nothing known of the contours' own modes."""
         return cls(state, np.zeros((contours, OWN_MODES)))
+
+    def own_of(self, contours: int) -> FloatArray:
+        """Coefficients (contours, 3) of each contour."""
+        return np.broadcast_to(self.own, (contours, OWN_MODES))
 
     def towards(self, other: Place, share: float) -> Place:
         """The place a share of the way to another one."""
@@ -123,16 +130,13 @@ def shift_to(place: FloatArray, other: FloatArray) -> FloatArray:
 class Sought(NamedTuple, Generic[Shown]):
     """Evidence, of so many keypoints, and the surface that is sought in ``views``.
 
-    These are contours of masks, photos or depths. ``is_one_camera`` says that all contours have
-    their own modes in common, as the pictures of a video do: otherwise a fit takes time with the
-    square of their number.
+    These are contours of masks, photos or depths.
     """
 
     evidence: Evidence
     keypoints: int
     views: list[Shown]
     surface: Surface
-    is_one_camera: bool = False
 
     def at(self, state: State) -> tuple[PosedSurface, list[Alignment]]:
         """The surface, and the alignments in all views."""
@@ -147,14 +151,14 @@ class Sought(NamedTuple, Generic[Shown]):
 
     def joined(self, place: Place, rows: Sequence[Measured]) -> Joined:
         """The evidence with what was measured at a place."""
-        return Joined.of(self.evidence, self.keypoints, rows, place, self.is_one_camera)
+        return Joined.of(self.evidence, self.keypoints, rows, place)
 
 
 class Joined(NamedTuple):
     """Evidence with what was measured at points of a surface.
 
     The ``state`` of this evidence is that of the ``place``, with ``points`` more points after the
-    keypoints; the rows of the place's own modes are equal if they are ``is_one_camera``'s.
+    keypoints.
     """
 
     evidence: Evidence
@@ -162,27 +166,16 @@ class Joined(NamedTuple):
     place: Place
     keypoints: int
     points: int
-    is_one_camera: bool = False
 
     @classmethod
     def of(
-        cls,
-        evidence: Evidence,
-        keypoints: int,
-        rows: Sequence[Measured],
-        place: Place,
-        is_one_camera: bool = False,
+        cls, evidence: Evidence, keypoints: int, rows: Sequence[Measured], place: Place
     ) -> Joined:
         """The evidence with ``rows``; the modes of a contour's own are the last ones."""
         points = sum(len(each.mean) for each in rows)
-        full = _with_measured(evidence, keypoints, rows, points, is_one_camera)
-        bare = cls(full, place.state, place, keypoints, points, is_one_camera)
+        full = _with_measured(evidence, keypoints, rows, points, place.own.size)
+        bare = cls(full, place.state, place, keypoints, points)
         return bare._replace(state=bare.at(place))
-
-    @property
-    def _own(self) -> FloatArray:
-        """The distinct rows of the place's own modes."""
-        return self.place.own[:1] if self.is_one_camera else self.place.own
 
     def at(self, place: Place) -> State:
         """Another place as a state of this evidence."""
@@ -192,7 +185,7 @@ class Joined(NamedTuple):
             state.poses.copy(),
             state.log_focals.copy(),
             state.log_scales.copy(),
-            np.concatenate([state.coefficients, self._replace(place=place)._own.ravel()]),
+            np.concatenate([state.coefficients, place.own.ravel()]),
             np.concatenate([still[:first], none, still[first:]]),
         )
 
@@ -203,14 +196,14 @@ class Joined(NamedTuple):
             return None
         still, first = state.displacements, self.keypoints
         coefficients, own = np.split(
-            state.coefficients.copy(), [len(state.coefficients) - self._own.size]
+            state.coefficients.copy(), [len(state.coefficients) - self.place.own.size]
         )
         bare = state._replace(
             coefficients=coefficients,
             displacements=np.concatenate([still[:first], still[first + self.points :]]),
         )
-        rows = np.broadcast_to(own.reshape(self._own.shape), self.place.own.shape)
-        return cost, self._replace(state=state, place=Place(bare, rows.copy()))
+        place = Place(bare, own.reshape(self.place.own.shape))
+        return cost, self._replace(state=state, place=place)
 
 
 def _with_measured(
@@ -218,12 +211,13 @@ def _with_measured(
     keypoints: int,
     measured: Sequence[Measured],
     total: int,
-    is_one_camera: bool,
+    further: int,
 ) -> Evidence:
-    """The evidence with what was measured at ``total`` points."""
+    """The evidence with what was measured at ``total`` points, and so many ``further`` modes.
+
+    Contours take them in turns: each has its own, or all have the same ones.
+    """
     shape, last = evidence.shape, len(evidence.shape.modes)
-    counts = [len(each.own) for each in measured if each.own is not None]
-    further = max(counts, default=0) if is_one_camera else sum(counts)
     end = keypoints + total
     mean = np.concatenate([shape.mean[:keypoints], np.zeros((total, 3)), shape.mean[keypoints:]])
     modes = np.zeros((last + further, len(mean), 3))
@@ -238,13 +232,13 @@ def _with_measured(
         for name, table in (("sightings", evidence.sightings), ("planes", evidence.planes))
     }
     first = keypoints
-    for points, own_modes, table, own in measured:
+    for number, (points, own_modes, table, own) in enumerate(measured):
         there = slice(first, first + len(points))
         mean[there] = points
         modes[: len(own_modes), there] = own_modes  # none for a rigid surface
         if own is not None:
-            modes[last : last + len(own), there] = own
-            last += 0 if is_one_camera else len(own)
+            place = last + number * len(own) % further
+            modes[place : place + len(own), there] = own
         name = "sightings" if isinstance(table, Sightings) else "planes"
         tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
         first = there.stop

@@ -116,10 +116,11 @@ class _Candidate(NamedTuple):
     @property
     def supports(self) -> list[OutlineSupport]:
         """OutlineSupport of the outline by each photo."""
-        is_exact = self.pictured.surface.is_exact
+        is_exact, outlines = self.pictured.surface.is_exact, self.reached.outlines
+        own_rows = self.reached.place.own_of(len(outlines))
         return [
             _support_of(outline, own, is_exact=is_exact)
-            for outline, own in zip(self.reached.outlines, self.reached.place.own, strict=True)
+            for outline, own in zip(outlines, own_rows, strict=True)
         ]
 
     @property
@@ -201,9 +202,9 @@ def _explored(
     near: list[_Candidate] = []
     for start, state in _starts(minima):
         evidence, state = with_displacement_modes(start.evidence, state)
-        is_one_camera = start.track is not None  # its pictures are displaced alike
-        pictured = Pictured(evidence, keypoints, list(photos), surface, is_one_camera)
-        reached = approach(pictured, Approach(Place.of(state, len(photos))))
+        pictured = Pictured(evidence, keypoints, list(photos), surface)
+        own_rows = len(photos) if start.track is None else 1  # a video's are displaced alike
+        reached = approach(pictured, Approach(Place.of(state, own_rows)))
         if reached is not None:
             near.append(_Candidate(start, pictured, reached))
     finished = []

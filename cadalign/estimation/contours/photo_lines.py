@@ -108,9 +108,8 @@ def with_neighbours(logs: FloatArray, are_neighbours: BoolArray) -> FloatArray:
     by the root of its weights. ``are_neighbours`` (S - 1,) is true where a line and the next one
     are.
     """
-    highest = logs.max(axis=1, keepdims=True)
-    total = np.exp(logs - highest).sum(axis=1, keepdims=True)
-    bounded = np.logaddexp(logs - highest - np.log(total), np.log(_STRAY / logs.shape[1]))
+    total = np.logaddexp.reduce(logs, axis=1, keepdims=True)
+    bounded = np.logaddexp(logs - total, np.log(_STRAY / logs.shape[1]))
     shares = _NEIGHBOUR * are_neighbours[:, None]
     found, weights = bounded.copy(), np.ones((len(bounded), 1))
     for own, other in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None))):

@@ -105,7 +105,7 @@ def finish(pictured: Pictured, start: Approach) -> Approach | None:
             return None
         if number and here.is_close(_FINE[-1]):
             break
-        noises = [*map(noise_of_lines, here.outlines, here.place.own)]
+        noises = _noises_of(here)
         here = _round(pictured, here.place, _FINE[-1], noises)
     return None if here is None else _widened(pictured, here, noises)
 
@@ -132,13 +132,12 @@ def _round(
     if not rows:
         return None
     shown = np.array([outline is not None for outline in outlines])
-    refined = pictured.joined(place._replace(own=place.own[shown]), rows).refined(_ITERATIONS)
+    used = shown if len(place.own) == len(shown) else slice(None)  # all have one row in common
+    refined = pictured.joined(place._replace(own=place.own[used]), rows).refined(_ITERATIONS)
     if refined is None:
         return None
     own, (_, joined) = np.zeros_like(place.own), refined
-    own[shown] = joined.place.own
-    if pictured.is_one_camera:
-        own[:] = joined.place.own[0]
+    own[used] = joined.place.own
     there = Place(joined.place.state, own)
     return Approach(there, tuple(outlines), joined, _step(pictured, outlines, rows, there.state))
 
@@ -185,6 +184,11 @@ def _rows(
         own=_OWN_SIGMAS,
         cameras=(given, camera),
     )
+
+
+def _noises_of(here: Approach) -> list[LineNoise]:
+    own = here.place.own_of(len(here.outlines))
+    return [*map(noise_of_lines, here.outlines, own)]
 
 
 def noise_of_lines(outline: Outline | None, own: FloatArray) -> LineNoise:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -218,17 +218,18 @@ def _resembling(
     (view,), camera = problem.views, problem.lenses.cameras[0]
     free = np.asarray(problem.prior.scales.free > 0)
     mask = cast(FloatArray, view.mask_image)
-    how: dict[str, Any] = {
-        "free": free,
-        "count": count,
-        "is_cut": is_cut,
-        "symmetry": _symmetry_of(model),
-    }
-    found = [
-        (each, surface)
-        for surface in _surfaces_of(model)
-        for each in resembling_poses(surface.mesh, mask, camera, **how)
-    ]
+    found: list[tuple[tuple[float, Alignment], Surface]] = []
+    for surface in _surfaces_of(model):
+        poses = resembling_poses(
+            surface.mesh,
+            mask,
+            camera,
+            free=free,
+            count=count,
+            is_cut=is_cut,
+            symmetry=_symmetry_of(model),
+        )
+        found.extend((each, surface) for each in poses)
     best = sorted(found, key=lambda pair: -pair[0][0])[:count]
     return [(alignment, surface) for (_, alignment), surface in best]
 

@@ -402,7 +402,7 @@ def distinct(
     kept: list[T] = []
     for given, each in found:
         pose = given
-        if group is not None and not group.is_trivial:
+        if group is not None:
             pose = group.canonical(given, tolerance=_DISTINCT_STRETCH).alignment
         if all(_differ(pose, other) for other in poses):
             poses.append(pose)

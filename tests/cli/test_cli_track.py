@@ -98,6 +98,7 @@ def test_the_page_and_the_animation_hold_every_track(
     assert [row["method"] for row in payload["headline"]["rows"]] == ["3", "7"]
     plots = {plot["id"]: plot for plot in payload["plots"]}
     assert {"place_ahead", "turn_y", "speed", "turning", "residual"} <= set(plots)
+    assert not any(plot["y"]["log"] for plot in plots.values())
     lines = np.loadtxt(tmp_path / "7.tum")
     (ahead,) = (t for t in plots["place_ahead"]["traces"] if t["method"] == "7")
     np.testing.assert_allclose(ahead["y"], lines[:, 3], rtol=1e-5)

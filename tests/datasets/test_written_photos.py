@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.files import write_json
 from support.photo_sets import WRITERS, write_bop, write_kitti, write_pix3d, write_scan2cad
 
@@ -117,6 +118,22 @@ def test_a_data_set_comes_back_from_another_form(tmp_path: Path, source: str, fo
         np.testing.assert_allclose(other.camera.matrix, camera.matrix, atol=1e-9)
 
 
+def test_an_object_that_stands_upright_comes_back_from_kitti(tmp_path: Path) -> None:
+    (photo, *_) = cadalign.datasets.open(write_pix3d(tmp_path / "given"))
+    (found,) = photo.objects
+    level = Rotation.from_euler("xy", [180, 40], degrees=True).as_matrix()
+    truth = replace(found.truth, cam_from_model=Alignment(level, [0.1, 0.2, 3.0], (1, 1, 1)))
+    upright = replace(photo, objects=(replace(found, truth=truth),))
+    assert write_photos(tmp_path / "new", [upright], "kitti") == ()
+    (read,) = cadalign.datasets.open(tmp_path / "new")
+    np.testing.assert_array_equal(read.read_image(), photo.read_image())
+    box = read.objects[0].truth.box
+    assert box is not None
+    written = box.corners[np.lexsort(np.round(box.corners, 6).T)]
+    expected = corners(upright)
+    np.testing.assert_allclose(written, expected[np.lexsort(np.round(expected, 6).T)], atol=1e-6)
+
+
 def test_masks_and_keypoints_come_back(tmp_path: Path) -> None:
     given = cadalign.datasets.open(write_pix3d(tmp_path / "given"))
     write_photos(tmp_path / "bop", given, "bop")
@@ -126,6 +143,7 @@ def test_masks_and_keypoints_come_back(tmp_path: Path) -> None:
     for photo, masked, marked in zip(given, masks, marks, strict=True):
         (one,), (mask,), (mark,) = photo.objects, masked.objects, marked.objects
         np.testing.assert_array_equal(mask.read_mask(), one.read_mask())
+        np.testing.assert_allclose(mask.bbox, one.bbox)
         assert one.keypoints is not None
         assert mark.keypoints is not None
         np.testing.assert_allclose(mark.keypoints.points_2d, one.keypoints.points_2d, atol=1e-6)

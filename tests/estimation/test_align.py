@@ -275,6 +275,14 @@ class TestOutliers:
         result = align(model, view, ransac=RansacOptions())
         assert np.flatnonzero(~result.inliers).tolist() == [3]
 
+    def test_as_many_samples_are_drawn_as_the_probability_asks_for(self) -> None:
+        model, truth = spreads(0.01, count=16), truth_of((1.0, 1.0, 1.0))
+        pixels = CAMERA.project(truth.apply(keypoints(16)))
+        pixels[:7] = np.random.default_rng(2).uniform(0, 480, (7, 2))
+        options = RansacOptions(min_iterations=0)
+        result = align(model, View(CAMERA, pixels), ransac=options)
+        assert np.flatnonzero(~result.inliers).tolist() == list(range(7))
+
     def test_keypoints_scattered_at_random_have_no_consensus(self) -> None:
         model, rng = spreads(0.01, count=16), np.random.default_rng(1)
         for views in (1, 2):

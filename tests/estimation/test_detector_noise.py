@@ -105,6 +105,7 @@ def test_file_is_read_as_written(tmp_path: Path) -> None:
             "keypoints' scores",
         ),
         (lambda: DetectorNoise([0.8, 0.2], [2.0, 1.0]), "scores: do not rise"),
+        (lambda: DetectorNoise([0.5, 0.5], [2.0, 1.0]), "scores: do not rise"),
         (
             lambda: calibrate_detector([ImageKeypoints(np.zeros((2, 2)))], []),
             "truth: 0 objects, but 1 predictions; give the same objects in the same order",

@@ -50,6 +50,20 @@ def similar(count: int = 12) -> ShapeModel:
     )
 
 
+@pytest.mark.parametrize("shape_sigma", [None, 0.01])
+def test_the_summary_of_keypoints_has_their_residuals_in_pixels(shape_sigma: float | None) -> None:
+    points, rng, views = keypoints(), np.random.default_rng(0), []
+    for angle in (0, 25):
+        exact = np.asarray(seen(points, truth_of(), around(angle)).points_2d)
+        views.append(View(CAMERA, exact + rng.normal(0, 1, exact.shape)))
+    result = align(Model(points_3d=points, shape_sigma=shape_sigma), views)
+    found = [each for each in result.evidence if each.kind == "keypoints"]
+    for summary, view in zip(found, result.views, strict=True):
+        assert summary.unit == "px"
+        lengths = np.linalg.norm(view.residuals, axis=1)
+        assert summary.rms == pytest.approx(np.sqrt((lengths**2).mean()), rel=0.02)
+
+
 class TestSize:
     @pytest.mark.parametrize("name", ["width", "height", "length"])
     def test_one_length_determines_all_scales(self, name: str) -> None:

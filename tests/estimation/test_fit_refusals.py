@@ -152,6 +152,14 @@ def test_linear_solver_names_the_normal_of_an_oblique_plane() -> None:
     ]
 
 
+def test_four_keypoints_that_no_alignment_reprojects_are_told_so() -> None:
+    rng = np.random.default_rng(0)
+    points_3d, points_2d = rng.uniform(-1, 1, (4, 3)), rng.uniform(0, 480, (4, 2))
+    error = fit_refusal(points_3d, points_2d, Camera(640, 480, 600, 600, 319.5, 239.5))
+    assert isinstance(error, DegenerateError)
+    assert "no alignment reprojects the 4 keypoints exactly, and the nearest one" in str(error)
+
+
 @pytest.mark.parametrize("method", ["aepnp", "aepnp-paper"])
 def test_linear_solvers_refuse_points_in_a_plane(method: str) -> None:
     error = fit_refusal(*in_plane(2), GOOD.camera, method=method)

@@ -331,6 +331,15 @@ def test_other_explanations_have_cameras_of_their_own() -> None:
     assert max(found) < 20
 
 
+@pytest.mark.parametrize("seed", [5, 13, 21])
+def test_a_pose_that_fits_with_another_focal_length_is_found_beside_the_best(seed: int) -> None:
+    problem = problem_of(seed, points=5, noise_px=0.5)
+    (other, *_) = fit_unknown(problem).alternatives
+    known = fit(problem.points_3d, problem.points_2d, other.camera)
+    poses = [known.alignment, *(each.alignment for each in known.alternatives)]
+    assert min(rotation_error(est=pose, gt=other.alignment) for pose in poses) < 0.5
+
+
 def test_estimated_noise_comes_with_nine_unknowns() -> None:
     problem = problem_of(3, points=60, noise_px=2.5)
     result = fit_unknown(problem, sigma=None)

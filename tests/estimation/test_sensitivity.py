@@ -323,6 +323,18 @@ def test_the_model_s_points_move_estimates_of_several_views() -> None:
     assert str(found).splitlines()[1].startswith("  views[")
 
 
+def test_the_unit_of_the_model_changes_derivatives_of_the_translation_alone() -> None:
+    pixels, unit = seen_by(PIN, 1, 0), 1e5
+
+    def of(points: np.ndarray, spread: float) -> np.ndarray:
+        estimate = aligned(Model(points_3d=points, shape_sigma=spread), PIN, focal="estimate")
+        return np.asarray(estimate(pixels, [np.ones(N)]).sensitivity().by_points_2d)
+
+    expected, found = of(MEAN, 0.03), of(unit * MEAN, unit * 0.03)
+    found[3:6] /= unit
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
+
+
 def test_a_mask_leaves_keypoints_little_influence() -> None:
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

@@ -109,6 +109,10 @@ def test_nerf_file_with_a_field_of_view_only(tmp_path):
     up, right = view.camera.project(view.cam_from_world.apply([[0, 1, 0], [1, 0, 0]]))
     np.testing.assert_allclose(up, [399.5, 199.5])
     np.testing.assert_allclose(right, [499.5, 299.5])
+    angles = {"camera_angle_x": np.pi / 2, "camera_angle_y": np.pi / 3}
+    path.write_text(json.dumps({**angles, "w": 800, "h": 600, "frames": [frame]}))
+    (view,) = read_camera_views(path)
+    assert view.camera.fy == pytest.approx(300 * np.sqrt(3))
 
 
 def test_nerf_keeps_what_all_cameras_share_at_the_top(tmp_path):

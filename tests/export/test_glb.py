@@ -113,6 +113,14 @@ def test_trimesh_reads_mesh_texture_and_place(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.asarray(image.convert("RGB")), texture)
 
 
+def test_the_photos_borders_do_not_run_into_those_opposite(tmp_path: Path) -> None:
+    tree = tree_of(export_object(tmp_path / "wedge.glb", aligned(tmp_path)))
+    unlit = "KHR_materials_unlit"
+    (photo,) = (each for each in tree["materials"] if unlit in each.get("extensions", {}))
+    texture = tree["textures"][photo["pbrMetallicRoughness"]["baseColorTexture"]["index"]]
+    assert set(tree["samplers"][texture["sampler"]].values()) == {33071}  # clamp to edge
+
+
 def test_colors_are_linear_light(tmp_path: Path) -> None:
     tree = tree_of(export_object(tmp_path / "wedge.glb", aligned(tmp_path)))
     (red,) = (each for each in tree["materials"] if each["name"] == "red")

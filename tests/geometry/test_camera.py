@@ -322,6 +322,11 @@ LENGTH_FIX = "give (k1, k2, p1, p2), optionally followed by k3 or k3, k4, k5, k6
         ),
         ({"distortion": 0.1}, "camera.distortion: not a sequence of numbers"),
         ({"distortion": ("a",) * 4}, "camera.distortion: not a sequence of numbers"),
+        ({"distortion": np.full(4, 0.1j)}, "camera.distortion: not a sequence of numbers"),
+        (
+            {"distortion": np.ma.masked_equal(np.array([0.1, 0.0, 0.0, 0.0]), 0.1)},
+            "camera.distortion: not a sequence of numbers",
+        ),
     ],
 )
 def test_camera_refuses_wrong_values(change: dict[str, Any], text: str) -> None:

@@ -6,11 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from cadalign import Camera, RansacOptions, Result, fit
 from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.solvers import aepnp, aepnp_paper
+from cadalign.solvers.linalg import rotation_from_quaternion
 
 CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -20,6 +22,14 @@ def departure(rotation: np.ndarray) -> float:
     """Largest entry of R R' - I; infinite for a reflection."""
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     return float(error) if np.linalg.det(rotation) > 0 else np.inf
+
+
+def test_a_quaternion_of_any_length_is_its_rotation() -> None:
+    rng = np.random.default_rng(0)
+    for x, y, z, w in rng.normal(size=(20, 4)) * rng.uniform(0.1, 10, (20, 1)):
+        found = np.empty((3, 3))
+        rotation_from_quaternion(w, x, y, z, found)
+        np.testing.assert_allclose(found, Rotation.from_quat([x, y, z, w]).as_matrix(), atol=1e-12)
 
 
 def test_start_far_from_a_rotation_does_not_reach_the_result() -> None:

@@ -116,6 +116,14 @@ class TestPhoto:
         assert joint_deg < alone_deg / 2
         assert joint_deg < 0.6
 
+    @pytest.mark.parametrize("seed", [12, 13, 16])
+    def test_settles_a_pose_that_four_rough_clicks_leave_open(self, seed: int) -> None:
+        shown, rng = scene(seed), np.random.default_rng(seed)
+        rows = np.sort(rng.permutation(8)[:4]).tolist()
+        clicks = shown.clicks[rows] + rng.normal(0, 22, (4, 2))
+        view = View(CAMERA, clicks, ids=rows, sigma=22.0, image=shown.pixels)
+        assert shown.error(align(shown.model(stretch="none"), view)) < 1.0
+
     def test_stretch_is_estimated(self) -> None:
         shown = scene(2, (1.0, 1.2, 0.85))
         joint = shown.aligned(shown.model(), image=shown.pixels)

@@ -1,16 +1,20 @@
-"""Models that the methods of the evaluation on photos are given."""
+"""Models and cameras that the methods of the evaluation on photos are given."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from support.photo_sets import write_pascal3d
 
+import cadalign.datasets
 from cadalign import Model
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.photos.methods import _model
+from cadalign.evaluation.photos.target import PhotoTarget
 
 BOUNDS = np.array([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])  # of a diagonal of 3
 
@@ -37,3 +41,17 @@ def test_a_rigid_model_is_not_stretched_and_a_prior_holds_the_stretch() -> None:
     assert model_of(protocols.PRIOR).stretch_sigma is not None
     assert model_of(protocols.STRETCHED).stretch_sigma is None
     assert model_of(protocols.RIGID).points_3d == pytest.approx(BOUNDS)  # in units of the width
+
+
+def test_a_photo_of_unknown_focal_length_has_the_annotations_at_the_middle_of_the_object(
+    tmp_path: Path,
+) -> None:
+    (photo,) = cadalign.datasets.open(write_pascal3d(tmp_path))
+    (found,) = photo.objects
+    assert found.bbox is not None
+    assert found.truth.camera is not None
+    camera = PhotoTarget(photo, found, str(tmp_path)).camera
+    assert camera is not None
+    left, top, right, bottom = found.bbox
+    assert (camera.cx, camera.cy) == ((left + right) / 2, (top + bottom) / 2)
+    assert camera.fx == found.truth.camera.fx

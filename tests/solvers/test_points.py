@@ -1,0 +1,23 @@
+"""What is told of a cloud of points: its place, its size, and whether it lies in a plane."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cadalign.solvers.alignment import center_and_unit
+from cadalign.solvers.linear import describe_plane
+
+
+def test_the_unit_of_points_is_their_root_mean_square_distance_from_the_mean() -> None:
+    points = np.random.default_rng(0).normal(0, 2.0, (30, 3)) + (100.0, -50.0, 7.0)
+    center, unit = center_and_unit(points)
+    np.testing.assert_allclose(center, points.mean(axis=0))
+    assert unit == pytest.approx(np.linalg.norm(points.std(axis=0)))
+
+
+def test_the_plane_of_many_points_takes_memory_in_proportion_to_their_number() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (300_000, 3))
+    assert describe_plane(points) is None
+    points[:, 1] = 0.5
+    assert describe_plane(points) == "the points lie in the plane y = 0.5"

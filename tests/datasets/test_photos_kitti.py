@@ -10,8 +10,9 @@ from support.files import write_json
 from support.photo_data import assert_damage_is_told, write_photo, write_text
 
 import cadalign.datasets
+from cadalign import Camera, ShapeModel
 from cadalign.datasets import KittiCars
-from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
+from cadalign.datasets.photos.kitti_keypoints import car_box, car_keypoints, yaw_of_car
 from cadalign.errors import DataError
 
 P2 = "P2: 700 0 600 70 0 700 170 7 0 0 1 0.5\n"
@@ -34,6 +35,20 @@ def test_the_box_of_a_car_heading_to_the_right(tmp_path):
 @pytest.mark.parametrize("yaw", [-3.0, -1.5, 0.0, 0.3, 2.9])
 def test_the_yaw_follows_from_the_box(yaw):
     assert yaw_of_car(car_box(np.ones(3), np.zeros(3), yaw).rotation) == pytest.approx(yaw)
+
+
+def test_keypoints_of_a_car_are_known_but_for_what_its_lengths_leave_open():
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    mean = np.vstack([corners * [0.8, 2.0, 0.75], [[0.3, 0.5, 0.2]]])
+    longer = mean * [0, 1, 0]
+    shape = ShapeModel.from_basis(mean, [longer], [0.1], residual_sigma=0.03)
+    camera = Camera(1242, 375, 700.0, 700.0, 620.5, 187.0)
+    box = car_box(np.array([1.5, 1.6, 1.2 * 4.0]), np.array([2.0, 1.7, 20.0]), -1.5)
+    found = car_keypoints(shape, box, camera)
+    in_camera = (mean * [1, 1.2, 1]) @ box.rotation.T + box.center
+    np.testing.assert_allclose(found.points_2d, camera.project(in_camera), atol=0.5)
+    inside = 700 * 0.03 / in_camera[-1, 2]  # of the last, which no length depends on
+    assert found.sigma[-1] == pytest.approx(inside, rel=0.03)
 
 
 def test_labels_of_the_object_benchmark(tmp_path):

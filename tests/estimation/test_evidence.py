@@ -23,12 +23,15 @@ from support.scenes import (
 
 from cadalign import Alignment, Model, ShapeModel, Size, View, align
 from cadalign.errors import InputError
+from cadalign.estimation.estimates import with_box
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.search import JointProblem
 from cadalign.estimation.uncertainty.evidence import redundancy_of
 from cadalign.geometry.gravity import up_from_vertical_edges
+from cadalign.shapes.parts import BoxMargins
+from cadalign.solvers.joint.evidence import State
 
 
 def box_of(points: np.ndarray, truth: Alignment) -> np.ndarray:
@@ -321,6 +324,22 @@ def test_bad_input_is_named(call: Any, message: str) -> None:
     with pytest.raises(InputError) as caught:
         call()
     assert str(caught.value).startswith(message)
+
+
+def test_points_that_are_no_keypoints_end_no_box() -> None:
+    prior = prior_of(similar())
+    views = [seen(keypoints(12), truth_of((1, 1, 1)), np.eye(4))]
+    problem = JointProblem(prior, views, None, FitOptions(), Lenses.of(views, "known", None))
+    evidence = problem.evidence(prior.components[0], problem.lenses)
+    modes, mean = evidence.shape.modes, evidence.shape.mean
+    pose = truth_of((1, 1, 1)).packed[None, :12]
+    state = State(pose, np.zeros(0), np.zeros(3), np.zeros(len(modes)), np.zeros_like(mean))
+    margins = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
+    farthest = int(mean[2:12, 0].argmax()) + 2
+    placed, _ = with_box(evidence, state, farthest, margins)
+    known = mean[:farthest]
+    expected = [known.min(axis=0) - 0.01, known.max(axis=0) + 0.01]
+    np.testing.assert_allclose(placed.shape.mean[-2:], expected)
 
 
 def test_equations_beyond_the_unknowns_are_counted() -> None:

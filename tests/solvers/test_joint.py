@@ -149,6 +149,17 @@ def seen_from(evidence: Evidence, state: State) -> Evidence:
     return evidence._replace(sightings=sightings._replace(rays=rays, depths=depths))
 
 
+def test_a_known_direction_costs_nothing_where_the_model_s_is_turned_onto_it() -> None:
+    evidence = evidence_of(0, spread=0.0, poses=(0, 1), loss=LINEAR)
+    state, up = state_of(0, 2), evidence.directions
+    turns = [each[:9].reshape(3, 3) for each in (evidence.rig.cam_from_rig[1], state.poses[1])]
+    agreeing = up._replace(camera=up.model @ (turns[0] @ turns[1]).T)
+    without = evidence._replace(directions=Directions(*(each[:0] for each in up)))
+    expected = cost_of(without, state)
+    assert cost_of(evidence._replace(directions=agreeing), state) == pytest.approx(expected)
+    assert cost_of(evidence, state) > expected * (1 + 1e-3)
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     seed=st.integers(0, 10_000),

@@ -137,15 +137,14 @@ class Descent(NamedTuple):
         look = rims_at(self.masked, place, self.reach, is_fine=self.masked.surface.is_exact)
         return stack(self.masked, place, look, self.noises, self.reach)
 
-    def run(self, here: Stacked) -> tuple[Stacked, int]:
-        """The place where no step lowers the cost, and the number of steps.
+    def run(self, here: Stacked) -> Stacked:
+        """The place where no step lowers the cost.
 
         Pixels make the cost rough: whole steps go on for a while where they don't lower it, before
         the least is tried for shorter ones and for others.
         """
-        best, steps, since = here, 0, 0
-        while steps < _MOST_STEPS:
-            steps += 1
+        best, since = here, 0
+        for _ in range(_MOST_STEPS):
             step = here.joined.refined(_ITERATIONS)
             there = None if step is None else self.at(step[1].place)
             if there is not None and there.cost < best.cost - _LEAST_GAIN:
@@ -161,7 +160,7 @@ class Descent(NamedTuple):
                 break
             here = best = better
             since = 0
-        return best, steps
+        return best
 
     def _shorter(self, here: Stacked) -> Stacked | None:
         """The first place on the way to the goal of a step that costs less."""
@@ -211,16 +210,88 @@ class Settled(NamedTuple):
         return [fit.noise for fit in self.fits]
 
 
+class Approach(NamedTuple):
+    """First steps towards contours, which learn the noise from the residuals.
+
+    The rims at the ``place`` were sought within a ``reach`` [px], at first ``first_reach``. They
+    ``is_settled`` where the last step changed the rims little.
+    """
+
+    place: Place
+    noises: list[Noise]
+    reach: float
+    first_reach: float
+    look: PlacedRims
+    is_settled: bool = False
+
+    @classmethod
+    def begun(cls, masked: Masked, state: State, *, is_wide: bool = False) -> Approach:
+        """The start; ``is_wide`` says that it may be far off."""
+        place = Place.of(state, len(masked.views))
+        reach = _first_reach(masked, _WIDE_REACH if is_wide else _RELATIVE_REACH)
+        is_exact = masked.surface.is_exact
+        noises = [first_noise(view.sigma, reach, is_exact=is_exact) for view in masked.views]
+        return cls(place, noises, reach, reach, rims_at(masked, place, reach, is_fine=False))
+
+    def followed(self, masked: Masked, steps: int = _MOST_ROUNDS) -> Approach | None:
+        """So many steps further, at most; None where no rim comes near a contour."""
+        here: Approach | None = self
+        for _ in range(steps):
+            if here is None or here.is_settled:
+                break
+            here = here._next(masked)
+        return here
+
+    def residuals(self) -> FloatArray:
+        """Signed distances (S,) of the contours from the rims [px], as far as `first_reach`.
+
+        They are without the offset that all of a contour has in common.
+        """
+        far = self.first_reach
+        found = [
+            np.where(rims.found, rims.offset + own_offset * noise.offset, far)
+            for rims, own_offset, noise in zip(
+                self.look.rims, self.place.own[:, 0], self.noises, strict=True
+            )
+        ]
+        return np.asarray(np.clip(np.concatenate(found), -far, far))
+
+    def widened(self, masked: Masked) -> Approach:
+        """The same with the rims within the first reach."""
+        look = rims_at(masked, self.place, self.first_reach, is_fine=False)
+        return self._replace(look=look)
+
+    def _next(self, masked: Masked) -> Approach | None:
+        place, noises, reach, first_reach, look, _ = self
+        is_exact = masked.surface.is_exact
+        noises = _learned(masked, place, look, noises, reach, correlated=False)
+        if is_exact:
+            reach = min(reach, _reach_of(noises))
+        here = stack(masked, place, look, noises, reach)
+        step = None if here is None else here.joined.refined(_FEW_ITERATIONS)
+        if step is None:
+            return None
+        _, joined = step
+        place = joined.place
+        if is_exact:
+            noises, own = with_learned_offsets(joined.evidence, joined.state, noises, place.own)
+            place = place._replace(own=own)
+        there = rims_at(masked, place, reach, is_fine=False)
+        widest = max(noise.sigma for noise in noises)
+        is_settled = _change(look.rims, there.rims) < _SETTLED * max(1.0, widest)
+        return Approach(place, noises, reach, first_reach, there, is_settled)
+
+
 def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | None:
     """Descend from one start; None where no rim comes near a contour.
 
     ``is_wide`` says that the start may be far off.
     """
-    first_reach = _first_reach(masked, _WIDE_REACH if is_wide else _RELATIVE_REACH)
-    found = _approach(masked, Place.of(state, len(masked.views)), first_reach)
+    start = Approach.begun(masked, state, is_wide=is_wide)
+    found = start.followed(masked)
     if found is None:
         return None
-    place, noises, reach = found
+    place, noises, reach = found.place, found.noises, found.reach
     is_exact, here = masked.surface.is_exact, None
     for _ in range(_MOST_NOISES):
         look = rims_at(masked, place, reach, is_fine=is_exact) if here is None else here.look
@@ -235,28 +306,9 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
         here = stack(masked, place, look, noises, reach)
         if here is None:
             return None
-        here, _ = Descent(masked, noises, reach).run(here)
+        here = Descent(masked, noises, reach).run(here)
         place = here.place
     return None if here is None else _settled(here, noises)
-
-
-def approached(masked: Masked, state: State) -> tuple[State, FloatArray, float] | None:
-    """Take the first steps of `settle` from a start that may be far off.
-
-    Returns the state there, the signed distances (S,) of the contours from the rims [px], without
-    the offset that all of a contour has in common, and the reach that these are at most.
-    """
-    reach = _first_reach(masked, _WIDE_REACH)
-    found = _approach(masked, Place.of(state, len(masked.views)), reach)
-    if found is None:
-        return None
-    place, noises, _ = found
-    look = rims_at(masked, place, reach, is_fine=False)
-    residuals = [
-        np.where(rims.found, rims.offset + own_offset * noise.offset, reach)
-        for rims, own_offset, noise in zip(look.rims, place.own[:, 0], noises, strict=True)
-    ]
-    return place.state, np.clip(np.concatenate(residuals), -reach, reach), reach
 
 
 def settle_with(
@@ -269,7 +321,7 @@ def settle_with(
     reach = min(_first_reach(masked, _RELATIVE_REACH), _reach_of(noises))
     descent = Descent(masked, noises, reach, others)
     here = descent.at(place)
-    return None if here is None else _settled(descent.run(here)[0], noises)
+    return None if here is None else _settled(descent.run(here), noises)
 
 
 def _first_reach(masked: Masked, share: float) -> float:
@@ -280,37 +332,8 @@ def _reach_of(noises: list[Noise]) -> float:
     return max(_REACH * max(noise.sigma for noise in noises), _LEAST_REACH)
 
 
-def _approach(
-    masked: Masked, place: Place, reach: float
-) -> tuple[Place, list[Noise], float] | None:
-    """Steps that learn the noise from the residuals, until the rims change little."""
-    is_exact = masked.surface.is_exact
-    noises = [first_noise(view.sigma, reach, is_exact=is_exact) for view in masked.views]
-    last: list[Rims] = []
-    for _ in range(_MOST_ROUNDS):
-        look = rims_at(masked, place, reach, is_fine=False)
-        widest = max(noise.sigma for noise in noises)
-        if _change(last, look.rims) < _SETTLED * max(1.0, widest):
-            break
-        noises = _learned(masked, place, look, noises, reach, correlated=False)
-        if is_exact:
-            reach = min(reach, _reach_of(noises))
-        here = stack(masked, place, look, noises, reach)
-        step = None if here is None else here.joined.refined(_FEW_ITERATIONS)
-        if step is None:
-            return None
-        _, joined = step
-        place, last = joined.place, look.rims
-        if is_exact:
-            noises, own = with_learned_offsets(joined.evidence, joined.state, noises, place.own)
-            place = place._replace(own=own)
-    return place, noises, reach
-
-
 def _change(last: list[Rims], rims: list[Rims]) -> float:
-    """Median change of the rims' offsets [px] since the last round; infinite in the first."""
-    if not last:
-        return np.inf
+    """Median change of the rims' offsets [px] since the last step."""
     changes = [np.zeros(0)]
     for before, after in zip(last, rims, strict=True):
         both = before.found & after.found

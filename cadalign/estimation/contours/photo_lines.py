@@ -288,8 +288,8 @@ def _covered(sight: Sight, corner: FloatArray, cell: float, shape: tuple[int, in
     Of every second row and column all are looked at, of the rest those near the outline.
     """
     height, width = shape
-    columns, rows = np.meshgrid(np.arange(0, width, 2), np.arange(0, height, 2))
-    coarse = sight.covers(corner + cell * np.stack([columns, rows], axis=-1)).astype(np.uint8)
+    every_second = np.stack(np.meshgrid(np.arange(0, width, 2), np.arange(0, height, 2)), axis=-1)
+    coarse = sight.covers(corner + cell * every_second).astype(np.uint8)
     near = cv2.morphologyEx(coarse, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     inside, open_cells = (
         each.repeat(2, axis=0).repeat(2, axis=1)[:height, :width] > 0 for each in (coarse, near)

@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.contours.descent import Masked, approached
+from cadalign.estimation.contours.descent import Approach, Masked
 from cadalign.estimation.contours.silhouettes import distinct, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import (
@@ -33,8 +33,6 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import TrainingShapes
 
-_SEARCHES = ((False, 12), (True, 24))  # whole silhouettes, then what lines leave; starts of each
-_SEARCHES_OF_SIMILAR = ((False, 12),)  # whose surfaces are warped, and meet no mask
 _MOST_MESHES = 4  # of a learned shape's training models
 _MOST_COMPARED = 100  # of these
 _MEETS = 0.003  # standard deviation of a contour that meets the rim, relative to its size
@@ -46,6 +44,22 @@ _CLOSE = 1.1  # cost above the least, of a contour's sample, at which a proposal
 _ROUGH_SIZE = 160.0  # [px], of the mask's copy in which starts are followed
 _LEAST_PIXEL = 1.3  # of a smaller copy, in those of the mask
 _WHERE = "views[0].mask"
+
+
+class _Search(NamedTuple):
+    """A search of starts whose silhouettes resemble the mask, or what lines leave of these.
+
+    So many ``starts`` are followed for some ``steps``, and the ``kept`` best ones to the end.
+    """
+
+    is_cut: bool
+    starts: int
+    steps: int
+    kept: int
+
+
+_SEARCHES = (_Search(False, 12, 2, 4), _Search(True, 24, 5, 8))
+_SEARCHES_OF_SIMILAR = (_Search(False, 12, 0, 12),)  # whose surfaces are warped, and meet no mask
 
 
 class _Proposal(NamedTuple):
@@ -74,6 +88,33 @@ class _Proposal(NamedTuple):
     def over(self, best: _Proposal) -> float:
         """-2 log of the likelihood over the best one's, for the fewer independent samples."""
         return 2 * (self.cost - best.cost) * min(self.independent, best.independent)
+
+
+class _Start(NamedTuple):
+    """A start on its way to the mask: its minimum without this, and the steps so far."""
+
+    minimum: Minimum
+    masked: Masked
+    approach: Approach
+
+    @property
+    def cost(self) -> float:
+        """See `_Proposal`."""
+        return cost_of_contour(self.approach.residuals(), self.approach.first_reach)
+
+    def followed(self, *steps: int) -> _Start | None:
+        """So many steps further, or to the end; None where no rim comes near the contour."""
+        further = self.approach.followed(self.masked, *steps)
+        return further and self._replace(approach=further)
+
+    @property
+    def proposal(self) -> _Proposal:
+        """The minimum near the start, its outline brought to the mask's."""
+        (contour,), here = self.masked.views, self.approach.widened(self.masked)
+        residuals, every = here.residuals(), np.ones(len(contour.contour.points), dtype=bool)
+        cost = cost_of_contour(residuals, here.first_reach)
+        alike = correlation_length(contour.contour, residuals, every)
+        return _Proposal(self.minimum._replace(state=here.place.state), residuals, cost, alike)
 
 
 def minima_of_mask(
@@ -168,7 +209,7 @@ def _searched(
     problem: JointProblem,
     model: Model | ShapeModel,
     contour: ViewContour,
-    searches: Sequence[tuple[bool, int]],
+    searches: Sequence[_Search],
 ) -> tuple[list[_Proposal], int, int]:
     """Minima near a contour, the likeliest first; numbers of iterations and of starts.
 
@@ -176,12 +217,17 @@ def _searched(
     """
     found: list[_Proposal] = []
     steps, starts = 0, 0
-    for is_cut, count in searches:
-        for alignment, surface in _resembling(problem, model, count, is_cut=is_cut):
-            proposal, iterations = _approached(problem, alignment, surface, contour)
+    for search in searches:
+        begun = []
+        for alignment, surface in _resembling(problem, model, search):
+            start, iterations = _begun(problem, alignment, surface, contour)
             starts, steps = starts + 1, steps + iterations
-            if proposal is not None:
-                found.append(proposal)
+            tried = start and start.followed(search.steps)
+            if tried is not None:
+                begun.append(tried)
+        begun.sort(key=lambda start: start.cost)
+        ends = [start.followed() for start in begun[: search.kept]]
+        found.extend(end.proposal for end in ends if end is not None)
         found.sort(key=lambda proposal: proposal.cost)
         if found and found[0].cost < _met_by(contour):
             break
@@ -212,7 +258,7 @@ def _rough_contour(view: View, camera: Camera, size: float) -> tuple[ViewContour
 
 
 def _resembling(
-    problem: JointProblem, model: Model | ShapeModel, count: int, *, is_cut: bool
+    problem: JointProblem, model: Model | ShapeModel, search: _Search
 ) -> list[tuple[Alignment, Surface]]:
     """Alignments of all meshes whose silhouettes resemble the mask, the best first."""
     (view,), camera = problem.views, problem.lenses.cameras[0]
@@ -225,31 +271,25 @@ def _resembling(
             mask,
             camera,
             free=free,
-            count=count,
-            is_cut=is_cut,
+            count=search.starts,
+            is_cut=search.is_cut,
             symmetry=_symmetry_of(model),
         )
         found.extend((each, surface) for each in poses)
-    best = sorted(found, key=lambda pair: -pair[0][0])[:count]
+    best = sorted(found, key=lambda pair: -pair[0][0])[: search.starts]
     return [(alignment, surface) for (_, alignment), surface in best]
 
 
-def _approached(
+def _begun(
     problem: JointProblem, start: Alignment, surface: Surface, contour: ViewContour
-) -> tuple[_Proposal | None, int]:
-    """The minimum near a start, its outline brought to the mask's; and the iterations."""
+) -> tuple[_Start | None, int]:
+    """A start before its first step towards the mask's outline; and iterations that led there."""
     _, minima, iterations, _ = find_minima(problem, [start], None)
     if not minima:
         return None, iterations
     best = minima[0]
     masked = Masked(best.evidence, len(problem.prior.ids), [contour], surface)
-    found = approached(masked, best.state)
-    if found is None:
-        return None, iterations
-    state, residuals, reach = found
-    cost, every = cost_of_contour(residuals, reach), np.ones(len(residuals), dtype=bool)
-    alike = correlation_length(contour.contour, residuals, every)
-    return _Proposal(best._replace(state=state), residuals, cost, alike), iterations
+    return _Start(best, masked, Approach.begun(masked, best.state, is_wide=True)), iterations
 
 
 def _symmetry_of(model: Model | ShapeModel) -> Symmetry | None:

@@ -130,7 +130,7 @@ def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
     descent = Descent(masked, found.noises, 4.0)
     end = descent.at(found.joined.place)
     assert end is not None
-    again, _ = descent.run(end)
+    again = descent.run(end)
     assert again is end
     for _ in range(20):
         step = np.zeros(6 + 3 + 3)

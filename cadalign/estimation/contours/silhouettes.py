@@ -34,6 +34,7 @@ from cadalign.geometry.symmetry_group import group_of
 
 _DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
 _CELLS = 80  # of a silhouette's or a mask's image
+_COMPARED_EVERY = 2  # rows and columns of these, for a pose
 _TURNS = 64
 _RINGS = 24
 _OUTERMOST = 3.0  # [standard deviations], of the rings
@@ -263,6 +264,13 @@ class _Facing(NamedTuple):
     cell: float
     camera_from_facing: FloatArray
 
+    @property
+    def compared(self) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Of every second row and column, the cells (m,), their rays (m, 3), and if seen (m,)."""
+        grid = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)
+        some = grid[::_COMPARED_EVERY, ::_COMPARED_EVERY].ravel()
+        return self.image.ravel()[some], self.rays[some], self.is_seen[some]
+
 
 def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
     inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
@@ -364,7 +372,7 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
 def _line_bins() -> IntArray:
     """Numbers (`_LINE_ANGLES`, n * n) of the cells' places along directions, all around."""
     angles = 2 * np.pi * np.arange(_LINE_ANGLES) / _LINE_ANGLES
-    places = np.arange(_CELLS) - (_CELLS - 1) / 2
+    places = np.arange(0, _CELLS, _COMPARED_EVERY) - (_CELLS - 1) / 2
     x, y = np.meshgrid(places, places)
     along = np.cos(angles)[:, None] * x.ravel() + np.sin(angles)[:, None] * y.ravel()
     return np.asarray(np.rint(along + _CELLS), dtype=np.int64)
@@ -376,8 +384,8 @@ def _overlap(atlas: Atlas, view: _Facing, pose: Alignment, *, is_cut: bool) -> f
     If it ``is_cut``, of what the best line leaves of the silhouette, less where it leaves less.
     """
     origin, model_from_ray = model_rays(pose)
-    seen = atlas.caster.covered(origin, view.rays @ model_from_ray.T) & view.is_seen
-    mask = view.image.ravel()
+    mask, rays, is_seen = view.compared
+    seen = atlas.caster.covered(origin, rays @ model_from_ray.T) & is_seen
     both, total = mask[seen], float(mask.sum())
     if not is_cut:
         return float(both.sum()) / (total + len(both) - float(both.sum()))

@@ -49,6 +49,7 @@ _LINE_ANGLES = 16  # of what hides a part
 _HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
 _LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
 _MOST_AFFINE = 200  # cameras of which the silhouettes are rendered
+_MOST_AFFINE_CUT = 600  # where the mask may lack a part, which leaves more possible
 _ITERATIONS = 8
 _PRIOR = 0.05  # weight of the logarithms of scales
 _MOST_LOG = 1.3
@@ -237,7 +238,8 @@ def resembling_poses(
     """
     atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
     query = whitened(view.image, view.corner, view.cell)
-    poses = _poses_of(*_affine_cameras(atlas, query), atlas, free)
+    most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
+    poses = _poses_of(*_affine_cameras(atlas, query, most), atlas, free)
     found = [(_overlap(atlas, view, pose, is_cut=is_cut), pose) for pose in poses]
     found.sort(key=lambda each: -each[0])
     kept = distinct(((pose, (iou, pose)) for iou, pose in found), count, symmetry)
@@ -269,7 +271,7 @@ class _Facing(NamedTuple):
         """Of every second row and column, the cells (m,), their rays (m, 3), and if seen (m,)."""
         grid = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)
         some = grid[::_COMPARED_EVERY, ::_COMPARED_EVERY].ravel()
-        return self.image.ravel()[some], self.rays[some], self.is_seen[some]
+        return self.image.ravel()[some].astype(float), self.rays[some], self.is_seen[some]
 
 
 def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
@@ -308,8 +310,8 @@ def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
     return _Facing(seen_cells, camera.contains(pixels), rays, corner, cell, turn)
 
 
-def _affine_cameras(atlas: Atlas, query: Whitened) -> tuple[FloatArray, FloatArray]:
-    """Maps ``M x + b`` of the model to the query's plane, those of the best overlaps.
+def _affine_cameras(atlas: Atlas, query: Whitened, most: int) -> tuple[FloatArray, FloatArray]:
+    """Maps ``M x + b`` of the model to the query's plane, those of the ``most`` best overlaps.
 
     Matrices (n, 2, 3) and shifts (n, 2).
     """
@@ -318,7 +320,7 @@ def _affine_cameras(atlas: Atlas, query: Whitened) -> tuple[FloatArray, FloatArr
     is_peak = (overlap >= np.roll(overlap, 1, 2)) & (overlap >= np.roll(overlap, -1, 2))
     is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=2, keepdims=True)
     peaks = np.nonzero(is_peak)
-    best = np.argsort(-overlap[peaks])[:_MOST_AFFINE]
+    best = np.argsort(-overlap[peaks])[:most]
     flip, row, number = (each[best] for each in peaks)
     angle = 2 * np.pi * number / _TURNS
     cosine, sine = np.cos(angle), np.sin(angle)

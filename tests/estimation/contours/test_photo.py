@@ -14,14 +14,17 @@ from support.timing import Measure, ratio, timed
 
 from cadalign import Alignment, Camera, Mesh, Model, Tracker, View, align
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.contours.contour import Sight
 from cadalign.estimation.contours.photo_lines import (
     bins_of,
     changes_of,
     crossings_of,
     edges_of,
     regions_of,
+    silhouette_of,
     with_neighbours,
 )
+from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.images import write_image
@@ -305,6 +308,33 @@ class TestTrack:
         tracker = Tracker(Model(points_3d=wedge().vertices, mesh=wedge()))
         with pytest.raises(InputError, match=r"view\.image.*not outlines.*init="):
             tracker.update(self.views(1, image=True)[0])
+
+
+class TestSilhouette:
+    """Cells of a predicted silhouette."""
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_its_cells_are_those_that_rays_meet(self, seed: int) -> None:
+        mesh, truth = wedge(), scene(seed).truth
+        surface = RigidSurface(mesh)
+        found = silhouette_of(surface, CAMERA, truth, 150)
+        assert found is not None
+        rows, columns = np.indices(found.inside.shape)
+        pixels = found.corner + found.cell * np.stack([columns, rows], axis=-1)
+        met = Sight(surface.caster, CAMERA, truth).covers(pixels)
+        assert 0.2 < met.mean() < 0.9
+        # The wedge is nowhere thinner than two cells.
+        assert (found.inside == met).all()
+
+    def test_a_lens_bends_rays_as_it_bends_pixels(self) -> None:
+        mesh, truth = wedge(), scene(0).truth
+        surface, bent = RigidSurface(mesh), replace(CAMERA, distortion=(-0.2, 0.05, 0.0, 0.0))
+        rows, columns = np.indices((CAMERA.height, CAMERA.width)).reshape(2, -1)
+        pixels = np.column_stack([columns, rows]).astype(float)
+        straight = CAMERA.project(np.column_stack([bent.normalize(pixels), np.ones(len(pixels))]))
+        covered = Sight(surface.caster, bent, truth).covers(pixels)
+        assert covered.any()
+        assert (covered == Sight(surface.caster, CAMERA, truth).covers(straight)).all()
 
 
 class TestLines:

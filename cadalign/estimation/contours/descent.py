@@ -49,7 +49,8 @@ _RELATIVE_REACH = 0.04
 _WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
 _LEAST_REACH = 4.0
 _REACH = 6.0  # in standard deviations of the residuals
-_MOST_ROUNDS = 16
+MOST_ROUNDS = 16
+"""Steps of an `Approach`."""
 _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
 _SETTLED = 0.02  # [px], median change of the offsets from round to round, or in standard deviations
 _MOST_NOISES = 3  # that are learned, each where the cost at the last is least
@@ -233,7 +234,7 @@ class Approach(NamedTuple):
         noises = [first_noise(view.sigma, reach, is_exact=is_exact) for view in masked.views]
         return cls(place, noises, reach, reach, rims_at(masked, place, reach, is_fine=False))
 
-    def followed(self, masked: Masked, steps: int = _MOST_ROUNDS) -> Approach | None:
+    def followed(self, masked: Masked, steps: int = MOST_ROUNDS) -> Approach | None:
         """So many steps further, at most; None where no rim comes near a contour."""
         here: Approach | None = self
         for _ in range(steps):

@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.contours.descent import Approach, Masked
+from cadalign.estimation.contours.descent import MOST_ROUNDS, Approach, Masked
 from cadalign.estimation.contours.silhouettes import distinct, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import (
@@ -102,10 +102,10 @@ class _Start(NamedTuple):
         """See `_Proposal`."""
         return cost_of_contour(self.approach.residuals(), self.approach.first_reach)
 
-    def followed(self, *steps: int) -> _Start | None:
-        """So many steps further, or to the end; None where no rim comes near the contour."""
-        further = self.approach.followed(self.masked, *steps)
-        return further and self._replace(approach=further)
+    def followed(self, steps: int = MOST_ROUNDS) -> _Start | None:
+        """So many steps further, at most; None where no rim comes near the contour."""
+        further = self.approach.followed(self.masked, steps)
+        return None if further is None else self._replace(approach=further)
 
     @property
     def proposal(self) -> _Proposal:
@@ -222,7 +222,7 @@ def _searched(
         for alignment, surface in _resembling(problem, model, search):
             start, iterations = _begun(problem, alignment, surface, contour)
             starts, steps = starts + 1, steps + iterations
-            tried = start and start.followed(search.steps)
+            tried = None if start is None else start.followed(search.steps)
             if tried is not None:
                 begun.append(tried)
         begun.sort(key=lambda start: start.cost)

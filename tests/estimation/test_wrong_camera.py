@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from cadalign import Alignment, Camera, Model, View, align, fit
 from cadalign.estimation.result import Result
+from cadalign.estimation.solve import solve_one
+from cadalign.estimation.uncertainty import misfit
 from cadalign.geometry.rotations import rotation_from_vector
 
 CAMERA = Camera(640, 480, 935, 935, 319.5, 239.5)
@@ -52,6 +56,20 @@ def test_right_cameras_are_not_blamed() -> None:
 
 def _right(count: int) -> list[str]:
     return [" ".join(fitted(seed, points=count).warnings) for seed in range(100)]
+
+
+def test_few_right_keypoints_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their residuals are too small for what another camera could lower them by."""
+    results = [fitted(seed, points=7) for seed in range(30)]
+    fits = []
+
+    def counted(*given: Any) -> Any:
+        fits.append(given)
+        return solve_one(*given)
+
+    monkeypatch.setattr(misfit, "solve_one", counted)
+    assert not any(result.warnings for result in results)
+    assert len(fits) <= 3
 
 
 def test_named_camera_is_kept_in_json() -> None:

@@ -186,6 +186,10 @@ class _Tested:
         redundancy = self.redundancy
         return redundancy <= 0 or chi_square_tail(self.chi_square, redundancy) >= _FALSE_ALARMS
 
+    def may_fall(self, chance: float, unknowns: int) -> bool:
+        """True if so many unknowns more may lower the sum, to zero at most, beyond this chance."""
+        return chi_square_tail(self.chi_square, unknowns) < chance
+
     def decrease_by_focal(self) -> float:
         """Decrease of the sum by a focal length of its own, to first order."""
         derivatives = projection_jacobian(self.points_3d, self.camera, self.alignment)
@@ -275,6 +279,8 @@ def _contradicting_scale(tested: _Tested) -> tuple[float, float, float] | None:
     options = tested.options
     if len(options.stretched_axes) == _SCALES and options.stretch_sigma is None:
         return None
+    if not tested.may_fall(_FALSE_STRETCH_ALARMS, _SCALES):
+        return None
     free = tested.again(stretch=None, stretch_sigma=None)
     if free is None:  # the keypoints do not determine the scales, so nothing contradicts
         return None
@@ -291,6 +297,8 @@ def _contradicting_camera(tested: _Tested) -> Camera | None:
     keypoints fit and the derivative by the focal length promises nothing.
     """
     if tested.options.focal == "estimate" or tested.redundancy < 1:
+        return None
+    if not tested.may_fall(_FALSE_CAMERA_ALARMS, 1):
         return None
     if tested.passes and tested.decrease_by_focal() < _WORTH_A_SEARCH:
         return None

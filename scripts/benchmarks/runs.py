@@ -176,7 +176,7 @@ def fits(
             runs = (_fit(file, method) for file in (short, long))
             count = sizes[1] - sizes[0]
             rows = _rate_and_memory(name, f"{name}, memory", count, *runs)
-            yield f"Fits of {_POINTS} keypoints", rows
+            yield f"Fits of {_POINTS} keypoints by {method}", rows
         if dask:
             name = "fits by Dask over those by processes"
             row = _dask_over_processes(name, _fit(short, "aepnp"))

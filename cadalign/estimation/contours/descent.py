@@ -49,6 +49,7 @@ _RELATIVE_REACH = 0.04
 _WIDE_REACH = 0.15  # where nothing but the masks determines the estimate
 _LEAST_REACH = 4.0
 _REACH = 6.0  # in standard deviations of the residuals
+_OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
 MOST_ROUNDS = 16
 """Steps of an `Approach`."""
 _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
@@ -330,7 +331,8 @@ def _first_reach(masked: Masked, share: float) -> float:
 
 
 def _reach_of(noises: list[Noise]) -> float:
-    return max(_REACH * max(noise.sigma for noise in noises), _LEAST_REACH)
+    least = max(_LEAST_REACH, *(_OFFSETS * noise.offset for noise in noises))
+    return max(_REACH * max(noise.sigma for noise in noises), least)
 
 
 def _change(last: list[Rims], rims: list[Rims]) -> float:

@@ -99,6 +99,16 @@ class TestOwnModel:
         found = align(Model(mesh=body()), View(CAMERA, mask=mask))
         assert rotation_error(est=found.alignment, gt=truth) < 4.0
 
+    @pytest.mark.parametrize("seed", [0, 1, 4])
+    def test_mask_that_is_cut_out_generously(self, seed: int) -> None:
+        """Its contour lies farther from the rims than noise alone would take it."""
+        truth, camera = posed(seed, (1.0, 0.8, 1.2)), CAMERA.resized(640, 480)
+        mask = cast_geometry(Scene(body()), camera, truth).mask.astype(np.uint8)
+        wide = cv2.dilate(mask, np.ones((13, 13), np.uint8)) > 0
+        found = align(Model(mesh=body()), View(camera, mask=wide))
+        assert rotation_error(est=found.alignment, gt=truth) < 1.0
+        assert found.alignment.scale == pytest.approx(truth.scale, rel=0.05)
+
     def test_probabilities_of_a_large_photo(self) -> None:
         """Starts are followed in a smaller copy of the mask, the end in the mask itself."""
         truth, camera = posed(0, (1.0, 1.2, 0.8)), CAMERA.resized(1280, 960)

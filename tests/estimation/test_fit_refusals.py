@@ -152,7 +152,7 @@ def test_linear_solver_names_the_normal_of_an_oblique_plane() -> None:
     ]
 
 
-def test_four_keypoints_that_no_alignment_reprojects_are_told_so() -> None:
+def test_four_keypoints_that_no_alignment_reprojects_are_refused() -> None:
     rng = np.random.default_rng(0)
     points_3d, points_2d = rng.uniform(-1, 1, (4, 3)), rng.uniform(0, 480, (4, 2))
     error = fit_refusal(points_3d, points_2d, Camera(640, 480, 600, 600, 319.5, 239.5))

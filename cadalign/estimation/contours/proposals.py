@@ -49,17 +49,19 @@ _WHERE = "views[0].mask"
 class _Search(NamedTuple):
     """A search of starts whose silhouettes resemble the mask, or what lines leave of these.
 
-    So many ``starts`` are followed for some ``steps``, and the ``kept`` best ones to the end.
+    Silhouettes are compared in ``every`` so many rows and columns. So many ``starts`` are followed
+    for some ``steps``, and the ``kept`` best ones to the end.
     """
 
     is_cut: bool
+    every: int
     starts: int
     steps: int
     kept: int
 
 
-_SEARCHES = (_Search(False, 12, 2, 4), _Search(True, 24, 5, 8))
-_SEARCHES_OF_SIMILAR = (_Search(False, 12, 0, 12),)  # whose surfaces are warped, and meet no mask
+_SEARCHES = (_Search(False, 2, 12, 2, 4), _Search(True, 2, 24, 5, 8))
+_SEARCHES_OF_SIMILAR = (_Search(False, 1, 12, 0, 12),)  # whose surfaces meet no mask
 
 
 class _Proposal(NamedTuple):
@@ -273,6 +275,7 @@ def _resembling(
             free=free,
             count=search.starts,
             is_cut=search.is_cut,
+            every=search.every,
             symmetry=_symmetry_of(model),
         )
         found.extend((each, surface) for each in poses)

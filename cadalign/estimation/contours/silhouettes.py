@@ -34,7 +34,6 @@ from cadalign.geometry.symmetry_group import group_of
 
 _DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
 _CELLS = 80  # of a silhouette's or a mask's image
-_COMPARED_EVERY = 2  # rows and columns of these, for a pose
 _TURNS = 64
 _RINGS = 24
 _OUTERMOST = 3.0  # [standard deviations], of the rings
@@ -228,19 +227,21 @@ def resembling_poses(
     free: BoolArray,
     count: int,
     is_cut: bool = False,
+    every: int = 1,
     symmetry: Symmetry | None = None,
 ) -> list[tuple[float, Alignment]]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
     Each comes after the intersection over union of its silhouette, or a part, and the mask.
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
-    lies beyond a line. Of alignments that are equal under the ``symmetry`` one is kept.
+    lies beyond a line. One row and column in ``every`` are compared. Of alignments that are equal
+    under the ``symmetry`` one is kept.
     """
     atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
-    query = whitened(view.image, view.corner, view.cell)
+    query, compared = whitened(view.image, view.corner, view.cell), view.compared(every)
     most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
     poses = _poses_of(*_affine_cameras(atlas, query, most), atlas, free)
-    found = [(_overlap(atlas, view, pose, is_cut=is_cut), pose) for pose in poses]
+    found = [(_overlap(atlas, compared, pose, is_cut=is_cut), pose) for pose in poses]
     found.sort(key=lambda each: -each[0])
     kept = distinct(((pose, (iou, pose)) for iou, pose in found), count, symmetry)
     return [(iou, turned_alignment(pose, view.camera_from_facing)) for iou, pose in kept]
@@ -266,12 +267,22 @@ class _Facing(NamedTuple):
     cell: float
     camera_from_facing: FloatArray
 
-    @property
-    def compared(self) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Of every second row and column, the cells (m,), their rays (m, 3), and if seen (m,)."""
+    def compared(self, every: int) -> _Compared:
+        """The cells of so many rows and columns that stand for all."""
         grid = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)
-        some = grid[::_COMPARED_EVERY, ::_COMPARED_EVERY].ravel()
-        return self.image.ravel()[some].astype(float), self.rays[some], self.is_seen[some]
+        some = grid[::every, ::every].ravel()
+        return _Compared(
+            self.image.ravel()[some].astype(float), self.rays[some], self.is_seen[some], every
+        )
+
+
+class _Compared(NamedTuple):
+    """Cells (m,) of `_Facing`, their rays (m, 3) and if they are seen (m,); every so many."""
+
+    mask: FloatArray
+    rays: FloatArray
+    is_seen: BoolArray
+    every: int
 
 
 def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
@@ -371,28 +382,28 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
 
 
 @cache
-def _line_bins() -> IntArray:
-    """Numbers (`_LINE_ANGLES`, n * n) of the cells' places along directions, all around."""
+def _line_bins(every: int) -> IntArray:
+    """Numbers (`_LINE_ANGLES`, m) of the cells' places along directions, all around."""
     angles = 2 * np.pi * np.arange(_LINE_ANGLES) / _LINE_ANGLES
-    places = np.arange(0, _CELLS, _COMPARED_EVERY) - (_CELLS - 1) / 2
+    places = np.arange(0, _CELLS, every) - (_CELLS - 1) / 2
     x, y = np.meshgrid(places, places)
     along = np.cos(angles)[:, None] * x.ravel() + np.sin(angles)[:, None] * y.ravel()
     return np.asarray(np.rint(along + _CELLS), dtype=np.int64)
 
 
-def _overlap(atlas: Atlas, view: _Facing, pose: Alignment, *, is_cut: bool) -> float:
+def _overlap(atlas: Atlas, view: _Compared, pose: Alignment, *, is_cut: bool) -> float:
     """Intersection over union of a pose's silhouette and the mask.
 
     If it ``is_cut``, of what the best line leaves of the silhouette, less where it leaves less.
     """
     origin, model_from_ray = model_rays(pose)
-    mask, rays, is_seen = view.compared
-    seen = atlas.caster.covered(origin, rays @ model_from_ray.T) & is_seen
+    mask = view.mask
+    seen = atlas.caster.covered(origin, view.rays @ model_from_ray.T) & view.is_seen
     both, total = mask[seen], float(mask.sum())
     if not is_cut:
         return float(both.sum()) / (total + len(both) - float(both.sum()))
     best = 0.0
-    for bins in _line_bins()[:, seen]:
+    for bins in _line_bins(view.every)[:, seen]:
         count = np.cumsum(np.bincount(bins, minlength=1))
         common = np.cumsum(np.bincount(bins, weights=both, minlength=1))
         share = count / max(float(count[-1]), 1.0)

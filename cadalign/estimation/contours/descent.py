@@ -51,7 +51,7 @@ _LEAST_REACH = 4.0
 _REACH = 6.0  # in standard deviations of the residuals
 _OFFSETS = 2.0  # in standard deviations of the offset that all of a contour has in common
 MOST_ROUNDS = 16
-"""Steps of an `Approach`."""
+"""Most of the `FirstSteps`."""
 _FEW_ITERATIONS = 4  # of a round, whose rims are not those of its end
 _SETTLED = 0.02  # [px], median change of the offsets from round to round, or in standard deviations
 _MOST_NOISES = 3  # that are learned, each where the cost at the last is least
@@ -212,7 +212,7 @@ class Settled(NamedTuple):
         return [fit.noise for fit in self.fits]
 
 
-class Approach(NamedTuple):
+class FirstSteps(NamedTuple):
     """First steps towards contours, which learn the noise from the residuals.
 
     The rims at the ``place`` were sought within a ``reach`` [px], at first ``first_reach``. They
@@ -227,7 +227,7 @@ class Approach(NamedTuple):
     is_settled: bool = False
 
     @classmethod
-    def begun(cls, masked: Masked, state: State, *, is_wide: bool = False) -> Approach:
+    def begun(cls, masked: Masked, state: State, *, is_wide: bool = False) -> FirstSteps:
         """The start; ``is_wide`` says that it may be far off."""
         place = Place.of(state, len(masked.views))
         reach = _first_reach(masked, _WIDE_REACH if is_wide else _RELATIVE_REACH)
@@ -235,9 +235,9 @@ class Approach(NamedTuple):
         noises = [first_noise(view.sigma, reach, is_exact=is_exact) for view in masked.views]
         return cls(place, noises, reach, reach, rims_at(masked, place, reach, is_fine=False))
 
-    def followed(self, masked: Masked, steps: int = MOST_ROUNDS) -> Approach | None:
+    def followed(self, masked: Masked, steps: int = MOST_ROUNDS) -> FirstSteps | None:
         """So many steps further, at most; None where no rim comes near a contour."""
-        here: Approach | None = self
+        here: FirstSteps | None = self
         for _ in range(steps):
             if here is None or here.is_settled:
                 break
@@ -258,12 +258,12 @@ class Approach(NamedTuple):
         ]
         return np.asarray(np.clip(np.concatenate(found), -far, far))
 
-    def widened(self, masked: Masked) -> Approach:
+    def widened(self, masked: Masked) -> FirstSteps:
         """The same with the rims within the first reach."""
         look = rims_at(masked, self.place, self.first_reach, is_fine=False)
         return self._replace(look=look)
 
-    def _next(self, masked: Masked) -> Approach | None:
+    def _next(self, masked: Masked) -> FirstSteps | None:
         place, noises, reach, first_reach, look, _ = self
         is_exact = masked.surface.is_exact
         noises = _learned(masked, place, look, noises, reach, correlated=False)
@@ -281,7 +281,7 @@ class Approach(NamedTuple):
         there = rims_at(masked, place, reach, is_fine=False)
         widest = max(noise.sigma for noise in noises)
         is_settled = _change(look.rims, there.rims) < _SETTLED * max(1.0, widest)
-        return Approach(place, noises, reach, first_reach, there, is_settled)
+        return FirstSteps(place, noises, reach, first_reach, there, is_settled)
 
 
 def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | None:
@@ -289,7 +289,7 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
 
     ``is_wide`` says that the start may be far off.
     """
-    start = Approach.begun(masked, state, is_wide=is_wide)
+    start = FirstSteps.begun(masked, state, is_wide=is_wide)
     found = start.followed(masked)
     if found is None:
         return None

@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
-from cadalign.estimation.contours.descent import MOST_ROUNDS, Approach, Masked
+from cadalign.estimation.contours.descent import MOST_ROUNDS, FirstSteps, Masked
 from cadalign.estimation.contours.silhouettes import distinct, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import (
@@ -97,7 +97,7 @@ class _Start(NamedTuple):
 
     minimum: Minimum
     masked: Masked
-    approach: Approach
+    approach: FirstSteps
 
     @property
     def cost(self) -> float:
@@ -292,7 +292,7 @@ def _begun(
         return None, iterations
     best = minima[0]
     masked = Masked(best.evidence, len(problem.prior.ids), [contour], surface)
-    return _Start(best, masked, Approach.begun(masked, best.state, is_wide=True)), iterations
+    return _Start(best, masked, FirstSteps.begun(masked, best.state, is_wide=True)), iterations
 
 
 def _symmetry_of(model: Model | ShapeModel) -> Symmetry | None:

@@ -1,4 +1,4 @@
-"""What is told of a cloud of points: its place, its size, and whether it lies in a plane."""
+"""Place and size of a cloud of points, and the plane in which it lies."""
 
 from __future__ import annotations
 

@@ -260,6 +260,8 @@ class FirstSteps(NamedTuple):
 
     def widened(self, masked: Masked) -> FirstSteps:
         """The same with the rims within the first reach."""
+        if self.reach == self.first_reach:
+            return self
         look = rims_at(masked, self.place, self.first_reach, is_fine=False)
         return self._replace(look=look)
 
@@ -295,8 +297,8 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
         return None
     place, noises, reach = found.place, found.noises, found.reach
     is_exact, here = masked.surface.is_exact, None
+    look = rims_at(masked, place, reach, is_fine=True) if is_exact else found.look
     for _ in range(_MOST_NOISES):
-        look = rims_at(masked, place, reach, is_fine=is_exact) if here is None else here.look
         learned = _learned(masked, place, look, noises, reach, correlated=True)
         if here is not None and is_exact:
             joined = here.joined
@@ -309,7 +311,7 @@ def settle(masked: Masked, state: State, *, is_wide: bool = False) -> Settled | 
         if here is None:
             return None
         here = Descent(masked, noises, reach).run(here)
-        place = here.place
+        place, look = here.place, here.look
     return None if here is None else _settled(here, noises)
 
 

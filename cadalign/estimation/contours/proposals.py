@@ -60,8 +60,13 @@ class _Search(NamedTuple):
     kept: int
 
 
-_SEARCHES = (_Search(False, 2, 12, 2, 4), _Search(True, 2, 24, 5, 8))
-_SEARCHES_OF_SIMILAR = (_Search(False, 1, 12, 0, 12),)  # whose surfaces meet no mask
+_SEARCHES = (
+    _Search(is_cut=False, every=2, starts=12, steps=2, kept=4),
+    _Search(is_cut=True, every=2, starts=24, steps=5, kept=8),
+)
+_SEARCHES_OF_SIMILAR = (  # whose surfaces meet no mask
+    _Search(is_cut=False, every=1, starts=12, steps=0, kept=12),
+)
 
 
 class _Proposal(NamedTuple):

@@ -18,7 +18,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.evidence import LENGTHS, ImageEvidence, ObservedImage, Size
-from cadalign.io.images import read_grey
+from cadalign.io.images import read_mask
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import StartFields
 from cadalign.retrieval.by_mask import grab_cut
@@ -267,7 +267,7 @@ def draw_mask(drawing: MaskDrawing, width: int, height: int) -> BoolArray:
     """The pixels (h, w) of a mask."""
     mask = np.zeros((height, width), dtype=np.uint8)
     if drawing.base is not None:
-        mask[:] = read_grey(Path(drawing.base)) != 0
+        mask[:] = read_mask(Path(drawing.base))
     for stroke in drawing.strokes:
         value = int(stroke.adds)
         if stroke.runs:

@@ -27,7 +27,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import DeclaredEvidence
-from cadalign.io.images import ByteImage, read_grey, read_photo
+from cadalign.io.images import ByteImage, read_grey, read_mask, read_photo
 from cadalign.names import renamed
 
 if TYPE_CHECKING:
@@ -88,7 +88,8 @@ class View(DeclaredEvidence):
         cameras moved in an unknown way between them.
     mask : (h, w) bool or float, or path, optional
         Pixels of the object in an image of the camera's size: True, or their probabilities in
-        [0, 1], or an 8-bit grey PNG that is not zero there.
+        [0, 1], or an 8-bit grey PNG that is not zero there (a JPEG: of
+        more than half of its brightest value).
     mask_sigma : float, optional
         Standard deviation of the mask's contour along its normal [px]; None estimates it.
     image : (h, w, 3) uint8, or path, optional
@@ -229,11 +230,13 @@ def _depths(given: Any, camera: Camera, count: int, scale: float | None) -> Floa
 def _mask(given: Any, camera: Camera) -> FloatArray | BoolArray:
     """A mask (h, w): bool, or probabilities."""
     is_file = isinstance(given, str | os.PathLike)
-    mask = read_grey(Path(given)) != 0 if is_file else np.asarray(given)
+    mask = read_mask(Path(given)) if is_file else np.asarray(given)
     if mask.shape != (camera.height, camera.width):
-        size = " x ".join(str(length) for length in mask.shape[::-1])
-        what = f"the mask is {size or 'a number'}, the camera {camera.width} x {camera.height}"
-        raise InputError(what, where="mask", fix="give the mask of this image, in its size")
+        is_image = mask.ndim == 2
+        size = f"{mask.shape[1]} x {mask.shape[0]}" if is_image else f"an array {mask.shape}"
+        what = f"the mask is {size}, the camera {camera.width} x {camera.height}"
+        fix = "give the mask of this image, in its size" + ("" if is_image else ", one channel")
+        raise InputError(what, where="mask", fix=fix)
     if mask.dtype == bool:
         return mask
     probabilities = as_floats(mask, name="mask", shape=(None, None))
@@ -250,12 +253,24 @@ def _photo(given: Any, camera: Camera) -> ByteImage:
     pixels = np.asarray(given)
     if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
         what = f"{pixels.dtype} of shape {pixels.shape}, expected an RGB image (h, w, 3) of uint8"
-        raise InputError(what, where="image")
+        raise InputError(what, where="image", fix=_as_photo(pixels))
     if pixels.shape[:2] != (camera.height, camera.width):
         size = f"{pixels.shape[1]} x {pixels.shape[0]}"
         what = f"the photo is {size}, the camera {camera.width} x {camera.height}"
         raise InputError(what, where="image", fix="give the photo that the camera is of")
     return pixels
+
+
+def _as_photo(pixels: npt.NDArray[Any]) -> str:
+    """How an array of another form becomes a photo."""
+    if pixels.ndim == 2:
+        return "of one channel give np.dstack([image] * 3)"
+    if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
+        return "give the photo's array, or its path"
+    steps = "image[..., :3]" if pixels.shape[2] == 4 else "image"
+    if pixels.dtype.kind == "f" and pixels.size and pixels.max() <= 1:
+        steps = f"(255 * {steps}).round()"
+    return f"give {steps}" + ("" if pixels.dtype == np.uint8 else ".astype(np.uint8)")
 
 
 def _upwards(given: Any, sigma: Any) -> FloatArray:

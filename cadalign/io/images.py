@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, open_input, reading, write_whole
@@ -127,6 +128,18 @@ def read_grey(path: Path) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
         fix = "give an image of one grey channel, of 8 or 16 bits"
         raise DataError(f"the image has the mode {brief(mode)}", where=str(path), fix=fix)
     return pixels if pixels.dtype == np.uint8 else pixels.astype(np.uint16)
+
+
+def read_mask(path: Path) -> BoolArray:
+    """Read an object's pixels (h, w): those that are not zero, as `read_grey` reads them.
+
+    Of a JPEG, whose compression leaves traces on both sides of every edge, those that are brighter
+    than half of the brightest.
+    """
+    with open_photo(path) as image:
+        is_lossy = image.format == "JPEG"
+    pixels = read_grey(path)
+    return np.asarray(pixels > (pixels.max() // 2 if is_lossy else 0))
 
 
 def write_image(path: Path, image: ByteImage) -> None:

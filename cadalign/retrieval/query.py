@@ -15,7 +15,8 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
-from cadalign.io.images import open_photo, read_grey, read_image
+from cadalign.io.images import open_photo, read_image
+from cadalign.io.images import read_mask as read_nonzero
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.shapes.model import ShapeModel
@@ -74,7 +75,7 @@ class ObservationRetrieval:
         camera, ids = seen.camera, _semantic_ids(seen, where)
         cuts_out = self.silhouette and len(ids)
         if mask is None and seen.evidence.mask is not None and not cuts_out:
-            mask = read_grey(seen.evidence.mask) != 0  # as a fit to the observation reads it
+            mask = read_nonzero(seen.evidence.mask)  # as a fit to the observation reads it
         if not len(ids):
             return library.retrieve(mask=mask, camera=camera, workers=workers, **vars(self.ranking))
         if shape is None and not camera.focal_known:

@@ -37,6 +37,21 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
             "give the mask of this image, in its size",
         ),
         (
+            lambda: View(CAMERA, PIXELS, mask=np.dstack([NOTHING] * 3)),
+            "mask: the mask is an array (480, 640, 3), the camera 640 x 480; "
+            "give the mask of this image, in its size, one channel",
+        ),
+        (
+            lambda: View(CAMERA, PIXELS, image=np.dstack([NOTHING / 1.0] * 4)),
+            "image: float64 of shape (480, 640, 4), expected an RGB image (h, w, 3) of uint8; "
+            "give (255 * image[..., :3]).round().astype(np.uint8)",
+        ),
+        (
+            lambda: View(CAMERA, PIXELS, image=NOTHING.astype(np.uint8)),
+            "image: uint8 of shape (480, 640), expected an RGB image (h, w, 3) of uint8; "
+            "of one channel give np.dstack([image] * 3)",
+        ),
+        (
             lambda: align(MODEL, [View(CAMERA, PIXELS), View(CAMERA, PIXELS, mask=NOTHING)]),
             "views[1].mask: contains no pixel of the object; give the mask of the object, or None",
         ),

@@ -18,7 +18,7 @@ from cadalign.annotate.photos import PhotoFile
 from cadalign.datasets import load_mesh
 from cadalign.datasets.photos.photo import DepthImage, PhotoObject
 from cadalign.errors import DataError
-from cadalign.io.images import photo_size, read_grey, read_photo
+from cadalign.io.images import photo_size, read_grey, read_mask, read_photo
 
 ROOT = Path(__file__).resolve().parents[2]
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 4 4\n%%EndComments\nshowpage\n%%EOF\n"
@@ -176,3 +176,14 @@ def test_one_module_decodes_pictures() -> None:
              for p in (ROOT / folder).rglob("*.py")]  # fmt: skip
     found = {p.relative_to(ROOT).as_posix() for p in files if others.search(p.read_text())}
     assert found == {"cadalign/io/images.py"}
+
+
+def test_traces_of_compression_are_no_part_of_a_mask(tmp_path: Path) -> None:
+    mask = np.zeros((48, 64), dtype=np.uint8)
+    mask[11:37, 13:50] = 255
+    for name in ("mask.png", "mask.jpg"):
+        Image.fromarray(mask).save(tmp_path / name)
+        assert np.array_equal(read_mask(tmp_path / name), mask > 0), name
+    assert (read_grey(tmp_path / "mask.jpg") > 0).sum() > (mask > 0).sum()
+    Image.fromarray(mask // 255).save(tmp_path / "labels.png")  # a label, not a brightness
+    assert np.array_equal(read_mask(tmp_path / "labels.png"), mask > 0)

@@ -14,7 +14,6 @@ import numpy as np
 from cadalign.arrays import FloatArray, worker_count
 from cadalign.errors import (
     CadalignError,
-    DegenerateError,
     InputError,
     NoConsensusError,
     quote,
@@ -23,7 +22,7 @@ from cadalign.errors import (
 from cadalign.estimation.contours import refine_with_images
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.joint import result_of_minima
-from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside
+from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside, no_pose_error
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prepared_views import align_facing, align_without, views_without_pose
@@ -214,12 +213,7 @@ def _align_all(
             raise
         mistake = joint_mistake(problem, minima[0], ransac) if minima else None
     if not minima:
-        raise DegenerateError(
-            "no pose has the keypoints in front of the camera",
-            where="views",
-            fix=mistake_beside(problem, ransac)
-            or "give at least 3 keypoints in one view, or `init`, and check which is which",
-        )
+        raise no_pose_error(problem, model, ransac)
     minima, refined = refine_with_images(model, prior, views, minima)
     stats = FitStats(iterations, hypotheses, time.perf_counter() - start)
     likely = widened_by_noise(problem, minima)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError
+from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.joint_robust import OUTLIER_COST
 from cadalign.estimation.mistakes import (
     DOWNWARD,
@@ -19,6 +19,7 @@ from cadalign.estimation.mistakes import (
     find_mistake,
     other_sizes,
 )
+from cadalign.estimation.model import Model
 from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.prior import is_exact
 from cadalign.estimation.search import (
@@ -29,6 +30,7 @@ from cadalign.estimation.search import (
     thresholds,
 )
 from cadalign.estimation.uncertainty.evidence import redundancy_of
+from cadalign.shapes.model import ShapeModel
 
 _FEW_REJECTED = 0.9  # share of the keypoints that agree, above which no mistake is searched for
 _LEAST_UNCERTAIN_MISFIT = 1.0  # of an uncertain shape, below which none is searched for
@@ -101,6 +103,40 @@ def mistake_beside(problem: JointProblem, ransac: RansacOptions | None) -> str |
     """Name the mistake in other evidence than keypoints without which there is an estimate."""
     tried = _beside_keypoints(problem)
     return next((each.clause for each in tried if _without(problem, each, ransac)), None)
+
+
+def no_pose_error(
+    problem: JointProblem, model: Model | ShapeModel, ransac: RansacOptions | None
+) -> CadalignError:
+    """The error where no start leads to a pose: what the evidence lacks, and what to give.
+
+    Raises InputError if a mask or photo is given for a model without meshes.
+    """
+    views, where, fix = problem.views, "views", mistake_beside(problem, ransac)
+    seen = [view for view in views if len(view.keypoint_ids)]
+    shown = [
+        f"views[{number}].{'image' if view.mask is None else 'mask'}"
+        for number, view in enumerate(views)
+        if view.mask is not None or view.image is not None
+    ]
+    if shown:
+        from cadalign.estimation.contours.surface import surfaces_of  # imports this package
+
+        surfaces_of(model, problem.prior.components[0].mean, shown[0])
+    what = "no pose has the keypoints in front of the camera"
+    is_rig = len(views) > 1 and views[0].cam_from_rig is not None
+    if fix is None and shown and not seen and len(views) == 1:
+        where = shown[0]
+        what = "a photo without keypoints does not tell where its outline is to be sought"
+        fix = "give `init`, at least 3 keypoints, or a mask"
+    elif fix is None and shown and not seen:
+        what = "masks and photos of several views tell no pose without keypoints"
+        fix = "give at least 3 keypoints in one view, or `init`, such as the pose by one mask alone"
+    elif fix is None and shown and is_rig and len(seen) == 1 and problem.size is None:
+        what = "keypoints of one view alone leave open the size that the known motion gives"
+        fix = "give a keypoint in another view, `size`, or `init`"
+    fix = fix or "give at least 3 keypoints in one view, or `init`, and check which is which"
+    return DegenerateError(what, where=where, fix=fix)
 
 
 def _misfit(minimum: Minimum) -> float:

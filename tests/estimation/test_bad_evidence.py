@@ -19,7 +19,15 @@ PIXELS = CAMERA.project(truth_of().apply(CORNERS))
 POINTS = keypoints(9)
 PLAIN = Model(points_3d=POINTS)
 NOTHING, EVERYTHING = np.zeros((480, 640), dtype=bool), np.ones((480, 640), dtype=bool)
+BODY = NOTHING.copy()
+BODY[200:280, 280:360] = True
+PHOTO = np.dstack([BODY * np.uint8(200)] * 3)
+SEEN = View(CAMERA, PIXELS, cam_from_rig=around(0))
 UNIT = "in another unit (millimetres for metres)?"
+
+
+def masked(*cameras: np.ndarray) -> list[View]:
+    return [View(CAMERA, mask=BODY, cam_from_rig=camera) for camera in cameras]
 
 
 def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: float) -> np.ndarray:
@@ -78,6 +86,26 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
         (
             lambda: View(CAMERA, PIXELS, cam_from_rig=changed(around(30), 0, 3, np.nan)),
             "cam_from_rig: NaN or infinite values in row 0; remove or repair these",
+        ),
+        (
+            lambda: align(PLAIN, View(CAMERA, mask=BODY)),
+            "views[0].mask: the model has no mesh, which a mask needs; "
+            "give it: Model(..., mesh=cadalign.load_mesh(path))",
+        ),
+        (
+            lambda: align(MODEL, View(CAMERA, image=PHOTO)),
+            "views[0].image: a photo without keypoints does not tell where its outline is to be "
+            "sought; give `init`, at least 3 keypoints, or a mask",
+        ),
+        (
+            lambda: align(MODEL, masked(around(0), around(30))),
+            "views: masks and photos of several views tell no pose without keypoints; "
+            "give at least 3 keypoints in one view, or `init`, such as the pose by one mask alone",
+        ),
+        (
+            lambda: align(MODEL, [SEEN, *masked(around(30))]),
+            "views: keypoints of one view alone leave open the size that the known motion gives; "
+            "give a keypoint in another view, `size`, or `init`",
         ),
         (
             lambda: align(PLAIN, [seen(POINTS, truth_of(), around(0)), View(CAMERA)]),

@@ -104,8 +104,8 @@ class Track(NamedTuple):
 class Minimum(NamedTuple):
     """An estimate under one component of the prior; ``score`` is -2 log of its probability.
 
-    The state's focal lengths are relative to those of ``lenses``. The score of a mask alone and a
-    model that is only similar is the ``outline_score``.
+    The state's focal lengths are relative to those of ``lenses``. The score of a mask alone is
+    the ``outline_score``.
     """
 
     component: int

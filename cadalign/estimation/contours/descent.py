@@ -260,8 +260,6 @@ class FirstSteps(NamedTuple):
 
     def widened(self, masked: Masked) -> FirstSteps:
         """The same with the rims within the first reach."""
-        if self.reach == self.first_reach:
-            return self
         look = rims_at(masked, self.place, self.first_reach, is_fine=False)
         return self._replace(look=look)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, cast
@@ -21,7 +21,7 @@ from cadalign.estimation.contours.measured import (
     with_displacement_modes,
 )
 from cadalign.estimation.contours.surface import Surface, surfaces_of
-from cadalign.estimation.contours.view_contour import ViewContour, contour_view
+from cadalign.estimation.contours.view_contour import ViewContour, contour_view, cost_of_contour
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.result import Result
@@ -32,7 +32,7 @@ from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import information_of
 from cadalign.solvers.joint.evidence import Evidence, State
-from cadalign.solvers.joint.search import reduced
+from cadalign.solvers.joint.search import reduced, score_state
 
 _MOST_STARTS = 4
 _MOST_OPEN_STARTS = 8  # where nothing but the masks determines the estimate
@@ -93,6 +93,18 @@ class _Candidate(NamedTuple):
         own, known = self.settled.score + self.start.prior_score, self.start.outline_score
         return own if known is None or not np.isfinite(own) else known
 
+    def scored_by_outline(self, correlation: float) -> _Candidate:
+        """The same with the score of a contour of which an occluder may have made a part.
+
+        So many neighbours as the ``correlation`` count as one.
+        """
+        evidence, state, place, *_ = self.settled.joined
+        rest = score_state(evidence, state) - self.settled.cost + self.start.prior_score
+        rest += cost_of(self.masked.evidence, place.state)
+        samples = sum(len(fit.residuals) for fit in self.settled.fits)
+        outline = 2 * samples / correlation * _outline_cost(self.settled)
+        return self._replace(start=self.start._replace(outline_score=rest + outline))
+
     @property
     def minimum(self) -> Minimum:
         evidence, state, *_ = self.settled.joined
@@ -127,7 +139,10 @@ def fit_masks(
     most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
     used, left_out, warnings = list(contours), [], []
     starts = [(each, each.state) for each in likely[:most]]
-    explore = partial(_explored, starts, keypoints, is_wide=is_open)
+    # Proposals lie near their ends, and some of these may explain no more than a part.
+    is_proposed = first.outline_score is not None and surfaces[0].is_exact
+    cost = _outline_cost if is_proposed else _misfit
+    explore = partial(_explored, starts, keypoints, is_wide=is_open and not is_proposed, cost=cost)
     best: list[_Candidate] = []
     while used:
         best = explore(used, surfaces)
@@ -135,7 +150,9 @@ def fit_masks(
             agrees = bool(best) and _misfit(best[0].settled) <= _AGREEING
             if not agrees or best[0].masked.surface.is_exact:
                 others = _displaced(first, _POORLY_KNOWN if agrees else _WELL_KNOWN)
-                displaced = _explored(others, keypoints, used, surfaces, is_wide=False)
+                displaced = _explored(
+                    others, keypoints, used, surfaces, is_wide=False, cost=_misfit
+                )
                 best = sorted([*best, *displaced], key=lambda each: _misfit(each.settled))
         hulls = [_hull_contour(each, views[each.image]) for each in used] if convex else []
         known = [each for each in hulls if each is not None]
@@ -147,6 +164,10 @@ def fit_masks(
             ):
                 best, used = by_hulls, known
         best = _finished(best)
+        if is_proposed and best:
+            correlation = best[0].settled.noises[0].correlation
+            scored = [each.scored_by_outline(correlation) for each in best]
+            best = sorted(scored, key=lambda each: each.score)
         wrong = _contradicting(best, used)
         if wrong is None:
             break
@@ -209,8 +230,9 @@ def _explored(
     surfaces: list[Surface],
     *,
     is_wide: bool,
+    cost: Callable[[Settled], float],
 ) -> list[_Candidate]:
-    """Every start with the surface that fits best, the best fit first.
+    """Every start with the surface of the least cost, the least first.
 
     Surfaces of a learned shape follow its modes alone: with the keypoints' own displacements a step
     takes several times as long, and modes distinguish the surfaces.
@@ -227,8 +249,8 @@ def _explored(
             if settled is not None:
                 tried.append(_Candidate(start, masked, settled))
         if tried:
-            found.append(min(tried, key=lambda each: _misfit(each.settled)))
-    return sorted(found, key=lambda each: _misfit(each.settled))
+            found.append(min(tried, key=lambda each: cost(each.settled)))
+    return sorted(found, key=lambda each: cost(each.settled))
 
 
 def _finished(candidates: list[_Candidate]) -> list[_Candidate]:
@@ -256,8 +278,17 @@ def _finished(candidates: list[_Candidate]) -> list[_Candidate]:
 
 def _misfit(settled: Settled) -> float:
     """Mean residual [px] of all samples, each at most `_LARGEST`, as of those without a rim."""
+    return float(_distances(settled).mean())
+
+
+def _outline_cost(settled: Settled) -> float:
+    """Mean of -log density [1/px] of all samples, which an occluder may have made in part."""
+    return cost_of_contour(_distances(settled), _LARGEST)
+
+
+def _distances(settled: Settled) -> FloatArray:
     every = [np.nan_to_num(np.abs(fit.residuals), nan=_LARGEST) for fit in settled.fits]
-    return float(np.minimum(np.concatenate(every), _LARGEST).mean())
+    return np.asarray(np.minimum(np.concatenate(every), _LARGEST))
 
 
 def _contradicting(

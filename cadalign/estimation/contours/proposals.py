@@ -12,7 +12,7 @@ import numpy as np
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.contours.descent import MOST_ROUNDS, FirstSteps, Masked
-from cadalign.estimation.contours.silhouettes import distinct, resembling_poses
+from cadalign.estimation.contours.silhouettes import Resembling, distinct, resembling_poses
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import (
     ViewContour,
@@ -98,20 +98,27 @@ class _Proposal(NamedTuple):
 
 
 class _Start(NamedTuple):
-    """A start on its way to the mask: its minimum without this, and the steps so far."""
+    """A start on its way to the mask: its minimum without this, and the steps so far.
+
+    They approach the ``shown`` part of the contour, which no line hides.
+    """
 
     minimum: Minimum
     masked: Masked
+    shown: Masked
     approach: FirstSteps
 
     @property
     def cost(self) -> float:
-        """See `_Proposal`."""
-        return cost_of_contour(self.approach.residuals(), self.approach.first_reach)
+        """See `_Proposal`; the contour that is not shown lies anywhere within the reach."""
+        reach, residuals = self.approach.first_reach, self.approach.residuals()
+        share = len(residuals) / len(self.masked.views[0].contour.points)
+        own = cost_of_contour(residuals, reach)
+        return share * own + (1 - share) * float(np.log(2 * reach))
 
     def followed(self, steps: int = MOST_ROUNDS) -> _Start | None:
         """So many steps further, at most; None where no rim comes near the contour."""
-        further = self.approach.followed(self.masked, steps)
+        further = self.approach.followed(self.shown, steps)
         return None if further is None else self._replace(approach=further)
 
     @property
@@ -169,13 +176,11 @@ def minima_of_mask(
             "average: the object may be partly hidden, the model another, or the pose wrong"
         )
     chosen = _chosen(proposals, _symmetry_of(model))
-    if is_exact:
-        return [each.minimum for each in chosen], steps, starts, mistake
     scores = [each.over(chosen[0]) for each in chosen]
     likely = [
         each.minimum._replace(outline_score=score)
         for each, score in zip(chosen, scores, strict=True)
-        if np.exp(-score / 2) >= LEAST_LIKELIHOOD
+        if is_exact or np.exp(-score / 2) >= LEAST_LIKELIHOOD
     ]
     return likely, steps, starts, mistake
 
@@ -226,8 +231,8 @@ def _searched(
     steps, starts = 0, 0
     for search in searches:
         begun = []
-        for alignment, surface in _resembling(problem, model, search):
-            start, iterations = _begun(problem, alignment, surface, contour)
+        for each, surface in _resembling(problem, model, search):
+            start, iterations = _begun(problem, each, surface, contour)
             starts, steps = starts + 1, steps + iterations
             tried = None if start is None else start.followed(search.steps)
             if tried is not None:
@@ -266,12 +271,12 @@ def _rough_contour(view: View, camera: Camera, size: float) -> tuple[ViewContour
 
 def _resembling(
     problem: JointProblem, model: Model | ShapeModel, search: _Search
-) -> list[tuple[Alignment, Surface]]:
+) -> list[tuple[Resembling, Surface]]:
     """Alignments of all meshes whose silhouettes resemble the mask, the best first."""
     (view,), camera = problem.views, problem.lenses.cameras[0]
     free = np.asarray(problem.prior.scales.free > 0)
     mask = cast(FloatArray, view.mask_image)
-    found: list[tuple[tuple[float, Alignment], Surface]] = []
+    found: list[tuple[Resembling, Surface]] = []
     for surface in _surfaces_of(model):
         poses = resembling_poses(
             surface.mesh,
@@ -284,20 +289,23 @@ def _resembling(
             symmetry=_symmetry_of(model),
         )
         found.extend((each, surface) for each in poses)
-    best = sorted(found, key=lambda pair: -pair[0][0])[: search.starts]
-    return [(alignment, surface) for (_, alignment), surface in best]
+    return sorted(found, key=lambda pair: -pair[0].overlap)[: search.starts]
 
 
 def _begun(
-    problem: JointProblem, start: Alignment, surface: Surface, contour: ViewContour
+    problem: JointProblem, start: Resembling, surface: Surface, contour: ViewContour
 ) -> tuple[_Start | None, int]:
     """A start before its first step towards the mask's outline; and iterations that led there."""
-    _, minima, iterations, _ = find_minima(problem, [start], None)
+    _, minima, iterations, _ = find_minima(problem, [start.alignment], None)
     if not minima:
         return None, iterations
     best = minima[0]
-    masked = Masked(best.evidence, len(problem.prior.ids), [contour], surface)
-    return _Start(best, masked, FirstSteps.begun(masked, best.state, is_wide=True)), iterations
+    masked, shown = (
+        Masked(best.evidence, len(problem.prior.ids), [part], surface)
+        for part in (contour, contour.shown_by(start.line))
+    )
+    approach = FirstSteps.begun(shown, best.state, is_wide=True)
+    return _Start(best, masked, shown, approach), iterations
 
 
 def _symmetry_of(model: Model | ShapeModel) -> Symmetry | None:

@@ -46,6 +46,8 @@ _OUTLINE_CELLS = 60
 _OUTLINE_EVERY = 2  # directions
 _LINE_ANGLES = 16  # of what hides a part
 _HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
+_LEAST_HIDDEN = 0.03  # of the area, that a line hides
+_LINE_MARGIN = 4.0  # [cells], on the object's side of a line, whose directions are few
 _LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
 _MOST_AFFINE = 200  # cameras of which the silhouettes are rendered
 _MOST_AFFINE_CUT = 600  # where the mask may lack a part, which leaves more possible
@@ -57,6 +59,18 @@ _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
 
 T = TypeVar("T")
+
+
+class Resembling(NamedTuple):
+    """An alignment whose silhouette, or the part of it that a line leaves, resembles a mask.
+
+    The ``overlap`` is their intersection over union. Rays with ``line @ ray > 0`` are near the
+    line (3,) or beyond it; it is zero where none is needed.
+    """
+
+    overlap: float
+    alignment: Alignment
+    line: FloatArray
 
 
 class Whitened(NamedTuple):
@@ -229,10 +243,9 @@ def resembling_poses(
     is_cut: bool = False,
     every: int = 1,
     symmetry: Symmetry | None = None,
-) -> list[tuple[float, Alignment]]:
+) -> list[Resembling]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
-    Each comes after the intersection over union of its silhouette, or a part, and the mask.
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
     lies beyond a line. One row and column in ``every`` are compared. Of alignments that are equal
     under the ``symmetry`` one is kept.
@@ -241,10 +254,10 @@ def resembling_poses(
     query, compared = whitened(view.image, view.corner, view.cell), view.compared(every)
     most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
     poses = _poses_of(*_affine_cameras(atlas, query, most), atlas, free)
-    found = [(_overlap(atlas, compared, pose, is_cut=is_cut), pose) for pose in poses]
-    found.sort(key=lambda each: -each[0])
-    kept = distinct(((pose, (iou, pose)) for iou, pose in found), count, symmetry)
-    return [(iou, turned_alignment(pose, view.camera_from_facing)) for iou, pose in kept]
+    found = [_resemblance(atlas, compared, pose, is_cut=is_cut) for pose in poses]
+    found.sort(key=lambda each: -each.overlap)
+    kept = distinct(((each.alignment, each) for each in found), count, symmetry)
+    return [view.in_camera(each) for each in kept]
 
 
 def outline_of_mask(mask: FloatArray | BoolArray, camera: Camera) -> Whitened:
@@ -267,22 +280,30 @@ class _Facing(NamedTuple):
     cell: float
     camera_from_facing: FloatArray
 
-    def compared(self, every: int) -> _Compared:
+    def compared(self, every: int) -> _Cells:
         """The cells of so many rows and columns that stand for all."""
         grid = np.arange(_CELLS**2).reshape(_CELLS, _CELLS)
         some = grid[::every, ::every].ravel()
-        return _Compared(
-            self.image.ravel()[some].astype(float), self.rays[some], self.is_seen[some], every
-        )
+        middle = self.corner + self.cell * (_CELLS - 1) / 2
+        mask = self.image.ravel()[some].astype(float)
+        return _Cells(mask, self.rays[some], self.is_seen[some], every, middle, self.cell)
+
+    def in_camera(self, found: Resembling) -> Resembling:
+        """The same in the photo's camera."""
+        turn = self.camera_from_facing
+        pose = turned_alignment(found.alignment, turn)
+        return Resembling(found.overlap, pose, turn @ found.line)
 
 
-class _Compared(NamedTuple):
+class _Cells(NamedTuple):
     """Cells (m,) of `_Facing`, their rays (m, 3) and if they are seen (m,); every so many."""
 
     mask: FloatArray
     rays: FloatArray
     is_seen: BoolArray
     every: int
+    middle: FloatArray
+    cell: float
 
 
 def _facing(mask: FloatArray | BoolArray, camera: Camera) -> _Facing:
@@ -381,34 +402,45 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
     return np.asarray(np.exp(logs))
 
 
+def _line_angles() -> FloatArray:
+    return np.asarray(2 * np.pi * np.arange(_LINE_ANGLES) / _LINE_ANGLES)
+
+
 @cache
 def _line_bins(every: int) -> IntArray:
     """Numbers (`_LINE_ANGLES`, m) of the cells' places along directions, all around."""
-    angles = 2 * np.pi * np.arange(_LINE_ANGLES) / _LINE_ANGLES
+    angles = _line_angles()
     places = np.arange(0, _CELLS, every) - (_CELLS - 1) / 2
     x, y = np.meshgrid(places, places)
     along = np.cos(angles)[:, None] * x.ravel() + np.sin(angles)[:, None] * y.ravel()
     return np.asarray(np.rint(along + _CELLS), dtype=np.int64)
 
 
-def _overlap(atlas: Atlas, view: _Compared, pose: Alignment, *, is_cut: bool) -> float:
-    """Intersection over union of a pose's silhouette and the mask.
+def _resemblance(atlas: Atlas, view: _Cells, pose: Alignment, *, is_cut: bool) -> Resembling:
+    """Compare a pose's silhouette with the mask.
 
-    If it ``is_cut``, of what the best line leaves of the silhouette, less where it leaves less.
+    If it ``is_cut``, what the best line leaves of the silhouette, less where it leaves less.
     """
     origin, model_from_ray = model_rays(pose)
     mask = view.mask
     seen = atlas.caster.covered(origin, view.rays @ model_from_ray.T) & view.is_seen
     both, total = mask[seen], float(mask.sum())
     if not is_cut:
-        return float(both.sum()) / (total + len(both) - float(both.sum()))
-    best = 0.0
-    for bins in _line_bins(view.every)[:, seen]:
+        overlap = float(both.sum()) / (total + len(both) - float(both.sum()))
+        return Resembling(overlap, pose, np.zeros(3))
+    best, line = 0.0, np.zeros(3)
+    for angle, bins in zip(_line_angles(), _line_bins(view.every)[:, seen], strict=True):
         count = np.cumsum(np.bincount(bins, minlength=1))
         common = np.cumsum(np.bincount(bins, weights=both, minlength=1))
         share = count / max(float(count[-1]), 1.0)
-        best = max(best, float((common / (total + count - common) * share**_HIDDEN_POWER).max()))
-    return best
+        overlaps = common / (total + count - common) * share**_HIDDEN_POWER
+        last = int(overlaps.argmax())
+        if overlaps[last] > best:
+            best, is_hidden = float(overlaps[last]), share[last] < 1 - _LEAST_HIDDEN
+            normal = np.array([np.cos(angle), np.sin(angle)])
+            farthest = (last - _CELLS - _LINE_MARGIN) * view.cell + normal @ view.middle
+            line = is_hidden * np.array([*normal, -farthest])
+    return Resembling(best, pose, line)
 
 
 def distinct(

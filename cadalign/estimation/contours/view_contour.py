@@ -242,6 +242,14 @@ class ViewContour:
         right, down = (REGISTRATION * own[1:]).tolist()
         return replace(camera, cx=camera.cx + right, cy=camera.cy + down)
 
+    def shown_by(self, line: FloatArray) -> ViewContour:
+        """The part that no line (3,) hides, beyond which rays have ``line @ ray > 0``."""
+        rays, _ = self.camera.normalize_where_valid(self.contour.points)
+        shown = rays @ line[:2] + line[2] <= 0
+        if shown.all():
+            return self
+        return replace(self, contour=self.contour.taken(shown), slopes=self.slopes[shown])
+
     def evidence_of(
         self, rims: Rims, noise: Noise, surface: PosedSurface, sight: Sight, bias: FloatArray
     ) -> Measured:

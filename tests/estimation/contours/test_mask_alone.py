@@ -13,6 +13,7 @@ from cadalign import Alignment, Camera, Mesh, Model, Symmetry, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.silhouettes import atlas_of, distinct, resembling_poses
+from cadalign.evaluation.instances.evidence import damaged_mask
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
@@ -109,6 +110,15 @@ class TestOwnModel:
         assert rotation_error(est=found.alignment, gt=truth) < 1.0
         assert found.alignment.scale == pytest.approx(truth.scale, rel=0.05)
 
+    @pytest.mark.parametrize("seed", [0, 6, 8])
+    def test_quarter_that_is_hidden(self, seed: int) -> None:
+        truth = posed(seed, (1.0, 1.4, 0.7))
+        whole = mask_of(body(), truth)
+        mask = damaged_mask(whole, "hidden", np.random.default_rng(seed))
+        found = align(Model(mesh=body()), View(CAMERA, mask=mask))
+        assert rotation_error(est=found.alignment, gt=truth) < 1.0
+        np.testing.assert_allclose(found.alignment.scale, truth.scale, rtol=0.03)
+
     def test_probabilities_of_a_large_photo(self) -> None:
         """Starts are followed in a smaller copy of the mask, the end in the mask itself."""
         truth, camera = posed(0, (1.0, 1.2, 0.8)), CAMERA.resized(1280, 960)
@@ -187,8 +197,8 @@ class TestSilhouettes:
         truth = posed(1, (1.0, 1.4, 0.7))
         mask = mask_of(body(), truth)
         found = resembling_poses(body(), mask, CAMERA, free=FREE, count=16)
-        overlaps = [iou for iou, _ in found]
+        overlaps = [each.overlap for each in found]
         assert overlaps == sorted(overlaps, reverse=True)
-        assert len({pose.rotation.tobytes() for _, pose in found}) == len(found)
-        nearest = min(rotation_error(est=pose, gt=truth) for _, pose in found)
+        assert len({each.alignment.rotation.tobytes() for each in found}) == len(found)
+        nearest = min(rotation_error(est=each.alignment, gt=truth) for each in found)
         assert nearest < 25.0

@@ -166,7 +166,7 @@ class Observation(ObservedImage):
         written = [
             write_image_fields(view, folder, states_origins=states_origins) for view in self.views
         ]
-        # A file of one image has keypoints; one of several may have a mask alone.
+        # Files of one image without keypoints were refused earlier; lists of views were not.
         is_of_mask = not len(self.points_2d) and self.evidence.mask is not None
         listed = bool(self.others) or is_of_mask
         data: dict[str, Any] = {"views": written} if listed else written[0]

@@ -165,7 +165,7 @@ class OneView(_ObjectFields, kw_only=True):
 
 
 class StartedView(OneView, kw_only=True):
-    """A file of one image with a start, which needs no keypoints."""
+    """A file of one image with a mask or a start, which needs no keypoints."""
 
     keypoints: list[KeypointFields] = msgspec.field(default_factory=list)
 
@@ -197,8 +197,9 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
     Raises DataError if a field is missing, unknown or invalid.
     """
     if not isinstance(data, Mapping) or "views" not in data:
-        is_started = isinstance(data, Mapping) and data.get("init") is not None
-        one: OneView = convert(data, with_evidence(StartedView if is_started else OneView))
+        given = data if isinstance(data, Mapping) else {}
+        needs_none = given.get("init") is not None or given.get("mask") is not None
+        one: OneView = convert(data, with_evidence(StartedView if needs_none else OneView))
         sigma = one.fit.sigma
         if isinstance(sigma, list) and len(sigma) != len(one.keypoints):
             what = f"{len(sigma)} numbers for {len(one.keypoints)} keypoints"

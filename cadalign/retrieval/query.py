@@ -153,7 +153,15 @@ def _semantic_ids(query: Observation, where: str) -> IntArray:
 
 
 def read_mask(path: Path, camera: Camera) -> BoolArray:
-    """Read an image whose bright pixels are the object's, (h, w) bool; raises as `read_image`."""
+    """Read an object's pixels, (h, w) bool; raises as `read_image`.
+
+    Those of one channel are read as a fit reads them, of a coloured image they are the bright ones.
+    """
+    with open_photo(path) as image:
+        is_grey = image.mode in ("1", "L", "P") or image.mode.startswith("I")
+    mask = read_nonzero(path) if is_grey else None
+    if mask is not None and mask.shape == (camera.height, camera.width):
+        return mask
     return np.asarray(read_image(path, camera).mean(axis=2) > 127.5)
 
 

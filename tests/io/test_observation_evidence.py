@@ -98,6 +98,17 @@ def test_start_arrives_and_needs_no_keypoints() -> None:
     assert Observation.from_dict(ONE | {"init": None}).init is None
 
 
+def test_a_mask_needs_no_keypoints() -> None:
+    alone = {"camera": CAMERA, "mask": "mask.png"}
+    for more in ({}, {"keypoints": []}):
+        found = Observation.from_dict({**alone, **more})
+        assert not len(found.points_2d)
+        for read in (found, Observation.from_dict(found.to_dict())):
+            assert read.evidence.mask == Path("mask.png")
+    with pytest.raises(DataError, match="keypoints: missing"):
+        Observation.from_dict({"camera": CAMERA, "image": "photo.png"})
+
+
 @pytest.mark.parametrize("data", [ONE, SEVERAL])
 def test_what_is_read_is_written_again(tmp_path: Path, data: dict[str, Any]) -> None:
     path = write_json(tmp_path / "a.json", data)
@@ -170,7 +181,7 @@ def test_views_need_no_xyz_where_a_shape_has_them(tmp_path: Path) -> None:
             "{path}: depth_sigma: given without depth; give depth, too",
         ),
         (
-            replaced(ONE, "init", ...) | {"keypoints": []},
+            replaced(ONE, "init", ...) | {"keypoints": [], "mask": None},
             "{path}: keypoints: [] is not a list of at least 1",
         ),
         (replaced(ONE, "init.translation", ...), "{path}: init.translation: missing"),

@@ -85,6 +85,8 @@ _LABELS = {
     "mask+depth": "+ mask, depth",
     "mask+views-2": "+ mask, 2 known views",
     "all": "all of one kind each",
+    "image": "+ the photo itself",
+    "mask-alone": "a mask alone",
     "rigid": "the given model, rigid",
     "stretched": "stretched",
     "prior": "stretched, with a prior",

@@ -93,6 +93,17 @@ def test_every_method_gives_what_it_is_named_after(car: ObjectScene) -> None:
 
 
 @pytest.mark.long
+def test_a_photo_and_a_mask_alone_are_methods(root: Path) -> None:
+    methods = ["keypoints", "image", "mask-alone"]
+    table = evaluate(root, "evidence", methods=methods, workers=0)
+    assert (table.status == "ok").all()
+    errors = table.groupby("method").rotation_error_deg.median()
+    assert errors["image"] < 0.7 * errors["keypoints"]
+    assert errors["mask-alone"] < 0.1 * errors["keypoints"]
+    assert (table.keypoints[table.method == "mask-alone"] == 0).all()
+
+
+@pytest.mark.long
 def test_run_resumes_and_reports(root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     options = ["--methods", *QUICK, "--categories", "car", "chair", "--workers", "0"]

@@ -150,7 +150,8 @@ def _step(
     shown = [each for each in zip(pictured.views, outlines, strict=True) if each[1] is not None]
     for (photo, outline), measured in zip(shown, rows, strict=True):
         silhouette, told = cast(Outline, outline).silhouette, cast(Outline, outline).is_told
-        points = measured.mean + np.tensordot(state.coefficients, measured.modes, axes=1)
+        own = state.coefficients[: len(measured.modes)]  # none for a rigid surface
+        points = measured.mean + np.tensordot(own, measured.modes, axes=1)
         camera = pictured.camera_at(photo.image, photo.camera, state)
         moved = camera.project(poses[photo.image].apply(points)) - silhouette.contour.points[told]
         along = (moved * silhouette.contour.normals[told]).sum(axis=1)

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from cadalign.evaluation.runs.tables import Columns
 
 KEYPOINTS = "keypoints"
-MASK, DEPTH, GRAVITY, LENGTH = "mask", "depth", "gravity", "length"
+MASK, DEPTH, GRAVITY, LENGTH, IMAGE = "mask", "depth", "gravity", "length", "image"
+MASK_ALONE = "mask-alone"
 VIEWS_FREE = {"views-2-free": 2, "views-5-free": 5}
 VIEWS_KNOWN = {"views-2": 2, "views-5": 5}
 DAMAGED = {
@@ -48,8 +49,10 @@ COMBINED = {
 }
 METHODS = (
     *(KEYPOINTS, GRAVITY, LENGTH, DEPTH, *VIEWS_FREE, *VIEWS_KNOWN, MASK, *DAMAGED, *COMBINED),
+    *(IMAGE, MASK_ALONE),
 )
-_DEFAULT = tuple(name for name in METHODS if name not in DAMAGED or name == "mask-dilated")
+_ON_DEMAND = {*DAMAGED, IMAGE, MASK_ALONE} - {"mask-dilated"}
+_DEFAULT = tuple(name for name in METHODS if name not in _ON_DEMAND)
 
 
 @dataclass(frozen=True)
@@ -86,7 +89,8 @@ class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     first view): these and one kind of evidence; views-2, views-5: two and five views with known
     camera motion, views-2-free, views-5-free with unknown motion; mask-dilated, mask-eroded (by 2
     px), mask-smoothed (at random, 2 px), mask-hidden (a quarter), mask-hole, mask-blob: damaged
-    masks; gravity+length, mask+gravity, mask+depth, mask+views-2, all."""
+    masks; gravity+length, mask+gravity, mask+depth, mask+views-2, all; image: the photo itself, the
+    object drawn before a random texture; mask-alone: the mask without any keypoint."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -79,6 +79,9 @@ class PhotosOptions(FunctionOptions, protocols.KeypointOptions):
     keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
     rigid+mask, rigid+image (the photo itself) or similar+depth+gravity; and truth. By default the
     first five, shape where there is one, and the evidence that the data have but the image."""
+    evidence: tuple[str, ...] = ()
+    """mask, depth, gravity, image: what the methods by default get beside keypoints; what the data
+    have but the image, where none is named."""
     shape: tuple[Path, ...] = ()
     """Files of `cadalign shape learn`, each for its category."""
     similar_sigma: float = 0.04
@@ -93,6 +96,7 @@ class PhotosOptions(FunctionOptions, protocols.KeypointOptions):
         if not 0 < self.similar_sigma < math.inf:
             raise InputError(f"{self.similar_sigma} is not positive", where="similar_sigma")
         self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
+        protocols.check_evidence(self.evidence, self.methods)
         for name in self.methods:
             if protocols.is_own(name) or not is_registered(name):
                 protocols.check_method(name)
@@ -224,10 +228,10 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     if not options.methods:
         methods = protocols.default_methods(
             with_evidence=tuple(dict.fromkeys((protocols.RIGID, protocol.best))),
-            evidence=_evidence(dataset),
+            evidence=set(options.evidence) or _evidence(dataset),
             has_shape=bool(shapes),
         )
-        options = replace(options, methods=methods)
+        options = replace(options, methods=methods, evidence=())
     tasks = PhotoTasks(dataset, options.max_photos)
     pictures = folder.made_for_pictures()
     chunk = _CHUNK if len(tasks) < _LARGE else _LARGE_CHUNK

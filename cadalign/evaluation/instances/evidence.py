@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -27,8 +27,10 @@ from cadalign.evaluation.experiments.evidence import (
     DAMAGED,
     DEPTH,
     GRAVITY,
+    IMAGE,
     LENGTH,
     MASK,
+    MASK_ALONE,
     METHODS,
     VIEWS_FREE,
     VIEWS_KNOWN,
@@ -48,9 +50,12 @@ from cadalign.evaluation.runs.tables import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.evidence import Size
-from cadalign.render import Scene, cast_geometry, visible_keypoints
+from cadalign.io.images import ByteImage
+from cadalign.render import RaycastRenderer, Scene, cast_geometry, visible_keypoints
 from cadalign.seeding import instance_rng
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
@@ -83,6 +88,7 @@ class ObjectScene:
     height: float  # of the object, with noise [model units]
     diagonal: float  # of the object's box [model units]
     shown: Scene  # the object as it is
+    symmetry: Symmetry  # of the object
     cam_from_shown: Alignment  # its pose in the first camera
     names: tuple[str, ...]  # names of the instance, for its randomness
     options: EvidenceRunOptions  # the seed, and the accuracy of the evidence
@@ -91,6 +97,19 @@ class ObjectScene:
         """The object's mask in the first camera; see `damaged_mask`."""
         mask = cast_geometry(self.shown, KEYPOINT_CAMERA, self.cam_from_shown).mask
         return damaged_mask(mask, damage, instance_rng(self.options.seed, *self.names, damage))
+
+    def photo(self) -> ByteImage:
+        """The object in the first camera, before a random texture."""
+        camera, rng = KEYPOINT_CAMERA, instance_rng(self.options.seed, *self.names, "photo")
+        frame = RaycastRenderer().render(self.shown, camera, self.cam_from_shown, samples=4)
+        return frame.composite(random_texture(camera.height, camera.width, rng))
+
+    def truth_for(self, est: Alignment) -> Alignment:
+        """The truth whose rotation is nearest, among those by which the object looks the same."""
+        rigid = replace(self.gt, scale=np.ones(3))  # the object has it, not its model
+        return replace(
+            nearest_truth(est=est, gt=rigid, symmetry=self.symmetry), scale=self.gt.scale
+        )
 
 
 _scene_of = lru_cache(maxsize=1)(load_scene)  # views of one model come one after another
@@ -127,6 +146,7 @@ def make_scene(model: AnnotatedModel, view: int, options: EvidenceRunOptions) ->
         height=height,
         diagonal=instance.diagonal,
         shown=shown,
+        symmetry=model.symmetry,
         cam_from_shown=pose,
         names=names,
         options=options,
@@ -197,6 +217,8 @@ def _align_with(scene: ObjectScene, *, method: str) -> EvidenceEstimate:
 def evidence_for(method: str, scene: ObjectScene) -> Given:
     """The views and the size that a method gives."""
     options = scene.options
+    if method == MASK_ALONE:
+        return Given((View(KEYPOINT_CAMERA, mask=scene.mask()),), scene.shots[:1], None)
     kinds = COMBINED.get(method, (method,))
     count = next((VIEWS_KNOWN[kind] for kind in kinds if kind in VIEWS_KNOWN), 1)
     shots = scene.shots[: VIEWS_FREE.get(method, count)]
@@ -228,6 +250,8 @@ def _of_first(kinds: tuple[str, ...], scene: ObjectScene) -> dict[str, Any]:
     for kind in kinds:
         if kind == MASK or kind in DAMAGED:
             fields["mask"] = scene.mask(DAMAGED.get(kind, "exact"))
+    if IMAGE in kinds:
+        fields["image"] = scene.photo()
     return fields
 
 
@@ -285,7 +309,9 @@ class EvidenceScenes(Setting):
         return EvidenceEstimate(answer.alignment, answer)
 
     def row(self, method: Method, scene: ObjectScene, estimate: EvidenceEstimate) -> Row:
-        est, gt, bounds = estimate.alignment, scene.gt, np.asarray(scene.model.bounds)
+        est, bounds = estimate.alignment, np.asarray(scene.model.bounds)
+        # Keypoints distinguish poses of the same outline.
+        gt = scene.truth_for(est) if method.name == MASK_ALONE else scene.gt
         boxes = {"est": Box.from_model(bounds, est), "gt": Box.from_model(bounds, gt)}
         values: Row = {
             **alignment_errors(est=est, gt=gt, length=scene.diagonal),
@@ -297,7 +323,7 @@ class EvidenceScenes(Setting):
         limits = self._bounds(bound_of(result, given, scene), scene)
         return {
             **values,
-            "keypoints": sum(len(shot.rows) for shot in given.shots),
+            "keypoints": sum(len(view.keypoint_ids) for view in given.views),
             **limits,
             "over_limit": values["rotation_error_deg"] / limits["rotation_bound_deg"],
             "warnings": len(result.warnings),
@@ -337,7 +363,7 @@ def bound_of(result: Result, given: Given, scene: ObjectScene) -> FloatArray:
     return pose_and_lengths(evidence, true_state, unknowns)
 
 
-# Masks --------------------------------------------------------------------------------------------
+# Photos and masks ---------------------------------------------------------------------------------
 
 DAMAGES = ("exact", "dilated", "eroded", "smoothed", "hidden", "hole", "blob")
 """Kinds of masks: without damage; with a contour 2 px outside or inside; with a contour that
@@ -348,6 +374,21 @@ _WANDER = 2.0  # [px], standard deviation of a smoothed contour
 _WANDER_LENGTH = 5.0  # [px], over which it wanders
 _HIDDEN = 0.25  # share of the area
 _SIZE = 0.13  # radius of holes and blobs, relative to the root of the area
+
+
+_GRAINS = (2.0, 8.0, 32.0)  # [px]
+_TEXTURE = 30.0  # standard deviation of a channel [grey levels]
+_COLOURED = 0.3  # part of it that is a channel's own
+
+
+def random_texture(height: int, width: int, rng: np.random.Generator) -> ByteImage:
+    """A picture (h, w, 3) of a random colour with grains of several sizes."""
+    picture = np.zeros((height, width, 3)) + rng.uniform(60, 200, 3)
+    for grain in _GRAINS:
+        noise = rng.normal(size=(height, width, 1)) + _COLOURED * rng.normal(size=picture.shape)
+        blurred = cv2.GaussianBlur(noise, (0, 0), grain)
+        picture += _TEXTURE / len(_GRAINS) ** 0.5 * blurred / blurred.std()
+    return np.asarray(np.clip(picture, 0, 255), dtype=np.uint8)
 
 
 def damaged_mask(mask: npt.ArrayLike, kind: str, rng: np.random.Generator) -> BoolArray:

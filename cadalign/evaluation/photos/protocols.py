@@ -66,6 +66,20 @@ def check_method(method: str) -> None:
         raise InputError(f"{base} takes keypoints alone", where="methods", fix=fix)
 
 
+def check_evidence(evidence: Collection[str], methods: Collection[str]) -> None:
+    """Check evidence that the methods by default are to get.
+
+    Raises InputError if a kind is unknown, or methods are given, which name their own.
+    """
+    for kind in evidence:
+        if kind not in EVIDENCE:
+            what = f"unknown evidence {quote(kind)}"
+            raise InputError(what, where="evidence", fix=f"known are {', '.join(EVIDENCE)}")
+    if evidence and methods:
+        fix = f"name it there, as in {RIGID}+{next(iter(evidence))}"
+        raise InputError("is for the methods by default alone", where="evidence", fix=fix)
+
+
 def default_methods(
     *,
     with_evidence: Collection[str],

@@ -187,6 +187,14 @@ class TestPhoto:
         assert np.median(errors) < 0.4
         assert max(errors) < 2.0
 
+    def test_counts_beside_the_mask_of_another_view(self) -> None:
+        shown = scene(1)
+        clicked = View(CAMERA, shown.clicks, sigma=CLICK_PX)
+        views = [replace(clicked, mask=shown.mask), replace(clicked, image=shown.pixels)]
+        found = align(shown.model(), views)
+        assert {"mask", "photo"} <= {each.kind for each in found.evidence}
+        assert shown.error(found) < 0.6
+
     def test_of_a_similar_model(self) -> None:
         shown = scene(2)
         wide = Mesh(shown.mesh.vertices * [1.0, 1.06, 0.95], shown.mesh.faces)

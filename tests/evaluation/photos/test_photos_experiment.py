@@ -175,6 +175,11 @@ class TestMethods:
         found = done(root, tmp_path / "run", methods=("rigid", "rigid+image"), max_photos=1)
         assert {row["status"] for row in found.results.to_pylist()} == {"ok"}
 
+    def test_evidence_of_the_methods_by_default_may_be_named(self, tmp_path: Path) -> None:
+        root = write_bop(tmp_path / "data")
+        found = done(root, tmp_path / "run", evidence=("image",), max_photos=1)
+        assert found.methods[5:] == ["rigid+image"]
+
     def test_what_an_object_lacks_is_left_out(self, tmp_path: Path) -> None:
         root = write_bop(tmp_path / "data", depth=False)
         (root / "test/000001/mask_visib/000001_000000.png").unlink()
@@ -374,6 +379,11 @@ class TestPage:
     ("options", "text"),
     [
         (("--methods", "best"), "--methods: unknown method 'best'"),
+        (("--evidence", "sound"), "--evidence: unknown evidence 'sound'; known are mask, depth"),
+        (
+            ("--evidence", "image", "--methods", "rigid"),
+            "--evidence: is for the methods by default alone; name it there, as in rigid+image",
+        ),
         (("--methods", "rigid+mask+mask"), "--methods: unknown method 'rigid+mask+mask'"),
         (("--methods", "truth+mask"), "--methods: truth takes keypoints alone"),
         (("--sigma", "0"), "--sigma: 0.0 is not positive"),

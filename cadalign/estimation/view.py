@@ -65,7 +65,8 @@ class View(DeclaredEvidence):
         Depths of the keypoints, their z in the camera's frame, or an image of such depths that is
         registered to the photo, as an array or as a 16-bit PNG [model units, or the unit in which
         the object's size is wanted]; 0 or NaN where unknown. A depth image is sampled robustly at
-        the keypoints and, with a mask and a mesh, over the visible surface.
+        the keypoints and, with a mask and a mesh, over the visible surface; beside a photo its
+        steps show the outline.
     depth_sigma : float or (n,) float
         Standard deviation of the depths, relative; by default 0.01, 1 %.
     depth_scale : float, optional
@@ -88,8 +89,8 @@ class View(DeclaredEvidence):
         cameras moved in an unknown way between them.
     mask : (h, w) bool or float, or path, optional
         Pixels of the object in an image of the camera's size: True, or their probabilities in
-        [0, 1], or an 8-bit grey PNG that is not zero there (a JPEG: of
-        more than half of its brightest value).
+        [0, 1], or an 8-bit grey PNG that is not zero there (a JPEG: of more than half of its
+        brightest value).
     mask_sigma : float, optional
         Standard deviation of the mask's contour along its normal [px]; None estimates it.
     image : (h, w, 3) uint8, or path, optional

@@ -21,7 +21,12 @@ from cadalign.estimation.contours.measured import (
     weakest_steps,
     with_displacement_modes,
 )
-from cadalign.estimation.contours.photo_lines import Outline, PhotoPyramid, photo_of
+from cadalign.estimation.contours.photo_lines import (
+    DepthImage,
+    Outline,
+    PhotoPyramid,
+    photo_of,
+)
 from cadalign.estimation.contours.photo_rounds import (
     Approach,
     Pictured,
@@ -151,7 +156,7 @@ def fit_photos(
     """
     cameras = minima[0].lenses.cameras
     photos = [
-        photo_of(number, cameras[number], cast(ByteImage, view.image))
+        photo_of(number, cameras[number], cast(ByteImage, view.image), _depth_of(view))
         for number, view in enumerate(views)
         if view.image is not None and view.mask is None
     ]
@@ -180,6 +185,11 @@ def fit_photos(
         for view, own in {**found, **left_out}.items()
     ]
     return Refined(refined, summaries, warnings, photos=frozenset(found))
+
+
+def _depth_of(view: View) -> DepthImage | None:
+    depths = view.depth_image
+    return None if depths is None else DepthImage(depths, float(cast(float, view.depth_sigma)))
 
 
 def _weak(found: dict[int, OutlineSupport]) -> list[str]:
@@ -255,7 +265,11 @@ def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> list[tuple[P
     if not best:
         return [(photos[0], "it shows no part of the model's outline")]
     supports = best[0].supports
-    alike = [k for k, each in enumerate(supports) if each.contrast < _LEAST_CONTRAST]
+    alike = [
+        k
+        for k, each in enumerate(supports)
+        if each.contrast < _LEAST_CONTRAST and photos[k].depth is None
+    ]
     if alike:
         return [(photos[k], "the object has the colours of what is around it") for k in alike]
     shares = [each.share for each in supports]

@@ -48,6 +48,7 @@ _BORDER = 2.0  # [px]
 _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other things
 _NEIGHBOUR = 0.45  # weight of a neighbour's log likelihoods
 _STRAY = 1e-3  # probability of a crossing anywhere on a line, beside its colours
+_DEPTH_EDGE = 1.0  # [px], standard deviation of the place of a depth image's step
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
@@ -140,12 +141,14 @@ def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.where(is_told, places, 0.0), np.where(is_told, 1 / safe, np.inf)
 
 
-def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
-    """Log likelihoods (S, 2 K + 1) of a change of the colours (S, 2 K + 1, 3) at each step.
+def edges_of(
+    colors: FloatArray, valid: BoolArray, step: float, least: float = _QUANTUM
+) -> FloatArray:
+    """Log likelihoods (S, 2 K + 1) of a change of the colours (S, 2 K + 1, c) at each step.
 
     On both sides of the change the colours are constant but for noise of unknown level: with the
     sum E of squares about both means, the likelihood is E to the power of -n / 2 for n pixels. A
-    ``step`` is so many pixels long.
+    ``step`` is so many pixels long. The ``least`` variance of the noise is that of c channels.
     """
     weights = valid.astype(np.float64)
     values = weights[..., None] * colors
@@ -158,9 +161,23 @@ def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
     squares = (values * colors).sum(axis=(1, 2))
     # A line of which one side is unknown has no edge.
     error = squares[:, None] - np.where(usable, between, np.inf).min(axis=1, keepdims=True)
-    error = np.where(usable, squares[:, None] - between, error) + _QUANTUM * total
+    error = np.where(usable, squares[:, None] - between, error) + least * total
     found = -total * min(step, 1.0) / 2 * np.log(np.maximum(error, 1e-9))
     return np.where(usable.any(axis=1, keepdims=True), found, 0.0)
+
+
+def steps_of(depths: FloatArray, valid: BoolArray, step: float, sigma: float) -> FloatArray:
+    """Log likelihoods (S, 2 K + 1) of a change of depths (S, 2 K + 1), as `edges_of`.
+
+    Depths have the relative standard deviation ``sigma``, and are NaN where none is known. The
+    places of their steps are less accurate than those of colours.
+    """
+    known = valid & np.isfinite(depths)
+    logs = edges_of(np.log(np.where(known, depths, 1.0))[..., None], known, step, sigma**2)
+    steps = step * np.arange(logs.shape[1]) / _DEPTH_EDGE
+    spread = np.exp(-((steps[:, None] - steps) ** 2) / 2)
+    likely = np.exp(logs - np.logaddexp.reduce(logs, axis=1, keepdims=True))
+    return np.asarray(np.log(likely @ (spread / spread.sum(axis=1, keepdims=True)) + _STRAY))
 
 
 def _sums_before(values: FloatArray) -> FloatArray:
@@ -168,12 +185,32 @@ def _sums_before(values: FloatArray) -> FloatArray:
     return np.asarray(np.cumsum(values, axis=1) - values / 2)
 
 
+class DepthImage(NamedTuple):
+    """Depths (h, w), NaN where none is known, and their relative standard deviation."""
+
+    depths: FloatArray
+    sigma: float
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Depths (...) of the pixels that hold points (..., 2)."""
+        height, width = self.depths.shape
+        columns, rows = np.rint(points).astype(int).reshape(-1, 2).T
+        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        found = np.full(len(columns), np.nan)
+        found[inside] = self.depths[rows[inside], columns[inside]]
+        return found.reshape(points.shape[:-1])
+
+
 class PhotoPyramid(NamedTuple):
-    """A photo in view number ``image``, and copies of it, each half as wide as the last."""
+    """A photo in view number ``image``, and copies of it, each half as wide as the last.
+
+    Its ``depth`` image shows steps where the object ends.
+    """
 
     image: int
     camera: Camera
     levels: tuple[ByteImage, ...]
+    depth: DepthImage | None = None
 
     def colors(self, points: FloatArray, step: float) -> ByteImage:
         """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
@@ -203,7 +240,9 @@ class PhotoPyramid(NamedTuple):
         return min(int(np.log2(max(step, 1.0))), len(self.levels) - 1)
 
 
-def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
+def photo_of(
+    image: int, camera: Camera, pixels: ByteImage, depth: DepthImage | None = None
+) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
     levels = [np.ascontiguousarray(pixels)]
     while min(levels[-1].shape[:2]) > _SMALLEST:
@@ -212,7 +251,7 @@ def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
         even = levels[-1][: 2 * size[1], : 2 * size[0]]
         smaller = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
         levels.append(np.asarray(smaller, dtype=np.uint8))
-    return PhotoPyramid(image, camera, tuple(levels))
+    return PhotoPyramid(image, camera, tuple(levels), depth)
 
 
 class Silhouette(NamedTuple):
@@ -351,6 +390,8 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     colors = photo.colors(pixels.reshape(-1, 2), step).reshape(*pixels.shape[:2], 3)
     valid = _on_own_side(photo, silhouette, pixels)
     logs = changes_of(odds[bins_of(colors)], valid)
+    if photo.depth is not None:
+        logs += steps_of(photo.depth.at(pixels), valid, step, photo.depth.sigma)
     if step <= _EDGE_STEP:
         logs += edges_of(colors.astype(np.float64), valid, step)
         logs = with_neighbours(logs, contour.neighbours(np.ones(len(logs), dtype=bool)))

@@ -187,6 +187,18 @@ class TestPhoto:
         assert np.median(errors) < 0.4
         assert max(errors) < 2.0
 
+    def test_steps_of_a_depth_image_show_the_outline(self) -> None:
+        shown, rng = scene(1), np.random.default_rng(1)
+        depth = cast_geometry(Scene(shown.mesh), CAMERA, shown.truth).depth
+        measured = np.where(shown.mask, depth, 4.0) * rng.normal(1, 0.003, depth.shape)
+        measured[rng.random(depth.shape) < 0.05] = np.nan
+        known = {"depth": measured, "depth_sigma": 0.003}
+        grey = np.clip(rng.normal(128, 5, shown.pixels.shape), 0, 255).astype(np.uint8)
+        clicks = shown.aligned(**known)
+        found = shown.aligned(**known, image=grey)
+        assert not any("image" in text for text in found.warnings)
+        assert shown.error(found) < 0.5 * shown.error(clicks)
+
     def test_counts_beside_the_mask_of_another_view(self) -> None:
         shown = scene(1)
         clicked = View(CAMERA, shown.clicks, sigma=CLICK_PX)

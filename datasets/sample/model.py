@@ -1,8 +1,8 @@
-"""Sample models: closed solids of one colour, joined to one mesh with keypoints on its surface.
+"""Sample models: closed parts of one colour, joined to one mesh with keypoints on its surface.
 
-The solids are boxes, lathes and extrusions. All but sharp boxes are lofts, surfaces through a row
-of closed outlines, because a part around the plane x = 0 must be exactly mirror symmetric, also in
-its tessellation.
+The parts are boxes, lathes and beams. All but sharp boxes are lofts, surfaces through a row of
+closed outlines, because a part around the plane x = 0 must be exactly mirror symmetric, also in its
+tessellation.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from cadalign.arrays import FloatArray, IntArray
-from cadalign.geometry.mesh import Mesh
+from cadalign.arrays import FloatArray
+from cadalign.geometry.mesh import Mesh, join
 
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255."""
@@ -25,7 +25,7 @@ Level = tuple[float, float, float, float]
 """A rectangle across a body: height y, width, z of its front and of its rear."""
 
 _WELD_DECIMALS = 8
-_TINY_AREA = 1e-12
+_TINY_AREA = 5e-13
 _CREASE_DEGREES = 35.0
 
 
@@ -38,41 +38,30 @@ def pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
     return colors[int(rng.integers(len(colors)))]
 
 
-@dataclass(frozen=True, eq=False)
-class Solid:
-    """A closed surface of one colour."""
-
-    vertices: FloatArray  # (n, 3), all different
-    faces: IntArray  # (m, 3), counter-clockwise as seen from outside
-    color: Color
-
-    @classmethod
-    def from_triangles(cls, vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Solid:
-        """Weld coinciding vertices, drop triangles without area, turn the surface outward."""
-        points = np.round(np.asarray(vertices, dtype=float), _WELD_DECIMALS) + 0.0
-        welded, inverse = np.unique(points, axis=0, return_inverse=True)
-        triangles = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)]
-        a, b, c = welded[triangles].transpose(1, 0, 2)
-        doubled_area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        solid = cls(welded, triangles[doubled_area > _TINY_AREA], color)
-        return solid if solid.volume >= 0 else replace(solid, faces=solid.faces[:, ::-1])
-
-    @property
-    def volume(self) -> float:
-        """The enclosed volume; negative where the faces look inward."""
-        corners = self.vertices[self.faces] - self.vertices.mean(axis=0)
-        return float(np.linalg.det(corners).sum() / 6)
+def part(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Mesh:
+    """Weld coinciding vertices, drop triangles without area, turn the surface outward."""
+    points = np.round(np.asarray(vertices, dtype=float), _WELD_DECIMALS) + 0.0
+    welded, inverse = np.unique(points, axis=0, return_inverse=True)
+    triangles = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)]
+    corners = welded[triangles]
+    if np.linalg.det(corners - welded.mean(axis=0)).sum() < 0:  # six times the volume
+        triangles = triangles[:, ::-1]
+    colors = np.tile((*color, 255), (len(welded), 1)) / 255
+    return Mesh(welded, triangles[_areas(corners) > _TINY_AREA], vertex_colors=colors)
 
 
-def both_sides(*solids: Solid) -> list[Solid]:
-    """The solids together with their mirror images under x -> -x."""
-    return [
-        *solids,
-        *(replace(s, vertices=s.vertices * (-1, 1, 1), faces=s.faces[:, ::-1]) for s in solids),
-    ]
+def _areas(triangles: FloatArray) -> FloatArray:
+    functions: Any = trimesh.triangles
+    return np.asarray(functions.area(triangles))
 
 
-def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
+def both_sides(*parts: Mesh) -> list[Mesh]:
+    """The parts together with their mirror images under x -> -x."""
+    mirrored = (replace(p, vertices=p.vertices * (-1, 1, 1), faces=p.faces[:, ::-1]) for p in parts)
+    return [*parts, *mirrored]
+
+
+def loft(outlines: npt.ArrayLike, color: Color) -> Mesh:
     """Join a row of closed outlines (k, n, 3), n even, by a surface and close its two ends.
 
     Point ``j`` of one is joined with point ``j`` of the next. An end is closed by strips between
@@ -91,7 +80,7 @@ def loft(outlines: npt.ArrayLike, color: Color) -> Solid:
     right = (vertices[a] + vertices[b] + vertices[c] + vertices[d])[:, 0] > 0
     first = np.stack([a, b, np.where(right, d, c)], axis=1)
     second = np.stack([np.where(right, b, a), c, d], axis=1)
-    return Solid.from_triangles(vertices, np.concatenate([first, second]), color)
+    return part(vertices, np.concatenate([first, second]), color)
 
 
 def rectangle(width: float, height: float, *, radius: float, steps: int) -> FloatArray:
@@ -105,32 +94,32 @@ def rectangle(width: float, height: float, *, radius: float, steps: int) -> Floa
     return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
 
 
-def stack(levels: Sequence[Level], color: Color, *, radius: float) -> Solid:
-    """A body through rectangles with round corners, from the lowest up."""
+def stack(levels: Sequence[Level], color: Color, *, radius: npt.ArrayLike, steps: int = 3) -> Mesh:
+    """A body through rectangles, from the lowest up, with corners of ``radius``, one or (k,)."""
     rings = [
-        np.insert(rectangle(width, rear - front, radius=radius, steps=3), 1, y, axis=1)
+        np.insert(rectangle(width, rear - front, radius=r, steps=steps), 1, y, axis=1)
         + (0, 0, (front + rear) / 2)
-        for y, width, front, rear in levels
+        for (y, width, front, rear), r in zip(levels, np.resize(radius, len(levels)), strict=True)
     ]
     return loft(rings, color)
 
 
 def box(
     center: npt.ArrayLike, size: Point, color: Color, *, radius: float = 0.0, steps: int = 2
-) -> Solid:
+) -> Mesh:
     """A box; ``steps`` flat pieces make a quarter circle of its rounded edges."""
-    middle, (width, height, depth) = np.asarray(center, dtype=float), size
+    width, height, depth = np.array(size) / 2
     if radius == 0:
         block = trimesh.creation.box(extents=size)
-        return Solid.from_triangles(block.vertices + middle, block.faces, color)
-    radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
-    angle = np.linspace(0, np.pi / 2, steps + 1)
-    lower = np.stack([1 - np.sin(angle), 1 - np.cos(angle)], axis=1) * radius - (0, height / 2)
-    rings = [
-        np.insert(rectangle(width - 2 * i, depth - 2 * i, radius=radius - i, steps=steps), 1, y, 1)
-        for i, y in np.concatenate([lower, lower[::-1] * (1, -1)])
-    ]
-    return loft(np.array(rings) + middle, color)
+        shape = part(block.vertices, block.faces, color)
+    else:
+        radius = min(radius, 0.98 * height, 0.9 * width, 0.9 * depth)
+        angle = np.linspace(0, np.pi / 2, steps + 1)
+        inset, y = radius * (1 - np.sin(angle)), radius * (1 - np.cos(angle)) - height
+        inset, y = np.append(inset, inset[::-1]), np.append(y, -y[::-1])
+        levels = np.stack([y, 2 * (width - inset), inset - depth, depth - inset], axis=1)
+        shape = stack(levels.tolist(), color, radius=radius - inset, steps=steps)
+    return replace(shape, vertices=shape.vertices + np.asarray(center, dtype=float))
 
 
 def beam(
@@ -138,25 +127,21 @@ def beam(
     size: tuple[float, float],
     color: Color,
     *,
-    scales: Sequence[float | tuple[float, float]] = (1.0,),
-    side: Point | None = None,
-    radius: float | None = None,
-) -> Solid:
-    """Extrude a rectangle along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
+    taper: float = 1.0,
+) -> Mesh:
+    """Extrude a rectangle along a path (k, 3), at its end ``taper`` times as large.
 
-    ``size`` is along ``side``, made perpendicular to the path, and across it; by default ``side``
-    is x, or z where the path runs along x.
+    ``size`` is along x, or along z where the path runs along x, and across it.
     """
     points = np.asarray(path, dtype=float)
     tangent = trimesh.unitize(np.gradient(points, axis=0))
-    along = side or ((1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1))
+    along = (1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1)
     first = trimesh.unitize(along - (tangent @ along)[:, None] * tangent)
-    section = rectangle(*size, radius=radius or 0.18 * min(size), steps=2 if radius else 1)
-    outlines = section * np.reshape(scales, (len(scales), 1, -1))
-    rings = (
-        outlines[..., :1] * first[:, None] + outlines[..., 1:] * np.cross(tangent, first)[:, None]
-    )
-    return loft(points[:, None] + rings, color)
+    section = rectangle(*size, radius=0.18 * min(size), steps=1)
+    x, y = (section * np.linspace(1, taper, len(points))[:, None, None]).transpose(2, 0, 1)[
+        ..., None
+    ]
+    return loft(points[:, None] + x * first[:, None] + y * np.cross(tangent, first)[:, None], color)
 
 
 def lathe(
@@ -168,24 +153,23 @@ def lathe(
     depth: npt.ArrayLike = 1.0,
     exponent: npt.ArrayLike = 2.0,
     sideways: bool = False,
-) -> Solid:
+) -> Mesh:
     """Turn a profile (k, 2) of radius and height around a vertical axis, in ``count`` = 4 i points.
 
     ``depth``, one or (k,), is the extent along z relative to x; ``exponent`` is 2 for circles, more
     for rounded squares: sections are superellipses ``|x/a|^exponent + |z/b|^exponent = 1``. The
-    axis of a ``sideways`` solid is along x, its heights are distances outward.
+    axis of a ``sideways`` part is along x, its heights are distances outward.
     """
     radius, height = np.asarray(profile, dtype=float).T[..., None]
     angle = 2 * np.pi * np.arange(count) / count
     unit = np.round([np.sin(angle), np.cos(angle)], 12)[:, None]
     across, along = radius * np.sign(unit) * np.abs(unit) ** (2 / np.reshape(exponent, (-1, 1)))
-    axis = np.broadcast_to(height, across.shape)
-    along = along * np.reshape(depth, (-1, 1))
+    axis, along = np.broadcast_to(height, across.shape), along * np.reshape(depth, (-1, 1))
     rings = np.stack([axis, across, along] if sideways else [across, axis, along], axis=2)
     return loft(rings + np.asarray(center, dtype=float), color)
 
 
-def ellipsoid(center: Point, size: Point, color: Color, *, count: int) -> Solid:
+def ellipsoid(center: Point, size: Point, color: Color, *, count: int) -> Mesh:
     """An ellipsoid of the given full extents (3,)."""
     angle = np.linspace(0, np.pi, count // 2 + 1)
     profile = np.stack([size[0] * np.sin(angle), -size[1] * np.cos(angle)], axis=1) / 2
@@ -199,7 +183,7 @@ def ellipsoid(center: Point, size: Point, color: Color, *, count: int) -> Solid:
 class Draft:
     """A model in its builder's units, y up and the front at -z."""
 
-    solids: Sequence[Solid]
+    parts: Sequence[Mesh]
     places: Mapping[int, Point]  # by semantic id; keypoints land on the surface's nearest point
     mirrored: tuple[tuple[int, int], ...] = ()  # semantic ids that a mirror plane exchanges
     turned: tuple[tuple[int, ...], ...] = ()  # semantic ids that a rotation about y permutes
@@ -244,61 +228,42 @@ def finish(draft: Draft, *, category: str, model_id: str, offset: FloatArray) ->
 
     The centre of the bounding box comes to ``offset`` (3,).
     """
-    vertices, faces, colors = _join(draft.solids)
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    center, diagonal = (low + high) / 2, float(np.linalg.norm(high - low))
+    whole = split_creases(join(draft.parts, f"{category} {model_id}"))
+    center, diagonal = (
+        whole.bounds.mean(axis=0),
+        float(np.linalg.norm(np.ptp(whole.bounds, axis=0))),
+    )
     # The file holds single precision: the mesh and what is computed from it agree with that.
-    scaled = ((vertices - center) / diagonal + offset).astype(np.float32).astype(np.float64)
-    a, b, c = scaled[faces].transpose(1, 0, 2)
-    faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12]  # rounding flattens some
-    mesh = Mesh(scaled, faces, vertex_colors=colors, source=f"{category} {model_id}")
-    places = {
-        k: (np.array(place) - center) / diagonal + offset for k, place in draft.places.items()
-    }
-    keypoints = _on_surface(mesh, places)
-    symmetries = draft.mirrored, draft.turned, draft.round
-    return SampleModel(category, model_id, mesh, keypoints, *symmetries)
-
-
-def _join(solids: Sequence[Solid]) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Concatenate parts: vertices, faces, and colours (n, 4) from 0 to 1."""
-    sizes = [len(solid.vertices) for solid in solids]
-    first = np.cumsum(sizes) - sizes
-    joined = np.concatenate([solid.faces + k for solid, k in zip(solids, first, strict=True)])
-    colors = np.repeat([(*solid.color, 255) for solid in solids], sizes, axis=0) / 255
-    positions, faces = split_creases(np.concatenate([solid.vertices for solid in solids]), joined)
-    split_colors = np.empty((len(positions), 4))
-    split_colors[faces] = colors[joined]
-    return positions, faces, split_colors
-
-
-def split_creases(vertices: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Double the vertices along sharp edges: new vertices and faces.
-
-    Shading then stays smooth only where the shape is.
-    """
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    smooth = mesh.face_adjacency_angles < np.radians(_CREASE_DEGREES)
-    beside, ends = mesh.face_adjacency[smooth], mesh.face_adjacency_edges[smooth]
-    # Of both faces at a smooth edge, the corners at its two ends: these remain one vertex.
-    corner = (faces[beside][:, :, None] == ends[:, None, :, None]).argmax(axis=3)
-    joined = (3 * beside[:, :, None] + corner).transpose(0, 2, 1).reshape(-1, 2)
-    graph: Any = trimesh.graph
-    label = graph.connected_component_labels(joined, node_count=faces.size)
-    positions = np.empty((label.max() + 1, 3))
-    positions[label] = vertices[faces].reshape(-1, 3)
-    return positions, label.reshape(faces.shape).astype(np.int64)
-
-
-def _on_surface(mesh: Mesh, places: Mapping[int, FloatArray]) -> tuple[SampleKeypoint, ...]:
-    """Keypoints at the surface's nearest points to places (3,)."""
+    scaled = ((whole.vertices - center) / diagonal + offset).astype(np.float32).astype(np.float64)
+    faces = whole.faces[_areas(scaled[whole.faces]) > _TINY_AREA]  # rounding flattens some
+    mesh = Mesh(scaled, faces, vertex_colors=whole.vertex_colors, source=whole.source)
     keypoints = []
-    for semantic_id, place in sorted(places.items()):
-        face, weights = closest_barycentric(mesh.triangles, place)
+    for semantic_id, place in sorted(draft.places.items()):
+        face, weights = closest_barycentric(
+            mesh.triangles, (np.array(place) - center) / diagonal + offset
+        )
         xyz = weights @ mesh.triangles[face]
         vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
         keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights, vertex))
-    return tuple(keypoints)
+    symmetries = draft.mirrored, draft.turned, draft.round
+    return SampleModel(category, model_id, mesh, tuple(keypoints), *symmetries)
+
+
+def split_creases(mesh: Mesh) -> Mesh:
+    """Double the vertices along sharp edges: shading then stays smooth only where the shape is."""
+    shape = mesh.to_trimesh()
+    smooth = shape.face_adjacency_angles < np.radians(_CREASE_DEGREES)
+    beside, ends = shape.face_adjacency[smooth], shape.face_adjacency_edges[smooth]
+    # Of both faces at a smooth edge, the corners at its two ends: these remain one vertex.
+    corner = (mesh.faces[beside][:, :, None] == ends[:, None, :, None]).argmax(axis=3)
+    joined = (3 * beside[:, :, None] + corner).transpose(0, 2, 1).reshape(-1, 2)
+    graph: Any = trimesh.graph
+    label = graph.connected_component_labels(joined, node_count=mesh.faces.size).astype(np.int64)
+    origin = np.empty(label.max() + 1, dtype=np.int64)
+    origin[label] = mesh.faces.reshape(-1)
+    colors = None if mesh.vertex_colors is None else mesh.vertex_colors[origin]
+    faces = label.reshape(mesh.faces.shape)
+    return replace(mesh, vertices=mesh.vertices[origin], faces=faces, vertex_colors=colors)
 
 
 def closest_barycentric(triangles: FloatArray, point: FloatArray) -> tuple[int, FloatArray]:

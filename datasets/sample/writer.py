@@ -8,17 +8,16 @@ import json
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from cadalign.datasets.models.categories import SYNSETS
-from cadalign.datasets.sample.bottle import bottle
-from cadalign.datasets.sample.car import car
-from cadalign.datasets.sample.chair import chair
+from cadalign.datasets.sample.household import bottle, chair
 from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
-from cadalign.datasets.sample.vessel import vessel
+from cadalign.datasets.sample.vehicles import car, vessel
 from cadalign.errors import DataError, InputError
 from cadalign.io.files import as_path, writing
 from cadalign.io.meshes.write import write_ply_mesh
@@ -118,9 +117,10 @@ def write_sample_dataset(
     target = as_path(root, "root")
     names = _check_arguments(per_category, categories, seed)
     _check_replaceable(target)
-    marker = _marker(names, per_category, seed)
-    if keep and _is_whole(target, marker):
-        return target
+    origin = {"categories": names, "per_category": int(per_category), "seed": int(seed)}
+    with suppress(OSError):
+        if keep and (target / _MARKER).read_text(encoding="utf-8") == _marker(target, origin):
+            return target
     with writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         # Not a plain folder name beside it: two runs at once must not share one.
@@ -130,8 +130,7 @@ def write_sample_dataset(
             data = Path(folder, "data")
             data.mkdir()
             _write(data, names, per_category, seed)
-            text = json.dumps({**marker, "bytes": _size(data)})
-            (data / _MARKER).write_text(f"{text}\n", encoding="utf-8")
+            (data / _MARKER).write_text(_marker(data, origin), encoding="utf-8")
             if target.exists():
                 target.rename(Path(folder, "replaced"))
             data.rename(target)
@@ -213,31 +212,13 @@ def _circle(model: SampleModel, rows: Sequence[int]) -> dict[str, Any]:
     return {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
 
 
-def _marker(names: Sequence[str], per_category: int, seed: int) -> dict[str, Any]:
-    """Origin of the files of a data set: the arguments, and the code that makes them."""
+def _marker(root: Path, origin: dict[str, Any]) -> str:
+    """Text of the file that tells how a data set was made: by what code, and of what size."""
     sources = (path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    return {
-        "made_by": "cadalign.datasets.sample",
-        "categories": list(names),
-        "per_category": int(per_category),
-        "seed": int(seed),
-        "code": hashlib.sha256(b"".join(sources)).hexdigest(),
-    }
-
-
-def _is_whole(root: Path, marker: dict[str, Any]) -> bool:
-    """True for a data set that was written with this marker, and whose files have their size."""
-    try:
-        found = json.loads((root / _MARKER).read_text(encoding="utf-8"))
-        return bool(found == {**marker, "bytes": _size(root)})
-    except (OSError, ValueError):
-        return False
-
-
-def _size(root: Path) -> int:
-    """Bytes of all files of a data set but its marker."""
     files = (path for path in root.rglob("*") if path.is_file() and path.name != _MARKER)
-    return sum(path.stat().st_size for path in files)
+    code, size = hashlib.sha256(b"".join(sources)), sum(path.stat().st_size for path in files)
+    made_by = {"made_by": "cadalign.datasets.sample", "code": code.hexdigest()}
+    return json.dumps({**made_by, **origin, "bytes": size}) + "\n"
 
 
 def _check_replaceable(target: Path) -> None:

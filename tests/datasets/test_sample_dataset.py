@@ -294,19 +294,19 @@ def test_faces_have_an_area_and_their_number_is_moderate(models: tuple[SampleMod
 def test_parts_are_closed_and_face_outward(category: str) -> None:
     for index in range(12):
         rng = np.random.default_rng(index)
-        for solid in MAKERS[category](rng, index).solids:
-            edges = np.concatenate([solid.faces[:, [i, (i + 1) % 3]] for i in range(3)])
+        for part in MAKERS[category](rng, index).parts:
+            edges = np.concatenate([part.faces[:, [i, (i + 1) % 3]] for i in range(3)])
             forward = Counter(map(tuple, edges.tolist()))
             backward = Counter(map(tuple, edges[:, ::-1].tolist()))
             assert forward == backward, (category, index)
-            assert solid.volume > 0, (category, index)
+            assert part.to_trimesh().volume > 0, (category, index)
 
 
 @pytest.mark.parametrize("category", ["car", "vessel"])
 def test_keypoints_are_placed_on_the_surface_or_close_to_it(category: str) -> None:
     for index in range(12):
         draft = MAKERS[category](np.random.default_rng(index), index)
-        triangles = np.concatenate([solid.vertices[solid.faces] for solid in draft.solids])
+        triangles = np.concatenate([part.triangles for part in draft.parts])
         size = np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0))
         for place in map(np.array, draft.places.values()):
             face, weights = closest_barycentric(triangles, place)
@@ -437,24 +437,24 @@ def test_keypoints_are_seen_from_around(models: tuple[SampleModel, ...]) -> None
 # Geometry ----------------------------------------------------------------------------------------
 
 
-def test_solids_have_the_size_and_volume_they_should() -> None:
+def test_parts_have_the_size_and_volume_they_should() -> None:
     block = box((1, 2, 3), (2, 4, 6), (1, 2, 3))
-    assert block.volume == pytest.approx(48.0)
+    assert block.to_trimesh().volume == pytest.approx(48.0)
     assert len(block.faces) == 12
     soft = box((0, 0, 0), (2, 4, 6), (1, 2, 3), radius=0.2, steps=6)
     np.testing.assert_allclose(np.ptp(soft.vertices, axis=0), (2, 4, 6))
-    assert 0.95 * 48 < soft.volume < 48
+    assert 0.95 * 48 < soft.to_trimesh().volume < 48
     ball = ellipsoid((0, 0, 0), (2, 4, 6), (1, 2, 3), count=64)
-    assert ball.volume == pytest.approx(np.pi * 48 / 6, rel=0.01)
+    assert ball.to_trimesh().volume == pytest.approx(np.pi * 48 / 6, rel=0.01)
 
 
 def test_creases_double_vertices_only_where_the_surface_is_sharp() -> None:
     block = box((0, 0, 0), (1, 1, 1), (0, 0, 0))
-    vertices, faces = split_creases(block.vertices, block.faces)
-    assert len(vertices) == 24
-    np.testing.assert_allclose(vertices[faces], block.vertices[block.faces])
+    split = split_creases(block)
+    assert len(split.vertices) == 24
+    np.testing.assert_allclose(split.triangles, block.triangles)
     ball = ellipsoid((0, 0, 0), (1, 1, 1), (0, 0, 0), count=32)
-    assert len(split_creases(ball.vertices, ball.faces)[0]) == len(ball.vertices)
+    assert len(split_creases(ball).vertices) == len(ball.vertices)
 
 
 def test_closest_point_of_a_triangle_beats_all_others() -> None:

@@ -81,7 +81,7 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     frame, fabric = pick(rng, _METALS if base == "swivel" else _WOODS), pick(rng, _FABRICS)
     half = c.width / 2
     pairs = {
-        (0, 1): c.back(1.0, half - 0.5 * c.leg),
+        (0, 1): c.back(1.05, half - 0.5 * c.leg),
         (2, 3): (half, c.seat, 0.43 * c.depth),
         (4, 5): (half, c.seat, -c.depth / 2),
         (21, 22): c.back(0.84, half + 0.08),

@@ -34,15 +34,16 @@ _STYLES = (
 )  # fmt: skip
 # How far the feet stand out and the legs' tops lie inside [metres]; thickness of top and foot.
 _LEGS = {
-    "straight": (-0.023, 0.023, 1.0, 1.0),
-    "tapered": (0.0, 0.03, 1.15, 0.7),
-    "splayed": (0.03, 0.1, 1.1, 0.6),
+    "straight": (-0.023, 0.023, (1.0, 1.0)),
+    "tapered": (0.0, 0.03, (1.15, 0.7)),
+    "splayed": (0.03, 0.1, (1.1, 0.6)),
 }
 _WOODS, _METALS = (
     palette("966236 ba8650 603c26 cea470 7a4628 462e22"),
     palette("a8acb2 34363a 787c82"),
 )
 _FABRICS = palette("ac342e 2c5484 46764e d4a03c 784a78 42464e c4baa8 28787e")
+(_DARK,) = palette("26262a")
 _SPOKE_IDS = (10, 11, 12, 13, 14)
 # Ranges of a chair's width, depth, seat, thickness, tall, tilt and leg.
 _LEAST, _MOST = (0.4, 0.4, 0.42, 0.028, 0.38, 5, 0.032), (0.52, 0.5, 0.5, 0.05, 0.58, 13, 0.046)
@@ -81,7 +82,7 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     frame, fabric = pick(rng, _METALS if base == "swivel" else _WOODS), pick(rng, _FABRICS)
     half = c.width / 2
     pairs = {
-        (0, 1): c.back(1.05, half - 0.5 * c.leg),
+        (0, 1): c.back(1.0, half - 0.5 * c.leg),
         (2, 3): (half, c.seat, 0.43 * c.depth),
         (4, 5): (half, c.seat, -c.depth / 2),
         (21, 22): c.back(0.84, half + 0.08),
@@ -98,13 +99,13 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
     if has_arms:
         x, y, rear = c.back(0.22 / c.tall, half + 0.01)
         front = -0.32 * c.depth
-        pad = (0.05, 0.024, rear - front)
+        pad, color = (0.05, 0.024, rear - front), _DARK if base == "swivel" else frame
         post = [
             (half - 0.012, c.seat - 0.6 * c.thickness, front + 0.04),
             (x, y - 0.01, front + 0.04),
         ]
         parts += both_sides(
-            box((x, y - 0.012, (front + rear) / 2), pad, frame, radius=0.01),
+            box((x, y - 0.012, (front + rear) / 2), pad, color, radius=0.01),
             beam(post, (0.026, 0.034), frame),
         )
         pairs |= {(6, 8): (x + 0.025, y, front), (7, 9): (x + 0.025, y, rear)}
@@ -116,12 +117,11 @@ def chair(rng: np.random.Generator, index: int) -> Draft:
 def _panel(c: _Chair, frame: Color, fabric: Color) -> list[Mesh]:
     """An upholstered board with rounded edges before two posts."""
     half = c.width / 2 - 0.5 * c.leg
-    board = box((0, 0, 0), (2 * half, 0.72 * c.tall, 0.05), fabric, radius=0.022, steps=3)
-    _, cos, sin = np.subtract(c.back(1.0), c.back(0.0)) / c.tall
-    turn = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    scales = [(0.92, 0.35), (0.97, 0.75), (1, 1), (1, 1), (0.97, 0.75), (0.92, 0.35)]
+    path = [c.back(share) for share in (0.28, 0.285, 0.31, 0.97, 0.995, 1.0)]
     post = [c.back(share, half - 0.5 * c.leg, 0.018) for share in (-0.1, 0.8)]
     return [
-        replace(board, vertices=board.vertices @ turn.T + c.back(0.64)),
+        beam(path, (2 * half, 0.05), fabric, scales=scales, radius=0.02),
         *both_sides(beam(post, (0.028, 0.022), frame)),
     ]
 
@@ -139,22 +139,25 @@ def _bars(c: _Chair, frame: Color, kind: str, count: int) -> list[Mesh]:
         rungs = [(share, 0.06) for share in np.linspace(0.28, 0.9, count)]
     slats = np.linspace(-half, half, count + 2)[1 : 1 if kind == "ladder" else -1]
     return [
-        *both_sides(beam(post, (0.8 * c.leg, c.leg), frame, taper=0.85)),
+        *both_sides(beam(post, (0.8 * c.leg, c.leg), frame, scales=(1, 0.85))),
         *(beam([at(0.2, x), at(0.93, x)], (0.75 * half / count, 0.014), frame) for x in slats),
         *(beam([at(share, x) for x in xs], (0.022, tall), frame) for share, tall in rungs),
     ]
 
 
 def _legs(c: _Chair, frame: Color, base: str, pairs: dict[tuple[int, int], Point]) -> list[Mesh]:
-    """Four legs, their feet added to ``pairs``."""
-    out, inset, thick, thin = _LEGS[base]
+    """Four legs, their feet added to ``pairs``, and bars between straight ones."""
+    out, inset, scales = _LEGS[base]
     x, z = c.width / 2 + out, c.depth / 2 + out
-    top, right = (c.width / 2 - inset, c.seat - 0.4 * c.thickness, c.depth / 2 - inset), []
+    top, parts = (c.width / 2 - inset, c.seat - 0.4 * c.thickness, c.depth / 2 - inset), []
     for ids, sign in (((17, 20), -1), ((18, 19), 1)):
-        path, size = [np.multiply(top, (1, 1, sign)), (x, 0, sign * z)], thick * c.leg
-        right.append(beam(path, (size, size), frame, taper=thin / thick))
+        path = [np.multiply(top, (1, 1, sign)), (x, 0, sign * z)]
+        parts += both_sides(beam(path, (c.leg, c.leg), frame, scales=scales))
         pairs[ids] = (x + c.leg, 0.01, sign * (z + c.leg))
-    return both_sides(*right)
+    if base == "straight":
+        parts += both_sides(beam([(x, 0.16, -z), (x, 0.16, z)], (0.02, 0.028), frame))
+        parts.append(beam([(-x, 0.16, 0), (x, 0.16, 0)], (0.02, 0.028), frame))
+    return parts
 
 
 def _swivel(c: _Chair, frame: Color, places: dict[int, Point]) -> list[Mesh]:
@@ -165,9 +168,10 @@ def _swivel(c: _Chair, frame: Color, places: dict[int, Point]) -> list[Mesh]:
     for number, degrees in zip(_SPOKE_IDS, (144, 72, 0, -72, -144), strict=True):
         angle = np.radians(degrees)  # from +z towards +x
         x, z = float(0.58 * c.width * np.sin(angle)), float(0.58 * c.width * np.cos(angle))
+        path = [(0, 0.115, 0), (x, 0.075, z)]
         parts += [
-            beam([(0, 0.115, 0), (x, 0.075, z)], (0.05, 0.036), frame, taper=0.6),
-            ellipsoid((0.96 * x, 0.03, 0.96 * z), (0.05, 0.06, 0.05), frame, count=16),
+            beam(path, (0.05, 0.036), frame, scales=(1, 0.6), side=(z, 0, -x)),
+            ellipsoid((0.96 * x, 0.03, 0.96 * z), (0.05, 0.06, 0.05), _DARK, count=16),
         ]
         places[number] = (x, 0.09, z)
     return parts

@@ -94,12 +94,12 @@ def rectangle(width: float, height: float, *, radius: float, steps: int) -> Floa
     return np.concatenate([top, right, -top, right[::-1] * (-1, 1)])
 
 
-def stack(levels: Sequence[Level], color: Color, *, radius: npt.ArrayLike, steps: int = 3) -> Mesh:
-    """A body through rectangles, from the lowest up, with corners of ``radius``, one or (k,)."""
+def stack(levels: Sequence[Level], color: Color, *, radius: float) -> Mesh:
+    """A body through rectangles with round corners, from the lowest up."""
     rings = [
-        np.insert(rectangle(width, rear - front, radius=r, steps=steps), 1, y, axis=1)
+        np.insert(rectangle(width, rear - front, radius=radius, steps=3), 1, y, axis=1)
         + (0, 0, (front + rear) / 2)
-        for (y, width, front, rear), r in zip(levels, np.resize(radius, len(levels)), strict=True)
+        for y, width, front, rear in levels
     ]
     return loft(rings, color)
 
@@ -108,18 +108,18 @@ def box(
     center: npt.ArrayLike, size: Point, color: Color, *, radius: float = 0.0, steps: int = 2
 ) -> Mesh:
     """A box; ``steps`` flat pieces make a quarter circle of its rounded edges."""
-    width, height, depth = np.array(size) / 2
+    middle, (width, height, depth) = np.asarray(center, dtype=float), size
     if radius == 0:
         block = trimesh.creation.box(extents=size)
-        shape = part(block.vertices, block.faces, color)
-    else:
-        radius = min(radius, 0.98 * height, 0.9 * width, 0.9 * depth)
-        angle = np.linspace(0, np.pi / 2, steps + 1)
-        inset, y = radius * (1 - np.sin(angle)), radius * (1 - np.cos(angle)) - height
-        inset, y = np.append(inset, inset[::-1]), np.append(y, -y[::-1])
-        levels = np.stack([y, 2 * (width - inset), inset - depth, depth - inset], axis=1)
-        shape = stack(levels.tolist(), color, radius=radius - inset, steps=steps)
-    return replace(shape, vertices=shape.vertices + np.asarray(center, dtype=float))
+        return part(block.vertices + middle, block.faces, color)
+    radius = min(radius, 0.49 * height, 0.45 * width, 0.45 * depth)
+    angle = np.linspace(0, np.pi / 2, steps + 1)
+    lower = np.stack([1 - np.sin(angle), 1 - np.cos(angle)], axis=1) * radius - (0, height / 2)
+    rings = [
+        np.insert(rectangle(width - 2 * i, depth - 2 * i, radius=radius - i, steps=steps), 1, y, 1)
+        for i, y in np.concatenate([lower, lower[::-1] * (1, -1)])
+    ]
+    return loft(np.array(rings) + middle, color)
 
 
 def beam(
@@ -127,21 +127,24 @@ def beam(
     size: tuple[float, float],
     color: Color,
     *,
-    taper: float = 1.0,
+    scales: Sequence[float | tuple[float, float]] = (1.0,),
+    side: Point | None = None,
+    radius: float | None = None,
 ) -> Mesh:
-    """Extrude a rectangle along a path (k, 3), at its end ``taper`` times as large.
+    """Extrude a rectangle along a path (k, 3), ``scales`` (k,) or (k, 2) times as large.
 
-    ``size`` is along x, or along z where the path runs along x, and across it.
+    ``size`` is along ``side``, made perpendicular to the path, and across it; by default ``side``
+    is x, or z where the path runs along x.
     """
     points = np.asarray(path, dtype=float)
     tangent = trimesh.unitize(np.gradient(points, axis=0))
-    along = (1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1)
+    along = side or ((1, 0, 0) if np.abs(tangent[:, 0]).max() < 0.9 else (0, 0, 1))
     first = trimesh.unitize(along - (tangent @ along)[:, None] * tangent)
-    section = rectangle(*size, radius=0.18 * min(size), steps=1)
-    x, y = (section * np.linspace(1, taper, len(points))[:, None, None]).transpose(2, 0, 1)[
-        ..., None
-    ]
-    return loft(points[:, None] + x * first[:, None] + y * np.cross(tangent, first)[:, None], color)
+    section = rectangle(*size, radius=radius or 0.18 * min(size), steps=2 if radius else 1)
+    x, y = np.split(section * np.reshape(scales, (len(scales), 1, -1)), 2, axis=2)
+    return loft(
+        points[:, None] + (x * first[:, None] + y * np.cross(tangent, first)[:, None]), color
+    )
 
 
 def lathe(

@@ -78,8 +78,8 @@ def test_the_pose_layer_lowers_its_loss_in_training(
         values.append(float(loss.detach().mean()))
         return loss
 
-    train(detector, known, steps=60, batch=12, rate=1e-3, pose_loss=through_the_fit)
-    assert np.mean(values[-10:]) < 0.8 * np.mean(values[:10])
+    train(detector, known, steps=150, batch=12, rate=1e-3, pose_loss=through_the_fit)
+    assert np.mean(values[-10:]) < 0.5 * np.mean(values[:10])
 
 
 def test_a_shape_is_learned_of_the_models_keypoints() -> None:

@@ -9,10 +9,15 @@ from typing import NamedTuple, cast
 import cv2
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.contours.descent import MOST_ROUNDS, FirstSteps, Masked
-from cadalign.estimation.contours.silhouettes import Resembling, distinct, resembling_poses
+from cadalign.estimation.contours.silhouettes import (
+    Possible,
+    Resembling,
+    distinct,
+    resembling_poses,
+)
 from cadalign.estimation.contours.surface import Surface, surfaces_of
 from cadalign.estimation.contours.view_contour import (
     ViewContour,
@@ -21,6 +26,7 @@ from cadalign.estimation.contours.view_contour import (
     cost_of_contour,
 )
 from cadalign.estimation.estimates import poses_of
+from cadalign.estimation.evidence_kinds import known_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.prior import Lenses, prior_of
@@ -43,6 +49,9 @@ _MOST_PROPOSALS = 5
 _CLOSE = 1.1  # cost above the least, of a contour's sample, at which a proposal is still one
 _ROUGH_SIZE = 160.0  # [px], of the mask's copy in which starts are followed
 _LEAST_PIXEL = 1.3  # of a smaller copy, in those of the mask
+_ROUGHLY = np.radians(10.0)  # standard deviation of a start's directions
+_ROUGH_STRETCH = 0.3  # of the logarithms of its lengths
+_MOST_SIGMAS = 3.0
 _WHERE = "views[0].mask"
 
 
@@ -287,9 +296,31 @@ def _resembling(
             is_cut=search.is_cut,
             every=search.every,
             symmetry=_symmetry_of(model),
+            possible=_possible(problem, surface),
         )
         found.extend((each, surface) for each in poses)
     return sorted(found, key=lambda pair: -pair[0].overlap)[: search.starts]
+
+
+def _possible(problem: JointProblem, surface: Surface) -> Possible | None:
+    """Tell which poses known directions, such as gravity's, and known lengths leave."""
+    directions, _ = known_of(problem.prior, [problem.views[0].given], None)
+    lengths = np.full(3, np.nan) if problem.size is None else problem.size.lengths
+    known = np.log(lengths / np.ptp(surface.mesh.bounds, axis=0))
+    if not len(directions.model) and np.isfinite(known).sum() < 2:
+        return None
+    roots, axes = np.linalg.eigh(directions.whitening.mT @ directions.whitening)
+    weights = roots / (1 + _ROUGHLY**2 * roots)  # of directions that are as rough as a start
+
+    def possible(rotations: FloatArray, scales: FloatArray) -> BoolArray:
+        seen = np.einsum("nij,dj->ndi", rotations, directions.model) - directions.camera
+        along = np.einsum("ndi,dij->ndj", seen, axes)
+        agree = (weights * along**2).sum(axis=2) < _MOST_SIGMAS**2
+        gaps = (known - np.log(scales))[:, np.isfinite(known)]
+        spread = np.ptp(gaps, axis=1) if gaps.size else np.zeros(len(scales))
+        return np.asarray(agree.all(axis=1) & (spread < _MOST_SIGMAS * _ROUGH_STRETCH))
+
+    return possible
 
 
 def _begun(

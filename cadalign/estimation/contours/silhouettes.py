@@ -51,6 +51,7 @@ _LINE_MARGIN = 4.0  # [cells], on the object's side of a line, whose directions 
 _LEAST_OF_BEST = 0.97  # overlap of another turn, relative to the best one of the same direction
 _MOST_AFFINE = 200  # cameras of which the silhouettes are rendered
 _MOST_AFFINE_CUT = 600  # where the mask may lack a part, which leaves more possible
+_WIDER = 3  # times as many cameras, where other evidence leaves few of them
 _ITERATIONS = 8
 _PRIOR = 0.05  # weight of the logarithms of scales
 _MOST_LOG = 1.3
@@ -59,6 +60,8 @@ _DISTINCT_DEG = 10.0
 _DISTINCT_STRETCH = 0.2
 
 T = TypeVar("T")
+Possible = Callable[[FloatArray, FloatArray], BoolArray]
+"""Tells which rotations (n, 3, 3) in the camera and scales (n, 3) other evidence leaves."""
 
 
 class Resembling(NamedTuple):
@@ -243,17 +246,23 @@ def resembling_poses(
     is_cut: bool = False,
     every: int = 1,
     symmetry: Symmetry | None = None,
+    possible: Possible | None = None,
 ) -> list[Resembling]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
     lies beyond a line. One row and column in ``every`` are compared. Of alignments that are equal
-    under the ``symmetry`` one is kept.
+    under the ``symmetry`` one is kept. Those that are not ``possible`` are left out.
     """
     atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
     query, compared = whitened(view.image, view.corner, view.cell), view.compared(every)
     most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
-    poses = _poses_of(*_affine_cameras(atlas, query, most), atlas, free)
+    cameras = _affine_cameras(atlas, query, most if possible is None else _WIDER * most)
+    rotations, places, scales = _poses_of(*cameras, atlas, free)
+    every_one = np.ones(len(scales), dtype=bool)
+    is_left = possible(view.camera_from_facing @ rotations, scales) if possible else every_one
+    left = (each[is_left][:most] for each in (rotations, places, scales))
+    poses = [Alignment(*each) for each in zip(*left, strict=True)]
     found = [_resemblance(atlas, compared, pose, is_cut=is_cut) for pose in poses]
     found.sort(key=lambda each: -each.overlap)
     kept = distinct(((each.alignment, each) for each in found), count, symmetry)
@@ -365,8 +374,11 @@ def _affine_cameras(atlas: Atlas, query: Whitened, most: int) -> tuple[FloatArra
 
 def _poses_of(
     matrices: FloatArray, shifts: FloatArray, atlas: Atlas, free: BoolArray
-) -> list[Alignment]:
-    """The alignments of affine cameras, ``matrices`` (n, 2, 3) and ``shifts`` (n, 2)."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Rotations, translations and scales of affine cameras.
+
+    These are ``matrices`` (n, 2, 3) and ``shifts`` (n, 2).
+    """
     scales = _stretches_of(matrices, free)
     rows = matrices / scales[:, None]
     sizes = np.sqrt(np.linalg.norm(rows, axis=2).prod(axis=1))
@@ -376,7 +388,7 @@ def _poses_of(
     middle = atlas.corners.mean(axis=0)
     seen = np.column_stack([matrices @ middle + shifts, np.ones(len(matrices))]) / sizes[:, None]
     places = seen - (rotations @ (scales * middle)[:, :, None])[:, :, 0]
-    return [Alignment(*each) for each in zip(rotations, places, scales, strict=True)]
+    return rotations, places, scales
 
 
 def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cadalign import Alignment, Camera, Mesh, Model, Symmetry, View, align
+from cadalign import Alignment, Camera, Mesh, Model, Size, Symmetry, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DegenerateError
 from cadalign.estimation.contours.silhouettes import atlas_of, distinct, resembling_poses
@@ -119,6 +119,15 @@ class TestOwnModel:
         assert rotation_error(est=found.alignment, gt=truth) < 1.0
         np.testing.assert_allclose(found.alignment.scale, truth.scale, rtol=0.03)
 
+    @pytest.mark.parametrize("known", ["up", "size"])
+    def test_gravity_and_lengths_narrow_the_search(self, known: str) -> None:
+        truth = posed(11, (1.0, 1.4, 0.7))
+        mask = damaged_mask(mask_of(body(), truth), "hidden", np.random.default_rng(11))
+        size = Size(*(np.ptp(body().vertices, axis=0) * truth.scale))
+        view = View(CAMERA, mask=mask, up=truth.rotation[:, 1] if known == "up" else None)
+        found = align(Model(mesh=body()), view, size=size if known == "size" else None)
+        assert rotation_error(est=found.alignment, gt=truth) < 1.0
+
     def test_probabilities_of_a_large_photo(self) -> None:
         """Starts are followed in a smaller copy of the mask, the end in the mask itself."""
         truth, camera = posed(0, (1.0, 1.2, 0.8)), CAMERA.resized(1280, 960)
@@ -190,6 +199,18 @@ class TestSimilarModel:
 
 
 class TestSilhouettes:
+    def test_poses_that_are_not_possible_are_left_out(self) -> None:
+        truth = posed(1)
+        given = body(), mask_of(body(), truth), CAMERA
+
+        def possible(rotations: np.ndarray, scales: np.ndarray) -> np.ndarray:
+            return (rotations[:, 1] @ truth.rotation[1] > 0.9) & (scales[:, 2] < 1.2)
+
+        found = resembling_poses(*given, free=FREE, count=16, possible=possible)
+        assert found
+        assert all(each.alignment.rotation[1] @ truth.rotation[1] > 0.9 for each in found)
+        assert all(each.alignment.scale[2] < 1.2 for each in found)
+
     def test_are_rendered_once(self) -> None:
         assert atlas_of(body()) is atlas_of(body())
 

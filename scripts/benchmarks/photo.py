@@ -19,7 +19,7 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, Mesh, Model, Result, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, load_mesh
-from cadalign.estimation.contours.photo_lines import bins_of, regions_of
+from cadalign.estimation.contours.line_changes import bins_of, regions_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation

@@ -15,15 +15,15 @@ from support.timing import Measure, ratio, timed
 from cadalign import Alignment, Camera, Mesh, Model, Tracker, View, align
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.contours.contour import Sight
-from cadalign.estimation.contours.photo_lines import (
+from cadalign.estimation.contours.line_changes import (
     bins_of,
     changes_of,
     crossings_of,
     edges_of,
     regions_of,
-    silhouette_of,
     with_neighbours,
 )
+from cadalign.estimation.contours.photo_lines import silhouette_of
 from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import rotation_from_vector
@@ -198,6 +198,24 @@ class TestPhoto:
         found = shown.aligned(**known, image=grey)
         assert not any("image" in text for text in found.warnings)
         assert shown.error(found) < 0.5 * shown.error(clicks)
+
+    def test_what_a_depth_image_shows_before_the_object_hides_its_outline(self) -> None:
+        shown = scene(1)
+        depth = cast_geometry(Scene(shown.mesh), CAMERA, shown.truth).depth
+        measured, pixels = np.where(shown.mask, depth, 4.0), shown.pixels.copy()
+        rows, columns = np.nonzero(shown.mask)
+        right = int(np.quantile(columns, 0.75))
+        covered = slice(rows.min() - 20, rows.max() + 20), slice(right, right + 120)
+        measured[covered], pixels[covered] = 2.0, (60, 60, 190)
+        rows = np.flatnonzero(shown.clicks[:, 0] < right)
+        seen = View(CAMERA, shown.clicks[rows], ids=rows.tolist(), sigma=CLICK_PX, image=pixels)
+        model = shown.model(stretch="none")
+        found = align(model, replace(seen, depth=measured, depth_sigma=0.003))
+        alone = align(model, seen)
+        (photo,) = (each for each in found.evidence if each.kind == "photo")
+        (blind,) = (each for each in alone.evidence if each.kind == "photo")
+        assert shown.error(found) < 0.5
+        assert photo.count < blind.count
 
     def test_counts_beside_the_mask_of_another_view(self) -> None:
         shown = scene(1)

@@ -79,9 +79,9 @@ class Similar:
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Similar:
     folder = tmp_path_factory.mktemp("pair") / "sample"
-    root = write_sample_dataset(folder, per_category=2, categories=["chair"])
+    root = write_sample_dataset(folder, per_category=3, categories=["chair"])
     case = make_case(root, tmp_path_factory.mktemp("annotate"))
-    other = KeypointNet(root)["chair", "sample_chair_001"]
+    other = KeypointNet(root)["chair", "sample_chair_002"]
     assert other.mesh_path is not None
     every = ModelKeypoints.of_model(other)
     visible = dict(case.clicks)

@@ -26,9 +26,9 @@ from cadalign.estimation.contours.view_contour import (
     cost_of_contour,
 )
 from cadalign.estimation.estimates import poses_of
-from cadalign.estimation.evidence_kinds import known_of
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions
+from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
@@ -304,7 +304,7 @@ def _resembling(
 
 def _possible(problem: JointProblem, surface: Surface) -> Possible | None:
     """Tell which poses known directions, such as gravity's, and known lengths leave."""
-    directions, _ = known_of(problem.prior, [problem.views[0].given], None)
+    directions = evidence_of(problem.prior, problem.views, lenses=problem.lenses).directions
     lengths = np.full(3, np.nan) if problem.size is None else problem.size.lengths
     known = np.log(lengths / np.ptp(surface.mesh.bounds, axis=0))
     if not len(directions.model) and np.isfinite(known).sum() < 2:

@@ -2,8 +2,10 @@
 
 Seen from afar, a stretched model under any pose is an affine image of the model, and silhouettes
 along one direction of the model differ by an affine map of the plane: whitened by their second
-moments, by a turn or a reflection. So silhouettes along directions all around are rendered once for
-a model, compared with the mask's at all turns, and each that resembles it gives an affine camera.
+moments, by a turn. So silhouettes along directions all around are rendered once for a model,
+compared with the mask's at all turns, and each that resembles it gives an affine camera. Near
+objects look larger where they are nearer, by an amount that a stretch changes little: silhouettes
+are rendered from about as far as the mask's size says, for there are few classes of distances.
 What an occluder or the image's border leaves of a silhouette has moments of its own: so each one is
 kept whole and cut by straight lines.
 From ``M = R[:2] S / Z``, for the rows of ``M S^-1`` are orthogonal and of one length, the stretch
@@ -33,6 +35,8 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 
 _DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
+_AFAR = 60.0  # distance of an eye whose rays are almost parallel, relative to half a box's diagonal
+_EYES = (5.0, 12.0, _AFAR)  # distances from which silhouettes are rendered
 _CELLS = 80  # of a silhouette's or a mask's image
 _TURNS = 64
 _RINGS = 24
@@ -103,20 +107,20 @@ def whitened(image: Image, corner: FloatArray, cell: float) -> Whitened:
     return _sampled(image, *_uncut(_cells(image)), corner, cell)
 
 
-def overlaps(views: Whitened, query: Whitened) -> FloatArray:
-    """Intersections over unions (2, N, turns) of silhouettes and one that is turned.
+def overlaps(views: Whitened, query: Whitened, *, mirrored: bool = True) -> FloatArray:
+    """Intersections over unions (k, N, turns) of silhouettes and one that is turned.
 
-    The query's mirror image comes second.
+    The query's mirror image comes second: an affine image is that from the other side.
     """
     rings = query.rings[0].astype(np.float32) / 255
     count, turns = rings.shape
     weights = np.repeat(_radii(count), turns)
     around = (np.arange(turns)[:, None] + np.arange(turns)) % turns
-    mirrored = np.roll(rings[:, ::-1], 1, axis=1)
-    turned = [each[:, around].transpose(0, 2, 1).reshape(-1, turns) for each in (rings, mirrored)]
+    images = [rings, np.roll(rings[:, ::-1], 1, axis=1)][: 1 + mirrored]
+    turned = [each[:, around].transpose(0, 2, 1).reshape(-1, turns) for each in images]
     weighted = np.hstack(turned) * weights[:, None].astype(np.float32)
     flat = views.rings.reshape(len(views.rings), -1).astype(np.float32) / 255
-    common = (flat @ weighted).reshape(len(flat), 2, turns).transpose(1, 0, 2)
+    common = (flat @ weighted).reshape(len(flat), -1, turns).transpose(1, 0, 2)
     areas = flat @ weights.astype(np.float32)
     return np.asarray(common / (areas[:, None] + weighted[:, 0].sum() - common), dtype=np.float64)
 
@@ -126,20 +130,31 @@ def _radii(count: int) -> FloatArray:
 
 
 @lru_cache(maxsize=32)
-def atlas_of(mesh: Mesh, *, is_cut: bool = False) -> Atlas:
-    """The silhouettes of a mesh, whole or the parts that lines leave, rendered once."""
-    surface = rigid_surface(mesh)
-    return _atlas(surface, _CUT_EVERY, _cuts) if is_cut else _atlas(surface, 1, _uncut)
+def atlas_of(mesh: Mesh, eye: float, *, is_cut: bool = False) -> Atlas:
+    """The silhouettes of a mesh, whole or the parts that lines leave, rendered once.
+
+    The ``eye`` is so far from the middle of the box, relative to half of its diagonal.
+    """
+    surface, around = rigid_surface(mesh), _half_sphere(_DIRECTIONS)
+    directions = np.concatenate([around, -around])
+    if is_cut:
+        return _atlas(surface, directions[::_CUT_EVERY], eye, _cuts)
+    return _atlas(surface, directions, eye, _uncut)
 
 
 def outline_of(mesh: Mesh) -> Whitened:
-    """The silhouettes of a mesh along fewer directions, to be compared with many others'."""
-    return _atlas(RigidSurface(mesh), _OUTLINE_EVERY, _uncut, cells=_OUTLINE_CELLS).views
+    """The silhouettes of a mesh from afar along fewer directions, to be compared with many others'.
+
+    Those from the other side are mirror images.
+    """
+    directions = _half_sphere(_DIRECTIONS)[::_OUTLINE_EVERY]
+    return _atlas(RigidSurface(mesh), directions, _AFAR, _uncut, cells=_OUTLINE_CELLS).views
 
 
 def _atlas(
     surface: RigidSurface,
-    every: int,
+    directions: FloatArray,
+    eye: float,
     parts_of: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
     *,
     cells: int = _CELLS,
@@ -147,19 +162,20 @@ def _atlas(
     """Silhouettes along directions, and the parts of each by their moments and lines."""
     caster, corners = surface.caster, surface.corners
     middle = corners.mean(axis=0)
-    reach = float(np.linalg.norm(corners - middle, axis=1).max())
+    far = eye * float(np.linalg.norm(corners - middle, axis=1).max())
     bases, views = [], []
-    for direction in _half_sphere(_DIRECTIONS)[::every]:
+    for direction in directions:
         base = np.linalg.svd(direction[None])[2][1:]
+        base[1] *= np.sign(np.cross(*base) @ direction)  # the image as it is seen, not mirrored
         across = (corners - middle) @ base.T
+        across *= far / (far + (corners - middle) @ direction)[:, None]
         low, high = across.min(axis=0), across.max(axis=0)
         cell = float((high - low).max()) / cells or 1.0
         places = low[:, None] + cell * np.arange(cells + 1)
         grid = np.stack(np.meshgrid(places[0], places[1]), axis=-1).reshape(-1, 2)
-        # Rays from afar: their origin is one point, so that they are almost parallel.
-        eye = middle - 60 * reach * direction
-        rays = (grid / (60 * reach)) @ base + direction
-        image = caster.covered(eye, rays).reshape(cells + 1, cells + 1).astype(np.float32)
+        rays = (grid / far) @ base + direction
+        covered = caster.covered(middle - far * direction, rays)
+        image = covered.reshape(cells + 1, cells + 1).astype(np.float32)
         points = _cells(image)
         if len(points) < _LEAST_CELLS:
             continue
@@ -168,6 +184,15 @@ def _atlas(
         bases.append(np.broadcast_to(base, (len(moments), 2, 3)))
     rows = [np.concatenate(column) for column in zip(*views, strict=True)]
     return Atlas(caster, corners, np.concatenate(bases), Whitened(*rows))
+
+
+def _eye_of(mesh: Mesh, query: Whitened) -> float:
+    """One of `_EYES` from which a box of the mesh's size looks as large as a silhouette."""
+    sides = np.ptp(mesh.bounds, axis=0)
+    area = float((sides * np.roll(sides, 1)).sum()) / 2  # a quarter of the surface (Cauchy)
+    angle = 4 * np.pi * float(np.linalg.det(query.spread[0]))  # of a disc of this variance
+    far = np.sqrt(area / angle) / (float(np.linalg.norm(sides)) / 2)
+    return min(_EYES, key=lambda eye: abs(np.log(eye / far)))
 
 
 def _half_sphere(count: int) -> FloatArray:
@@ -254,8 +279,9 @@ def resembling_poses(
     lies beyond a line. One row and column in ``every`` are compared. Of alignments that are equal
     under the ``symmetry`` one is kept. Those that are not ``possible`` are left out.
     """
-    atlas, view = atlas_of(mesh, is_cut=is_cut), _facing(mask, camera)
+    view = _facing(mask, camera)
     query, compared = whitened(view.image, view.corner, view.cell), view.compared(every)
+    atlas = atlas_of(mesh, _eye_of(mesh, query), is_cut=is_cut)
     most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
     cameras = _affine_cameras(atlas, query, most if possible is None else _WIDER * most)
     rotations, places, scales = _poses_of(*cameras, atlas, free)
@@ -356,17 +382,16 @@ def _affine_cameras(atlas: Atlas, query: Whitened, most: int) -> tuple[FloatArra
 
     Matrices (n, 2, 3) and shifts (n, 2).
     """
-    overlap = overlaps(atlas.views, query)
+    (overlap,) = overlaps(atlas.views, query, mirrored=False)
     # A whitened silhouette may fit at several turns.
-    is_peak = (overlap >= np.roll(overlap, 1, 2)) & (overlap >= np.roll(overlap, -1, 2))
-    is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=2, keepdims=True)
+    is_peak = (overlap >= np.roll(overlap, 1, 1)) & (overlap >= np.roll(overlap, -1, 1))
+    is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=1, keepdims=True)
     peaks = np.nonzero(is_peak)
     best = np.argsort(-overlap[peaks])[:most]
-    flip, row, number = (each[best] for each in peaks)
+    row, number = (each[best] for each in peaks)
     angle = 2 * np.pi * number / _TURNS
     cosine, sine = np.cos(angle), np.sin(angle)
     turns = np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
-    turns[flip == 1, 1] *= -1.0
     planes = query.spread[0] @ turns @ np.linalg.inv(atlas.views.spread[row])
     shifts = query.mean[0] - (planes @ atlas.views.mean[row][:, :, None])[:, :, 0]
     return planes @ atlas.bases[row], shifts

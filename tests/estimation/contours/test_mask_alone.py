@@ -212,7 +212,7 @@ class TestSilhouettes:
         assert all(each.alignment.scale[2] < 1.2 for each in found)
 
     def test_are_rendered_once(self) -> None:
-        assert atlas_of(body()) is atlas_of(body())
+        assert atlas_of(body(), 7.0) is atlas_of(body(), 7.0)
 
     def test_resembling_poses_are_distinct_and_sorted(self) -> None:
         truth = posed(1, (1.0, 1.4, 0.7))

@@ -263,7 +263,7 @@ def _photo(given: Any, camera: Camera) -> ByteImage:
 
 
 def _as_photo(pixels: npt.NDArray[Any]) -> str:
-    """How an array of another form becomes a photo."""
+    """The fix for an array of another form: what makes a photo of it."""
     if pixels.ndim == 2:
         return "of one channel give np.dstack([image] * 3)"
     if pixels.ndim != 3 or pixels.shape[2] not in (3, 4):

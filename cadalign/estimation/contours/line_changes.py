@@ -1,4 +1,4 @@
-"""Where along a line the colours or depths of a photo change from the object's to others.
+"""Places along a line where the colours or depths of a photo change from the object to others.
 
 The statistics of region-based tracking: M. Stoiber, M. Pfanne, K. H. Strobl, R. Triebel,
 A. Albu-Schaeffer, "SRT3D: A sparse region-based 3D object tracking approach for the real world",

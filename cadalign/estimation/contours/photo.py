@@ -22,7 +22,7 @@ from cadalign.estimation.contours.measured import (
     with_displacement_modes,
 )
 from cadalign.estimation.contours.photo_lines import (
-    DepthImage,
+    MeasuredDepths,
     Outline,
     PhotoPyramid,
     photo_of,
@@ -187,9 +187,9 @@ def fit_photos(
     return Refined(refined, summaries, warnings, photos=frozenset(found))
 
 
-def _depth_of(view: View) -> DepthImage | None:
+def _depth_of(view: View) -> MeasuredDepths | None:
     depths = view.depth_image
-    return None if depths is None else DepthImage(depths, float(cast(float, view.depth_sigma)))
+    return None if depths is None else MeasuredDepths(depths, float(cast(float, view.depth_sigma)))
 
 
 def _weak(found: dict[int, OutlineSupport]) -> list[str]:

@@ -47,7 +47,7 @@ _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other thing
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
-class DepthImage(NamedTuple):
+class MeasuredDepths(NamedTuple):
     """Depths (h, w), NaN where none is known, and their relative standard deviation."""
 
     depths: FloatArray
@@ -72,7 +72,7 @@ class PhotoPyramid(NamedTuple):
     image: int
     camera: Camera
     levels: tuple[ByteImage, ...]
-    depth: DepthImage | None = None
+    depth: MeasuredDepths | None = None
 
     def colors(self, points: FloatArray, step: float) -> ByteImage:
         """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
@@ -103,7 +103,7 @@ class PhotoPyramid(NamedTuple):
 
 
 def photo_of(
-    image: int, camera: Camera, pixels: ByteImage, depth: DepthImage | None = None
+    image: int, camera: Camera, pixels: ByteImage, depth: MeasuredDepths | None = None
 ) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
     levels = [np.ascontiguousarray(pixels)]

@@ -17,7 +17,7 @@ from cadalign.io.documents import read_json
 from cadalign.io.images import read_image
 from cadalign.io.input_kinds import is_of_many, refuse_photo_or_mesh
 from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.query import ObservationRetrieval, read_mask, read_query
+from cadalign.retrieval.query import ObservationRetrieval, read_query, read_query_mask
 
 if TYPE_CHECKING:
     from cadalign.retrieval.match import Match
@@ -92,7 +92,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         query = self.of_camera.applied_to(read_query(path), str(path))
         library, _ = self.opened()
         camera = query.camera
-        mask = None if self.mask is None else read_mask(self.mask, camera)
+        mask = None if self.mask is None else read_query_mask(self.mask, camera)
         # The table needs no photo, which may have been moved.
         photo = None
         if self.out is not None and query.image is not None:

@@ -112,8 +112,8 @@ def no_pose_error(
 
     Raises InputError if a mask or photo is given for a model without meshes.
     """
-    views, where, fix = problem.views, "views", mistake_beside(problem, ransac)
-    seen = [view for view in views if len(view.keypoint_ids)]
+    views, fix = problem.views, mistake_beside(problem, ransac)
+    seen = sum(len(view.keypoint_ids) > 0 for view in views)
     shown = [
         f"views[{number}].{'image' if view.mask is None else 'mask'}"
         for number, view in enumerate(views)
@@ -123,20 +123,32 @@ def no_pose_error(
         from cadalign.estimation.contours.surface import surfaces_of  # imports this package
 
         surfaces_of(model, problem.prior.components[0].mean, shown[0])
-    what = "no pose has the keypoints in front of the camera"
-    is_rig = len(views) > 1 and views[0].cam_from_rig is not None
-    if fix is None and shown and not seen and len(views) == 1:
-        where = shown[0]
-        what = "a photo without keypoints does not tell where its outline is to be sought"
-        fix = "give `init`, at least 3 keypoints, or a mask"
-    elif fix is None and shown and not seen:
-        what = "masks and photos of several views tell no pose without keypoints"
-        fix = "give at least 3 keypoints in one view, or `init`, such as the pose by one mask alone"
-    elif fix is None and shown and is_rig and len(seen) == 1 and problem.size is None:
-        what = "keypoints of one view alone leave open the size that the known motion gives"
-        fix = "give a keypoint in another view, `size`, or `init`"
-    fix = fix or "give at least 3 keypoints in one view, or `init`, and check which is which"
-    return DegenerateError(what, where=where, fix=fix)
+    if shown and fix is None:
+        is_rig = len(views) > 1 and views[0].cam_from_rig is not None
+        if not seen and len(views) == 1:
+            return DegenerateError(
+                "a photo without keypoints does not tell where its outline is to be sought",
+                where=shown[0],
+                fix="give `init`, at least 3 keypoints, or a mask",
+            )
+        if not seen:
+            return DegenerateError(
+                "masks and photos of several views tell no pose without keypoints",
+                where="views",
+                fix="give at least 3 keypoints in one view, or `init`, such as the pose by one "
+                "mask alone",
+            )
+        if is_rig and seen == 1 and problem.size is None:
+            return DegenerateError(
+                "keypoints of one view alone leave open the size that the known motion gives",
+                where="views",
+                fix="give a keypoint in another view, `size`, or `init`",
+            )
+    return DegenerateError(
+        "no pose has the keypoints in front of the camera",
+        where="views",
+        fix=fix or "give at least 3 keypoints in one view, or `init`, and check which is which",
+    )
 
 
 def _misfit(minimum: Minimum) -> float:

@@ -15,8 +15,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
-from cadalign.io.images import open_photo, read_image
-from cadalign.io.images import read_mask as read_nonzero
+from cadalign.io.images import is_grey, open_photo, read_image, read_mask
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.shapes.model import ShapeModel
@@ -75,7 +74,7 @@ class ObservationRetrieval:
         camera, ids = seen.camera, _semantic_ids(seen, where)
         cuts_out = self.silhouette and len(ids)
         if mask is None and seen.evidence.mask is not None and not cuts_out:
-            mask = read_nonzero(seen.evidence.mask)  # as a fit to the observation reads it
+            mask = read_mask(seen.evidence.mask)  # as a fit to the observation reads it
         if not len(ids):
             return library.retrieve(mask=mask, camera=camera, workers=workers, **vars(self.ranking))
         if shape is None and not camera.focal_known:
@@ -152,14 +151,12 @@ def _semantic_ids(query: Observation, where: str) -> IntArray:
     return query.ids
 
 
-def read_mask(path: Path, camera: Camera) -> BoolArray:
+def read_query_mask(path: Path, camera: Camera) -> BoolArray:
     """Read an object's pixels, (h, w) bool; raises as `read_image`.
 
     Those of one channel are read as a fit reads them, of a coloured image they are the bright ones.
     """
-    with open_photo(path) as image:
-        is_grey = image.mode in ("1", "L", "P") or image.mode.startswith("I")
-    mask = read_nonzero(path) if is_grey else None
+    mask = read_mask(path) if is_grey(path) else None
     if mask is not None and mask.shape == (camera.height, camera.width):
         return mask
     return np.asarray(read_image(path, camera).mean(axis=2) > 127.5)

@@ -17,7 +17,7 @@ from cadalign.io.images import write_image
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, look_at
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.query import read_mask
+from cadalign.retrieval.query import read_query_mask
 
 pytestmark = pytest.mark.slow
 
@@ -78,9 +78,9 @@ def test_a_mask_of_labels_is_read_as_a_fit_reads_it(tmp_path: Path) -> None:
     mask = np.zeros((240, 320), dtype=np.uint8)
     mask[90:150, 100:200] = 1
     write_image(tmp_path / "labels.png", mask)
-    assert np.array_equal(read_mask(tmp_path / "labels.png", CAMERA), mask > 0)
+    assert np.array_equal(read_query_mask(tmp_path / "labels.png", CAMERA), mask > 0)
     write_image(tmp_path / "white.png", np.dstack([255 * mask] * 3))
-    assert np.array_equal(read_mask(tmp_path / "white.png", CAMERA), mask > 0)
+    assert np.array_equal(read_query_mask(tmp_path / "white.png", CAMERA), mask > 0)
 
 
 def test_a_part_that_is_hidden_does_not_hide_the_model(library: Library) -> None:

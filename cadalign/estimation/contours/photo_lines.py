@@ -47,6 +47,17 @@ _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other thing
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
+def _cells_at(
+    image: FloatArray | BoolArray, points: FloatArray, outside: float
+) -> FloatArray | BoolArray:
+    """Values (...) of the cells of an image (h, w) that hold points (..., 2), or ``outside``."""
+    height, width = image.shape
+    columns, rows = np.moveaxis(np.rint(points).astype(int), -1, 0)
+    held = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    found = image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    return np.where(held, found, outside)
+
+
 class MeasuredDepths(NamedTuple):
     """Depths (h, w), NaN where none is known, and their relative standard deviation."""
 
@@ -55,12 +66,7 @@ class MeasuredDepths(NamedTuple):
 
     def at(self, points: FloatArray) -> FloatArray:
         """Depths (...) of the pixels that hold points (..., 2)."""
-        height, width = self.depths.shape
-        columns, rows = np.rint(points).astype(int).reshape(-1, 2).T
-        inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        found = np.full(len(columns), np.nan)
-        found[inside] = self.depths[rows[inside], columns[inside]]
-        return found.reshape(points.shape[:-1])
+        return np.asarray(_cells_at(self.depths, points, np.nan), dtype=np.float64)
 
 
 class PhotoPyramid(NamedTuple):
@@ -145,13 +151,7 @@ class Silhouette(NamedTuple):
 
     def at(self, points: FloatArray) -> BoolArray:
         """Tell if pixels (..., 2) lie inside."""
-        cells = np.rint((points - self.corner) / self.cell).astype(int)
-        height, width = self.inside.shape
-        columns, rows = cells[..., 0], cells[..., 1]
-        held = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-        return np.asarray(
-            held & self.inside[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-        )
+        return np.asarray(_cells_at(self.inside, (points - self.corner) / self.cell, False))
 
 
 def silhouette_of(

@@ -133,7 +133,9 @@ class _Start(NamedTuple):
     @property
     def proposal(self) -> _Proposal:
         """The minimum near the start, its outline brought to the mask's."""
-        (contour,), here = self.masked.views, self.approach.widened(self.masked)
+        (contour,), here = self.masked.views, self.approach
+        if here.reach < here.first_reach or self.shown is not self.masked:
+            here = here.widened(self.masked)
         residuals, every = here.residuals(), np.ones(len(contour.contour.points), dtype=bool)
         cost = cost_of_contour(residuals, here.first_reach)
         alike = correlation_length(contour.contour, residuals, every)
@@ -331,10 +333,9 @@ def _begun(
     if not minima:
         return None, iterations
     best = minima[0]
-    masked, shown = (
-        Masked(best.evidence, len(problem.prior.ids), [part], surface)
-        for part in (contour, contour.shown_by(start.line))
-    )
+    masked = Masked(best.evidence, len(problem.prior.ids), [contour], surface)
+    part = contour.shown_by(start.line)
+    shown = masked if part is contour else masked._replace(views=[part])
     approach = FirstSteps.begun(shown, best.state, is_wide=True)
     return _Start(best, masked, shown, approach), iterations
 

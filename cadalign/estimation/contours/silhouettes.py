@@ -48,7 +48,7 @@ _CUT_SHARES = (0.15, 0.3)  # of the area that lies beyond a line
 _CUT_ANGLES = 12
 _OUTLINE_CELLS = 60
 _OUTLINE_EVERY = 2  # directions
-_LINE_ANGLES = 16  # of what hides a part
+_LINES = 16  # directions of what hides a part
 _HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
 _LEAST_HIDDEN = 0.03  # of the area, that a line hides
 _LINE_MARGIN = 4.0  # [cells], on the object's side of a line, whose directions are few
@@ -195,6 +195,13 @@ def _eye_of(mesh: Mesh, query: Whitened) -> float:
     return min(_EYES, key=lambda eye: abs(np.log(eye / far)))
 
 
+@cache
+def _around(count: int) -> FloatArray:
+    """Unit vectors (count, 2) in equal steps, all around."""
+    angles = 2 * np.pi * np.arange(count) / count
+    return np.column_stack([np.cos(angles), np.sin(angles)])
+
+
 def _half_sphere(count: int) -> FloatArray:
     """Directions (count, 3) spread evenly: a Fibonacci lattice."""
     k = np.arange(count) + 0.5
@@ -224,9 +231,8 @@ def _cuts(points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
     Their directions are spread evenly after whitening.
     """
-    angles = 2 * np.pi * np.arange(_CUT_ANGLES) / _CUT_ANGLES
     root = np.linalg.cholesky(np.cov(points.T) + _CELL_VARIANCE * np.eye(2))
-    normals = np.column_stack([np.cos(angles), np.sin(angles)]) @ np.linalg.inv(root)
+    normals = _around(_CUT_ANGLES) @ np.linalg.inv(root)
     terms = _terms(points)
     last = [max(int((1 - share) * len(points)) - 1, 2) for share in _CUT_SHARES]
     moments: list[FloatArray] = []
@@ -250,9 +256,7 @@ def _sampled(
     square -= mean[:, :, None] * mean[:, None, :]
     variances, axes = np.linalg.eigh(square + _CELL_VARIANCE * np.eye(2))
     spread = (axes * np.sqrt(np.maximum(variances, _CELL_VARIANCE))[:, None]) @ axes.mT
-    angles = 2 * np.pi * np.arange(_TURNS) / _TURNS
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    rays = (_radii(_RINGS)[:, None, None] * circle).reshape(-1, 2)
+    rays = (_radii(_RINGS)[:, None, None] * _around(_TURNS)).reshape(-1, 2)
     places = mean[:, None] + rays @ spread
     padded = np.asarray(np.pad(image, 1), dtype=np.float32)
     covered = sampled(padded, places.reshape(-1, 2) + 1).reshape(len(mean), -1)
@@ -285,8 +289,9 @@ def resembling_poses(
     most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
     cameras = _affine_cameras(atlas, query, most if possible is None else _WIDER * most)
     rotations, places, scales = _poses_of(*cameras, atlas, free)
-    every_one = np.ones(len(scales), dtype=bool)
-    is_left = possible(view.camera_from_facing @ rotations, scales) if possible else every_one
+    is_left = np.ones(len(scales), dtype=bool)
+    if possible is not None:
+        is_left = possible(view.camera_from_facing @ rotations, scales)
     left = (each[is_left][:most] for each in (rotations, places, scales))
     poses = [Alignment(*each) for each in zip(*left, strict=True)]
     found = [_resemblance(atlas, compared, pose, is_cut=is_cut) for pose in poses]
@@ -389,8 +394,7 @@ def _affine_cameras(atlas: Atlas, query: Whitened, most: int) -> tuple[FloatArra
     peaks = np.nonzero(is_peak)
     best = np.argsort(-overlap[peaks])[:most]
     row, number = (each[best] for each in peaks)
-    angle = 2 * np.pi * number / _TURNS
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine, sine = _around(_TURNS)[number].T
     turns = np.stack([cosine, -sine, sine, cosine], axis=1).reshape(-1, 2, 2)
     planes = query.spread[0] @ turns @ np.linalg.inv(atlas.views.spread[row])
     shifts = query.mean[0] - (planes @ atlas.views.mean[row][:, :, None])[:, :, 0]
@@ -439,17 +443,13 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
     return np.asarray(np.exp(logs))
 
 
-def _line_angles() -> FloatArray:
-    return np.asarray(2 * np.pi * np.arange(_LINE_ANGLES) / _LINE_ANGLES)
-
-
 @cache
 def _line_bins(every: int) -> IntArray:
-    """Numbers (`_LINE_ANGLES`, m) of the cells' places along directions, all around."""
-    angles = _line_angles()
+    """Numbers (`_LINES`, m) of the cells' places along directions, all around."""
     places = np.arange(0, _CELLS, every) - (_CELLS - 1) / 2
     x, y = np.meshgrid(places, places)
-    along = np.cos(angles)[:, None] * x.ravel() + np.sin(angles)[:, None] * y.ravel()
+    cosine, sine = _around(_LINES).T[:, :, None]
+    along = cosine * x.ravel() + sine * y.ravel()
     return np.asarray(np.rint(along + _CELLS), dtype=np.int64)
 
 
@@ -466,7 +466,7 @@ def _resemblance(atlas: Atlas, view: _Cells, pose: Alignment, *, is_cut: bool) -
         overlap = float(both.sum()) / (total + len(both) - float(both.sum()))
         return Resembling(overlap, pose, np.zeros(3))
     best, line = 0.0, np.zeros(3)
-    for angle, bins in zip(_line_angles(), _line_bins(view.every)[:, seen], strict=True):
+    for normal, bins in zip(_around(_LINES), _line_bins(view.every)[:, seen], strict=True):
         count = np.cumsum(np.bincount(bins, minlength=1))
         common = np.cumsum(np.bincount(bins, weights=both, minlength=1))
         share = count / max(float(count[-1]), 1.0)
@@ -474,7 +474,6 @@ def _resemblance(atlas: Atlas, view: _Cells, pose: Alignment, *, is_cut: bool) -
         last = int(overlaps.argmax())
         if overlaps[last] > best:
             best, is_hidden = float(overlaps[last]), share[last] < 1 - _LEAST_HIDDEN
-            normal = np.array([np.cos(angle), np.sin(angle)])
             farthest = (last - _CELLS - _LINE_MARGIN) * view.cell + normal @ view.middle
             line = is_hidden * np.array([*normal, -farthest])
     return Resembling(best, pose, line)

@@ -244,10 +244,10 @@ class ViewContour:
 
     def shown_by(self, line: FloatArray) -> ViewContour:
         """The part that no line (3,) hides, beyond which rays have ``line @ ray > 0``."""
+        if not line.any():
+            return self
         rays, _ = self.camera.normalize_where_valid(self.contour.points)
         shown = rays @ line[:2] + line[2] <= 0
-        if shown.all():
-            return self
         return replace(self, contour=self.contour.taken(shown), slopes=self.slopes[shown])
 
     def evidence_of(

@@ -28,6 +28,7 @@ from cadalign.geometry.symmetry_group import SymmetryGroup
 
 _TOLERANCE = 0.03  # of the keypoints' extent: how well people place equivalent keypoints
 _OF_WAY = 0.2  # the same, of how far the rotation takes a keypoint
+_STILL = 1e-12  # square of a way that is none
 _FOLDS = (2, 3, 4, 5, 6, 8)
 _AXIS_TOLERANCE_DEG = 10.0
 
@@ -52,15 +53,34 @@ def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
     if revolution is not None:
         center, axis = revolution
         return SymmetryGroup(center, np.eye(3)[None], axis)
-    from cadalign.datasets.models.rotated_onto import rotations_onto_themselves  # compiled
-
-    center, equivalent = xyz.mean(axis=0), _equivalent(len(xyz), symmetries)
-    shifted = np.ascontiguousarray(xyz - center)
-    most = tolerance**2, _OF_WAY**2
-    kept = rotations_onto_themselves(shifted, equivalent, _candidates(), *most)
+    center, rotations = xyz.mean(axis=0), _candidates()
+    kept = _onto_themselves(xyz - center, _equivalent(len(xyz), symmetries), rotations, tolerance)
     if not kept.any():
         return trivial
-    return SymmetryGroup(center, np.concatenate([np.eye(3)[None], _candidates()[kept]]))
+    return SymmetryGroup(center, np.concatenate([np.eye(3)[None], rotations[kept]]))
+
+
+def _onto_themselves(
+    points: FloatArray, equivalent: BoolArray, rotations: FloatArray, tolerance: float
+) -> BoolArray:
+    """Mask (g,) of the rotations (g, 3, 3) that map the centred points (k, 3) onto one another.
+
+    A rotation takes each point to the nearest that is ``equivalent`` (k, k) to it: to within the
+    tolerance and, as on a thin model a wrong angle is within that, to within a share of the way
+    between the two points. No two points go to the same, and not all stay where they are.
+    """
+    rows = np.arange(len(points))
+    squares = (points**2).sum(axis=1)
+    lengths = squares[:, None] + squares
+    # Rotations keep lengths: squares of distances follow from products alone.
+    gaps = lengths - 2 * (points @ rotations.transpose(0, 2, 1)) @ points.T
+    gaps = np.where(equivalent, gaps, np.inf)
+    nearest = gaps.argmin(axis=2)
+    gap, way = gaps.min(axis=2), (lengths - 2 * points @ points.T)[rows, nearest]
+    is_near = (gap <= tolerance**2) & ((gap <= _OF_WAY**2 * way) | (way < _STILL))
+    is_reached_once = (np.diff(np.sort(nearest, axis=1), axis=1) > 0).all(axis=1)
+    moves = (nearest != rows).any(axis=1)
+    return np.asarray(is_near.all(axis=1) & is_reached_once & moves)
 
 
 def _axis_of_revolution(

@@ -9,13 +9,12 @@ from __future__ import annotations
 import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from msgspec import Raw
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.bop_files import (
@@ -36,12 +35,12 @@ from cadalign.datasets.photos.dataset import (
     PhotoFormat,
     PoseEstimate,
     PoseFile,
+    leaving_out,
     parse,
     read_each,
     read_table,
 )
 from cadalign.datasets.photos.photo import (
-    CadModel,
     DepthImage,
     Photo,
     PhotoObject,
@@ -62,7 +61,7 @@ from cadalign.io.documents import (
     in_file,
     read_json,
 )
-from cadalign.io.files import as_path, write_json, writing
+from cadalign.io.files import as_path, made_folder, write_json
 from cadalign.io.images import photo_size
 
 MILLIMETRES = 1e-3
@@ -103,21 +102,16 @@ class _SceneCamera(ForeignDocument):
     depth_scale: NotNegative = 1.0
 
 
-@dataclass(frozen=True)
 class _Scene:
-    """A scene's tables, whose values are parsed when they are asked for, and its common camera."""
+    """A scene's tables, whose values are parsed when they are asked for; its camera and models."""
 
-    folder: Path
-    truth: dict[str, Raw]
-    cameras: dict[str, Raw]
-    info: dict[str, Raw]
-    common: _SceneCamera | None
-
-    @classmethod
-    def read(cls, folder: Path) -> _Scene:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.truth = read_table(folder / TRUTH)
         paths = folder / _CAMERAS, folder / _INFO
-        cameras, info = (read_table(path) if path.is_file() else {} for path in paths)
-        return cls(folder, read_table(folder / TRUTH), cameras, info, _common_camera(folder))
+        self.cameras, self.info = (read_table(path) if path.is_file() else {} for path in paths)
+        self.common = _common_camera(folder)
+        self.models = BopModels.find(folder)
 
     def camera(self, key: str, image: Path | None) -> tuple[Camera | None, float]:
         """The photo's camera, None where its size is not known; and the depth's scale."""
@@ -171,30 +165,22 @@ class Bop(PhotoDataset):
             fix = "give a BOP data set, one of its splits, or a scene"
             raise DataError(what, where=str(folder), fix=fix)
         self._photos: list[tuple[Path, str]] = []
-        names, bad = [], {}
+        names: list[str] = []
+        bad: dict[str, DataError] = {}
         for scene in scenes:
-            try:
-                keys = list(read_table(scene / TRUTH))
-            except DataError as error:
-                bad[str(scene)] = error
-                continue
             prefix = "" if scene == folder else f"{scene.relative_to(folder).as_posix()}/"
-            self._photos += [(scene, key) for key in keys]
-            names += [f"{prefix}{key}" for key in keys]
+            with leaving_out(str(scene), bad):
+                keys = list(read_table(scene / TRUTH))
+                self._photos += [(scene, key) for key in keys]
+                names += [f"{prefix}{key}" for key in keys]
         super().__init__(folder, names, bad)
         self._scene: _Scene | None = None
-        self._models: BopModels | None = None
-        self._known: dict[int, tuple[CadModel, Symmetry]] = {}
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         folder, key = self._photos[index]
-        # Photos come scene by scene; tables and models of one scene are kept.
         if self._scene is None or self._scene.folder != folder:
-            self._scene = _Scene.read(folder)
-            models = BopModels.find(folder)
-            if self._models != models:
-                self._models, self._known = models, {}
+            self._scene = _Scene(folder)  # kept, as photos come scene by scene
         scene = self._scene
         image = _image(folder, ("rgb", "gray"), key)
         camera, depth_scale = scene.camera(key, image)
@@ -205,7 +191,9 @@ class Bop(PhotoDataset):
 
         def read_object(number: int, entry: Any) -> PhotoObject:
             pose: ScenePose = convert(entry, ScenePose)
-            model, symmetry = self._model(pose.obj_id)
+            model, symmetry = None, Symmetry.none()
+            if scene.models is not None:
+                model, symmetry = scene.models.model(pose.obj_id)
             alignment, box = pose.alignment(), None
             if model is not None and model.bounds is not None:
                 box = Box.from_model(model.bounds, alignment)
@@ -234,14 +222,6 @@ class Bop(PhotoDataset):
         if isinstance(read_json(path), list):
             raise self.other_poses(path, f"give a CSV file of results, or one as {TRUTH}")
         return _Poses(path, read_scene_gt(path), self)
-
-    def _model(self, obj_id: int) -> tuple[CadModel | None, Symmetry]:
-        """A model and its symmetries, read once while photos have the same models."""
-        if self._models is None:
-            return None, Symmetry.none()
-        if obj_id not in self._known:
-            self._known[obj_id] = self._models.model(obj_id)
-        return self._known[obj_id]
 
 
 def find_scenes(folder: Path) -> Iterator[Path]:
@@ -347,8 +327,7 @@ def write_scene(folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[st
             what = "BOP's camera files have no place for lens distortion"
             raise InputError(what, where=f"views[{number}].camera", fix=fix)
         table[image] = {"cam_K": camera.matrix.ravel().tolist(), "depth_scale": 1.0}
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    made_folder(folder)
     write_json(folder / _CAMERAS, table)
     write_scene_gt(folder / TRUTH, poses)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,7 +36,7 @@ from cadalign.io.documents import (
     read_json,
     within,
 )
-from cadalign.io.files import read_text, write_json, write_text, writing
+from cadalign.io.files import made_folder, read_text, write_json, write_text
 from cadalign.io.meshes.write import write_ply_mesh
 
 TRUTH = "scene_gt.json"
@@ -254,41 +254,43 @@ class ModelInfo(ForeignDocument):
         return np.array([corner, corner + np.array(size, dtype=float)])
 
 
-@dataclass(frozen=True)
 class BopModels:
-    """The models' folder of a data set."""
+    """The CAD models of a data set: a folder of ``obj_000001.ply`` and ``models_info.json``.
 
-    folder: Path  # the folder of ``obj_000001.ply`` and ``models_info.json``
-    info: dict[str, Any]
-    """The parsed entries of ``models_info.json`` by the models' ids; empty where it is missing."""
+    Raises DataError if ``models_info.json`` cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._path = folder, folder / _MODELS_INFO
+        self._info: dict[str, Any] = {}
+        with in_file(self._path):
+            if self._path.is_file():
+                self._info = convert(read_json(self._path), dict[str, Any])
+        self._known: dict[int, tuple[CadModel, Symmetry]] = {}
 
     @classmethod
     def find(cls, scene: Path) -> BopModels | None:
-        """Find the models of a scene: beside it, or in one of the three folders above it.
-
-        Raises DataError if ``models_info.json`` cannot be read.
-        """
+        """Find the models of a scene: beside it, or in one of the three folders above it."""
         places = (scene, *scene.parents[:_LEVELS])
         folders = (place / name for place in places for name in _MODEL_FOLDERS)
         folder = next(filter(Path.is_dir, folders), None)
-        if folder is None:
-            return None
-        path = folder / _MODELS_INFO
-        with in_file(path):
-            return cls(folder, convert(read_json(path), dict[str, Any]) if path.is_file() else {})
+        return None if folder is None else cls(folder)
 
     def model(self, obj_id: int) -> tuple[CadModel, Symmetry]:
         """The CAD model of an id, its mesh None where the file is missing, and its symmetries.
 
         Raises DataError if a motion is not rigid, or an axis has no direction.
         """
-        name = object_name(obj_id)
-        with in_file(self.folder / _MODELS_INFO):
-            info: ModelInfo = convert(self.info.get(str(obj_id), {}), ModelInfo, str(obj_id))
-            with within(str(obj_id)):
-                symmetry = info.symmetry()
-        mesh = existing(self.folder / f"{name}.ply")
-        return CadModel(name, mesh, bounds=info.bounds(), diameter=info.diameter), symmetry
+        if obj_id not in self._known:
+            name, place = object_name(obj_id), str(obj_id)
+            with in_file(self._path):
+                info: ModelInfo = convert(self._info.get(place, {}), ModelInfo, place)
+                with within(place):
+                    symmetry = info.symmetry()
+            mesh = existing(self._folder / f"{name}.ply")
+            model = CadModel(name, mesh, bounds=info.bounds(), diameter=info.diameter)
+            self._known[obj_id] = model, symmetry
+        return self._known[obj_id]
 
 
 def write_model(folder: Path, mesh: Mesh, number: int) -> dict[str, float]:
@@ -310,8 +312,7 @@ def write_models_info(folder: Path, entries: Mapping[int, dict[str, float]]) -> 
     table = read_json(path) if path.exists() else {}
     if not isinstance(table, dict):
         raise DataError("is not a table of models", where=str(path))
-    with writing(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    made_folder(path.parent)
     write_json(path, table | {str(number): each for number, each in entries.items()})
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -24,6 +25,7 @@ from cadalign.io.files import damaged, read_bytes
 logger = logging.getLogger("cadalign")
 
 T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 _Record = TypeVar("_Record")
 # Warnings of one data set that are logged; `problems` has all.
 _LOGGED = 20
@@ -213,6 +215,20 @@ class PhotoFormat:
 def has(*patterns: str) -> Callable[[Path], bool]:
     """The test whether a folder has a file of one of these patterns."""
     return lambda folder: any(next(folder.glob(pattern), None) is not None for pattern in patterns)
+
+
+@contextmanager
+def leaving_out(name: K, problems: MutableMapping[K, DataError] | None) -> Iterator[None]:
+    """Leave out a record that cannot be read, and keep the reason why in ``problems``.
+
+    Without problems the reason is raised.
+    """
+    try:
+        yield
+    except DataError as error:
+        if problems is None:
+            raise
+        problems[name] = error
 
 
 def read_each(

@@ -16,7 +16,13 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, read_each
+from cadalign.datasets.photos.dataset import (
+    PhotoDataset,
+    PhotoFormat,
+    has,
+    leaving_out,
+    read_each,
+)
 from cadalign.datasets.photos.kitti_keypoints import (
     CARS,
     SIZE,
@@ -42,7 +48,6 @@ _LAYOUTS = (_OBJECT, _TRACKING)
 # The numbers after an object's type: truncated, occluded, alpha, bbox 4, dimensions h w l,
 # location 3, rotation_y; a detector's score may follow.
 _NUMBERS = 14
-_NO_FRAME = -1
 # The car's frame from a model whose y is up: left is -x, rear z, up y.
 _CAR_FROM_Y_UP = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 _MOST_TILT = 10.0  # of a written model's up from the camera's [degrees]
@@ -54,8 +59,8 @@ class KittiLabel:
 
     kind: str  # the object's type, such as "Car"
     numbers: FloatArray  # (14,), what follows the type
-    frame: int | None = None  # the tracking benchmark's first column
-    track: int | None = None  # its second column
+    object_id: str  # the tracking benchmark's second column; elsewhere the line's number from 0
+    frame: int = 0  # the tracking benchmark's first column
 
     @property
     def flags(self) -> frozenset[str]:
@@ -112,114 +117,111 @@ class KittiCars(PhotoDataset):
     ) -> None:
         folder = as_path(root, "root")
         self._categories = frozenset(categories)
-        self._frames: list[KeypointFrame | _LabelFrame] = []
         bad: dict[str, DataError] = {}
-        for found in _list_frames(folder):
-            if isinstance(found, DataError):
-                bad[str(found.where)] = found
-            else:
-                self._frames.append(found)
+        self._frames = list(_list_frames(folder, bad))
         if not self._frames and not bad:
             fix = f"give a folder of {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}"
             raise DataError("no KITTI labels are here", where=str(folder), fix=fix)
         super().__init__(folder, [frame.name for frame in self._frames], bad)
-        self._sequence: tuple[Path, dict[int, list[KittiLabel | DataError]]] | None = None
+        self._sequence: tuple[Path, dict[int, list[KittiLabel]]] | None = None
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         frame = self._frames[index]
         if isinstance(frame, KeypointFrame):
-            return frame.photo(SIZE)
+            return frame.photo()
         image = existing(frame.image)
         camera, shift = None, np.zeros(3)
         if frame.calibration.is_file():
             size = SIZE if image is None else photo_size(image)
             camera, shift = read_projection(frame.calibration, size)
 
-        def read_object(number: int, label: KittiLabel | DataError) -> PhotoObject | None:
-            if isinstance(label, DataError):
-                raise label
+        def read_object(_: int, label: KittiLabel) -> PhotoObject | None:
             if label.kind not in self._categories:
                 return None
             return PhotoObject(
-                object_id=str(number if label.track is None else label.track),
+                object_id=label.object_id,
                 category=label.kind,
                 truth=Truth(box=label.box(shift), metres=1.0),
                 bbox=label.bbox,
                 flags=label.flags,
             )
 
-        objects, problems = read_each(self._labels(frame), read_object, where=str(frame.labels))
+        bad: dict[str, DataError] = {}
+        if frame.frame is None:
+            labels = read_labels(frame.labels, tracking=False, problems=bad)
+        else:
+            labels = self._labels(frame.labels).get(frame.frame, [])
+        objects, problems = read_each(labels, read_object, where=str(frame.labels))
+        problems = (*bad.values(), *problems)
         return Photo(frame.name, image, camera, objects, up=UP, problems=problems)
 
-    def _labels(self, frame: _LabelFrame) -> list[KittiLabel | DataError]:
-        if frame.frame is None:
-            return read_labels(frame.labels, tracking=False)
-        if self._sequence is None or self._sequence[0] != frame.labels:
-            self._sequence = frame.labels, _by_frame(read_labels(frame.labels, tracking=True))
-        return self._sequence[1].get(frame.frame, [])
+    def _labels(self, path: Path) -> dict[int, list[KittiLabel]]:
+        """Labels of a sequence by frame, kept for its other photos."""
+        if self._sequence is None or self._sequence[0] != path:
+            self._sequence = path, _by_frame(path, {})
+        return self._sequence[1]
 
 
-def _list_frames(root: Path) -> Iterator[KeypointFrame | _LabelFrame | DataError]:
-    """List the photos of all layouts; what cannot be read is the reason why."""
+def _list_frames(
+    root: Path, problems: dict[str, DataError]
+) -> Iterator[KeypointFrame | _LabelFrame]:
+    """List the photos of all layouts; ``problems`` gets the reasons why others cannot be read."""
     for name, list_them in ((CARS, list_cars), (TRACKS, list_tracks)):
         if (root / name).is_file():
-            yield from list_them(root / name)
+            with leaving_out(str(root / name), problems):
+                yield from list_them(root / name, problems)
     for (labels, images), place in product(_LAYOUTS, (root, root / "training")):
         for path in sorted((place / labels).glob("*.txt")):
             image, calibration = place / images, place / "calib" / path.name
             if labels == _OBJECT[0]:
                 yield _LabelFrame(path.stem, path, image / f"{path.stem}.png", calibration)
                 continue
-            try:
-                found = _by_frame(read_labels(path, tracking=True))
-            except DataError as error:
-                yield error
-                continue
-            yield from (each for each in found.pop(_NO_FRAME, []) if isinstance(each, DataError))
-            for frame in sorted(found):
+            frames: Iterable[int] = ()
+            with leaving_out(str(path), problems):
+                frames = _by_frame(path, problems)
+            for frame in sorted(frames):
                 name = f"{path.stem}/{frame:06d}"
                 yield _LabelFrame(name, path, image / f"{name}.png", calibration, frame)
 
 
-def _by_frame(labels: Iterable[KittiLabel | DataError]) -> dict[int, list[KittiLabel | DataError]]:
-    """A sequence's labels by frame; lines that could not be read are those of frame -1."""
-    found: dict[int, list[KittiLabel | DataError]] = defaultdict(list)
-    for label in labels:
-        frame = label.frame if isinstance(label, KittiLabel) else None
-        found[_NO_FRAME if frame is None else frame].append(label)
+def _by_frame(path: Path, problems: dict[str, DataError]) -> dict[int, list[KittiLabel]]:
+    """Labels of a sequence by frame."""
+    found: dict[int, list[KittiLabel]] = defaultdict(list)
+    for label in read_labels(path, tracking=True, problems=problems):
+        found[label.frame].append(label)
     return found
 
 
-def read_labels(path: Path, *, tracking: bool) -> list[KittiLabel | DataError]:
-    """Read a label file; a bad line is the reason why, in its place.
+def read_labels(
+    path: Path, *, tracking: bool, problems: dict[str, DataError] | None = None
+) -> list[KittiLabel]:
+    """Read a label file; for ``tracking``, frame and track come before the type.
 
-    Where it is for ``tracking``, frame and track come before the type. Raises DataError if the file
-    cannot be read.
+    ``problems`` gets the reasons why lines cannot be read, by their places; without it, the first
+    is raised. Raises DataError if the file cannot be read.
     """
-    lines = read_text(path).splitlines()
-    found: list[KittiLabel | DataError] = []
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            try:
-                found.append(_label(line.split(), tracking=tracking))
-            except InputError as error:
-                found.append(DataError(error.what, where=f"{path}, line {number}"))
+    lines = enumerate(read_text(path).splitlines(), start=1)
+    found: list[KittiLabel] = []
+    for row, (number, line) in enumerate(each for each in lines if each[1].strip()):
+        place = f"{path}, line {number}"
+        with leaving_out(place, problems), in_file(place):
+            found.append(_label(line.split(), row, tracking=tracking))
     return found
 
 
-def _label(fields: list[str], *, tracking: bool) -> KittiLabel:
+def _label(fields: list[str], row: int, *, tracking: bool) -> KittiLabel:
     skipped = 2 if tracking else 0
     if len(fields) not in (skipped + 1 + _NUMBERS, skipped + 2 + _NUMBERS):
         raise InputError(f"{len(fields)} columns, expected {skipped + 1 + _NUMBERS}")
     try:
         numbers = np.array(fields[skipped + 1 : skipped + 1 + _NUMBERS], dtype=np.float64)
-        frame, track = map(int, fields[:2]) if tracking else (None, None)
+        frame, object_id = map(int, fields[:2]) if tracking else (0, row)
     except ValueError:
         raise InputError(f"{quote(' '.join(fields))} are not a label's numbers") from None
     if not np.isfinite(numbers).all():
         raise InputError("some of its numbers are not finite")
-    return KittiLabel(fields[skipped], numbers, frame, track)
+    return KittiLabel(fields[skipped], numbers, str(object_id), frame)
 
 
 def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArray]:
@@ -228,23 +230,21 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
     The shift is added to the reference camera's coordinates, in which locations are given, to get
     this camera's. Raises DataError if the file cannot be read, or holds no valid P2.
     """
-    lines = read_text(path).splitlines()
-    for line in lines:
-        name, _, rest = line.partition(" ")
-        if name.rstrip(":") != "P2":
-            continue
-        try:
-            matrix = np.array(rest.split(), dtype=np.float64).reshape(3, 4)
-        except ValueError:
-            raise damaged("P2 is not a 3 x 4 matrix", path) from None
-        k = matrix[:, :3]
-        with in_file(f"{path}: P2"):
-            camera = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-        try:
-            return camera, np.asarray(np.linalg.solve(k, matrix[:, 3]))
-        except np.linalg.LinAlgError:
-            raise damaged("P2 is not the matrix of a camera", path) from None
-    raise damaged("there is no line P2", path)
+    lines = (line.partition(" ") for line in read_text(path).splitlines())
+    found = next((rest for name, _, rest in lines if name.rstrip(":") == "P2"), None)
+    if found is None:
+        raise damaged("there is no line P2", path)
+    try:
+        matrix = np.array(found.split(), dtype=np.float64).reshape(3, 4)
+    except ValueError:
+        raise damaged("P2 is not a 3 x 4 matrix", path) from None
+    k = matrix[:, :3]
+    with in_file(f"{path}: P2"):
+        camera = Camera(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+    try:
+        return camera, np.asarray(np.linalg.solve(k, matrix[:, 3]))
+    except np.linalg.LinAlgError:
+        raise damaged("P2 is not the matrix of a camera", path) from None
 
 
 def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:

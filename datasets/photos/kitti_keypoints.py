@@ -16,7 +16,7 @@ from msgspec import Raw
 
 from cadalign.arrays import FloatArray, read_only
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
-from cadalign.datasets.photos.dataset import parse, read_list, read_table
+from cadalign.datasets.photos.dataset import leaving_out, parse, read_list, read_table
 from cadalign.datasets.photos.photo import (
     CadModel,
     NamedPoints,
@@ -27,6 +27,7 @@ from cadalign.datasets.photos.photo import (
     existing,
 )
 from cadalign.datasets.photos.placed import LEVEL_UP
+from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -43,7 +44,6 @@ from cadalign.io.documents import (
     in_file,
     within,
 )
-from cadalign.io.files import damaged, read_text
 from cadalign.io.images import photo_size
 from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.model import ShapeModel
@@ -126,29 +126,26 @@ class KeypointFrame:
     model: MeanCar | None = None  # the part of ``car_tracks.json`` for all frames
     track: _Track | None = None  # and for the frames of one car
 
-    def photo(self, size: tuple[int, int]) -> Photo:
-        """Read the entry; ``size`` is that of photos that are not there.
-
-        Raises DataError if the entry is bad.
-        """
+    def photo(self) -> Photo:
+        """Read the entry; raises DataError if it is bad."""
         with in_file(self.path), within(self.place):
             if self.track is None or self.model is None:
-                return self._photo_of_car(convert(self.entry, _Car), size)
+                return self._photo_of_car(convert(self.entry, _Car))
             frame, track = convert(self.entry, _Frame), self.track
             names = tuple(self.model.names)
             points = NamedPoints(names, np.array(self.model.model_xyz).reshape(-1, 3))
             marked = _marked(frame.uv, names, frame.score)
             found = _object(str(track.track), frame, track.dims_hwl, points, marked)
-            return Photo(self.name, None, _camera(track.K, size), (found,), up=UP)
+            return Photo(self.name, None, _camera(track.K), (found,), up=UP)
 
-    def _photo_of_car(self, car: _Car, size: tuple[int, int]) -> Photo:
+    def _photo_of_car(self, car: _Car) -> Photo:
         names = tuple(each.name for each in car.keypoints)
         if len(set(names)) != len(names):
             raise InputError("a name occurs twice", where="keypoints")
         points = NamedPoints(names, np.array([each.xyz for each in car.keypoints]).reshape(-1, 3))
         scores = [each.score for each in car.keypoints if each.score is not None]
         image = existing(self.path.parent / car.image)
-        camera = _camera(car.K, size if image is None else photo_size(image))
+        camera = _camera(car.K, SIZE if image is None else photo_size(image))
         marked = _marked([each.uv for each in car.keypoints], names, scores or None)
         found = _object("0", car, car.dims_hwl, points, marked)
         return Photo(self.name, image, camera, (found,), up=UP)
@@ -184,45 +181,35 @@ def yaw_of_car(rotation: FloatArray) -> float:
     return float(np.arctan2(-forward[2], forward[0]))
 
 
-def list_cars(path: Path) -> Iterator[KeypointFrame | DataError]:
-    """List the cars of ``cars.json``; a file that cannot be read is the reason why."""
-    try:
-        entries = read_list(path)
-    except DataError as error:
-        yield error
-        return
-    for number, raw in enumerate(entries):
+def list_cars(path: Path, problems: dict[str, DataError] | None = None) -> Iterator[KeypointFrame]:
+    """List the cars of ``cars.json``.
+
+    ``problems`` gets the reasons why entries cannot be read, by their places; without it, the first
+    is raised. Raises DataError if the file cannot be read.
+    """
+    for number, raw in enumerate(read_list(path)):
         place = f"[{number}]"
-        try:
+        with leaving_out(f"{path}: {place}", problems):
             entry = parse(raw, Any, path=path, where=place)
-        except DataError as error:
-            yield error
-            continue
-        image = entry.get("image") if isinstance(entry, dict) else None
-        stem = Path(image).stem if isinstance(image, str) and "\0" not in image else str(number)
-        yield KeypointFrame(f"{stem}#{number}", path, place, entry)
+            image = entry.get("image") if isinstance(entry, dict) else None
+            is_name = isinstance(image, str) and "\0" not in image
+            stem = Path(image).stem if is_name else str(number)
+            yield KeypointFrame(f"{stem}#{number}", path, place, entry)
 
 
-def list_tracks(path: Path) -> Iterator[KeypointFrame | DataError]:
-    """List the frames of ``car_tracks.json``; what cannot be read is the reason why."""
-    try:
-        table = read_table(path)
-        model = _mean_car(path, table)
-        tracks = _part(path, table, "tracks", list[Any])
-    except DataError as error:
-        yield error
-        return
-    for number, entry in enumerate(tracks):
+def list_tracks(
+    path: Path, problems: dict[str, DataError] | None = None
+) -> Iterator[KeypointFrame]:
+    """List the frames of ``car_tracks.json``; see `list_cars`."""
+    table = read_table(path)
+    model = _mean_car(path, table)
+    for number, entry in enumerate(_part(path, table, "tracks", list[Any])):
         place = f"tracks[{number}]"
-        try:
-            with in_file(path):
-                track = convert(entry, _Track, place)
-        except DataError as error:
-            yield error
-            continue
-        for row, frame in enumerate(track.frames):
-            name = f"{track.sequence}/track {track.track}/{row}"
-            yield KeypointFrame(name, path, f"{place}.frames[{row}]", frame, model, track)
+        with leaving_out(f"{path}: {place}", problems), in_file(path):
+            track: _Track = convert(entry, _Track, place)
+            for row, frame in enumerate(track.frames):
+                name = f"{track.sequence}/track {track.track}/{row}"
+                yield KeypointFrame(name, path, f"{place}.frames[{row}]", frame, model, track)
 
 
 def read_track_keypoints(path: Path) -> list[ImageKeypoints]:
@@ -234,8 +221,6 @@ def read_track_keypoints(path: Path) -> list[ImageKeypoints]:
     """
     found = []
     for each in list_tracks(path):
-        if isinstance(each, DataError):
-            raise each
         assert each.track is not None
         assert each.model is not None
         with in_file(path), within(each.place):
@@ -248,7 +233,7 @@ def read_track_keypoints(path: Path) -> list[ImageKeypoints]:
             size=SIZE,
             source=f"{path}: {each.place}",
             track=str(each.track.track),
-            camera=_camera(each.track.K, SIZE),
+            camera=_camera(each.track.K),
         )
         found.append(keypoints)
     if not found:
@@ -269,7 +254,7 @@ def car_bounds(points: FloatArray) -> FloatArray:
     return np.array([center - _MEAN_CAR / 2, center + _MEAN_CAR / 2])
 
 
-def _camera(k: _Matrix, size: tuple[int, int]) -> Camera:
+def _camera(k: _Matrix, size: tuple[int, int] = SIZE) -> Camera:
     return Camera(*size, k[0][0], k[1][1], k[0][2], k[1][2])
 
 
@@ -305,12 +290,12 @@ def car_shape(folder: Path) -> ShapeModel | None:
         return None
     car = _mean_car(paths[0], read_table(paths[0]))
     points = np.array(car.model_xyz, dtype=float).reshape(-1, 3)
-    _check_lengths(points, paths[0])
-    mean = _numbers(paths[1], len(points) * 3).reshape(-1, 3)
-    if len(mean) != len(points):
-        what = f"{len(mean)} points, but {paths[0].name} has {len(points)}"
-        raise DataError(what, where=str(paths[1]))
-    modes = _numbers(paths[2], len(points) * 3).reshape(-1, len(points), 3)
+    mean = read_matrix(paths[1], points.shape)
+    modes = read_matrix(paths[2], (None, points.size)).reshape(-1, *points.shape)
+    for path, lengths in zip(paths, (points, mean, modes), strict=True):
+        if not (np.abs(lengths) < _LONGEST).all():  # whose squares are not finite
+            what = f"some of its numbers are beyond {_LONGEST:.0e}"
+            raise DataError(what, where=str(path))
     box = car_bounds(points)
     metres, *_ = np.linalg.lstsq(mean - mean.mean(axis=0), points - points.mean(axis=0), rcond=None)
     return ShapeModel.from_basis(
@@ -368,23 +353,3 @@ def _mean_car(path: Path, table: dict[str, Raw]) -> MeanCar:
 
 def _part(path: Path, table: dict[str, Raw], name: str, kind: Any) -> Any:
     return parse(table.get(name, Raw(b"null")), kind, path=path, where=name)
-
-
-def _numbers(path: Path, multiple: int) -> FloatArray:
-    text = read_text(path)
-    try:
-        values = np.array(text.split(), dtype=np.float64)
-    except ValueError:
-        raise damaged("not a table of numbers", path) from None
-    if not len(values) or len(values) % multiple:
-        what = f"{len(values)} numbers are not a multiple of {multiple}"
-        raise DataError(what, where=str(path))
-    _check_lengths(values, path)
-    return values
-
-
-def _check_lengths(values: FloatArray, path: Path) -> None:
-    """Refuse numbers that are no lengths of cars: not finite, or so large that squares are not."""
-    if not (np.abs(values) < _LONGEST).all():
-        what = f"some of its numbers are not finite, or beyond {_LONGEST:.0e}"
-        raise DataError(what, where=str(path))

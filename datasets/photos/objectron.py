@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, read_each
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, leaving_out, read_each
 from cadalign.datasets.photos.objectron_files import (
     ArCamera,
     ObjectronAnnotation,
@@ -117,16 +117,14 @@ class Objectron(PhotoDataset):
             fix = "give the folder of Objectron's annotations"
             raise DataError("there are no annotation files (.pbdata)", where=str(folder), fix=fix)
         self._frames: list[tuple[Path, int]] = []
-        names, bad = [], {}
+        names: list[str] = []
+        bad: dict[str, DataError] = {}
         for path in paths:
-            try:
-                count = len(read_sequence(path).frames)
-            except DataError as error:
-                bad[str(path)] = error
-                continue
             stem = path.relative_to(folder).with_suffix("").as_posix()
-            self._frames += [(path, number) for number in range(count)]
-            names += [f"{stem}/{number}" for number in range(count)]
+            with leaving_out(str(path), bad):
+                count = len(read_sequence(path).frames)
+                self._frames += [(path, number) for number in range(count)]
+                names += [f"{stem}/{number}" for number in range(count)]
         if not names and not bad:
             raise DataError("the annotation files have no frames", where=str(folder))
         super().__init__(folder, names, bad)

@@ -6,7 +6,6 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,12 +13,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
+from cadalign.datasets.photos.photo import NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import made_folder, write_json, writing
 from cadalign.io.images import open_photo, write_image
 from cadalign.io.meshes.write import write_obj_mesh
 
@@ -32,63 +30,37 @@ _LEAST = 0.9  # of the cosine between an axis and up that another axis is taken
 _Entry = TypeVar("_Entry")
 
 
-@dataclass(frozen=True, eq=False)
 class PlacedObject:
     """An object of a photo whose camera, pose and model are known.
 
     Raises InputError if the photo has no camera, or the object no pose or no model.
     """
 
-    photo: Photo
-    found: PhotoObject
-
-    def __post_init__(self) -> None:
-        missing = None
-        if self.found.truth.cam_from_model is None:
-            missing = "pose with all scales"
-        elif self.found.model is None:
-            missing = "CAD model"
-        if missing:
-            what = f"object {self.found.object_id} has no {missing}, which a data set needs"
-            raise InputError(what, where=self.photo.name)
-        self.camera.require_focal()
-
-    @property
-    def camera(self) -> Camera:
+    def __init__(self, photo: Photo, found: PhotoObject) -> None:
+        aligned, model = found.truth.cam_from_model, found.model
+        if aligned is None or model is None:
+            missing = "pose with all scales" if aligned is None else "CAD model"
+            what = f"object {found.object_id} has no {missing}, which a data set needs"
+            raise InputError(what, where=photo.name)
+        metres = found.truth.metres or 1.0
+        marks = found.keypoints
+        up = np.array(LEVEL_UP) if photo.up is None else photo.up
+        self.photo, self.found, self.model = photo, found, model
+        self.camera = found.truth.camera or photo.known_camera
         """The camera that the pose fits the photo with."""
-        return self.found.truth.camera or self.photo.known_camera
-
-    @property
-    def model(self) -> CadModel:
-        """The CAD model."""
-        assert self.found.model is not None
-        return self.found.model
-
-    @property
-    def category(self) -> str:
+        self.camera.require_focal()
+        self.category = _file_name(found.category)
         """The category as the name of a folder."""
-        return _file_name(self.found.category)
-
-    @property
-    def model_id(self) -> str:
+        self.model_id = _file_name(model.model_id)
         """The model's id as the name of a folder."""
-        return _file_name(self.model.model_id)
-
-    @property
-    def _aligned(self) -> Alignment:
-        assert self.found.truth.cam_from_model is not None
-        return self.found.truth.cam_from_model
-
-    @property
-    def pose(self) -> Alignment:
+        self.pose = Alignment(aligned.rotation, aligned.translation * metres, np.ones(3))
         """The pose of the stretched model, without stretch [m]."""
-        shift = self._aligned.translation * (self.found.truth.metres or 1.0)
-        return Alignment(self._aligned.rotation, shift, np.ones(3))
-
-    @property
-    def scale(self) -> FloatArray:
+        self.scale: FloatArray = aligned.scale * metres
         """Metres per model unit along the model's axes, (3,) float."""
-        return self._aligned.scale * (self.found.truth.metres or 1.0)
+        self.marked = dict(zip(marks.names, marks.points_2d, strict=True)) if marks else {}
+        """The pixels (2,) of the marked keypoints by their names."""
+        self.up: FloatArray = up / np.linalg.norm(up)
+        """The direction in the camera that is up in the scene, of length 1."""
 
     @cached_property
     def keypoints(self) -> NamedPoints:
@@ -107,12 +79,6 @@ class PlacedObject:
         return self.keypoints.xyz * self.scale
 
     @property
-    def marked(self) -> dict[str, FloatArray]:
-        """The pixels (2,) of the marked keypoints by their names."""
-        marks = self.found.keypoints
-        return {} if marks is None else dict(zip(marks.names, marks.points_2d, strict=True))
-
-    @property
     def bounds(self) -> FloatArray:
         """Lowest and highest coordinates of the model before the stretch, (2, 3) float."""
         return self.mesh.bounds if self.model.bounds is None else self.model.bounds
@@ -127,12 +93,6 @@ class PlacedObject:
         """The centre of the model's box in the camera, (3,) float [m]."""
         middle: FloatArray = self.bounds.mean(axis=0) * self.scale
         return np.asarray(self.pose.apply(middle[None])[0])
-
-    @property
-    def up(self) -> FloatArray:
-        """The direction in the camera that is up in the scene, of length 1."""
-        up = np.array(LEVEL_UP) if self.photo.up is None else self.photo.up
-        return np.asarray(up / np.linalg.norm(up))
 
     @cached_property
     def mesh(self) -> Mesh:
@@ -165,8 +125,7 @@ class PlacedObject:
 
     def copy_image(self, stem: Path) -> Path:
         """Copy the photo, upright; a file that is so already is copied as it is."""
-        with writing(stem):
-            stem.parent.mkdir(parents=True, exist_ok=True)
+        made_folder(stem.parent)
         if isinstance(self.photo.image, Path):
             with _left_out(), open_photo(self.photo.image) as image:
                 ending = _COPIED.get(image.format or "")
@@ -186,8 +145,7 @@ class PlacedObject:
         """Write the mask as a PNG, 255 on the object; None without one."""
         if self.found.mask_path is None:
             return None
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+        made_folder(path.parent)
         with _left_out():
             mask = self.found.read_mask()
         write_image(path, np.where(mask, 255, 0).astype(np.uint8))

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from msgspec import Meta, Raw
+from msgspec import Meta
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.categories import name_of_synset
@@ -23,6 +23,7 @@ from cadalign.datasets.photos.dataset import (
     PoseEstimate,
     PoseFile,
     has,
+    leaving_out,
     parse,
     read_each,
     read_list,
@@ -147,16 +148,14 @@ class Scan2CAD(PhotoDataset):
         below = [folder / name for name in _MODEL_FOLDERS]
         self._models = below if shapenet is None else [as_path(shapenet, "shapenet")]
         self._records: list[tuple[int, ScanNetFrame]] = []  # with the row of the scan
-        names, bad = [], {}
-        for number, entry in enumerate(self._entries):
-            try:
-                scene = self._parse(number, entry, _Head).id_scan
-            except DataError as error:
-                bad[f"[{number}]"] = error
-                continue
-            for frame in list_frames(frames, scene)[::every]:
-                self._records.append((number, frame))
-                names.append(f"{scene}/{frame.frame_id}")
+        names: list[str] = []
+        bad: dict[str, DataError] = {}
+        for number in range(len(self._entries)):
+            with leaving_out(f"[{number}]", bad):
+                scene = self._parse(number, _Head).id_scan
+                for frame in list_frames(frames, scene)[::every]:
+                    self._records.append((number, frame))
+                    names.append(f"{scene}/{frame.frame_id}")
         if not names:
             what = f"no frame of the {len(self._entries) - len(bad)} annotated scans is here"
             fix = "give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)"
@@ -176,7 +175,7 @@ class Scan2CAD(PhotoDataset):
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         row, frame = self._records[index]
-        scan = self._parse(row, self._entries[row], _Scan)
+        scan = self._parse(row, _Scan)
         camera, cam_from_scan = frame.camera(), frame.cam_from_scan()
         cam_from_world = cam_from_scan @ _inverse(scan.trs.alignment())
 
@@ -190,8 +189,8 @@ class Scan2CAD(PhotoDataset):
         up = cam_from_scan.rotation[:, 2]  # scans are upright: z points up
         return Photo(name, frame.image_path, camera, objects, up=up, problems=problems)
 
-    def _parse(self, number: int, entry: Raw, kind: Any) -> Any:
-        return parse(entry, kind, path=self.annotations, where=f"[{number}]")
+    def _parse(self, number: int, kind: Any) -> Any:
+        return parse(self._entries[number], kind, path=self.annotations, where=f"[{number}]")
 
 
 def _object(

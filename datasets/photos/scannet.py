@@ -15,7 +15,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import in_file
-from cadalign.io.files import damaged, read_text, write_text, writing
+from cadalign.io.files import damaged, made_folder, read_text, write_text
 from cadalign.io.images import photo_size
 
 # The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
@@ -110,8 +110,7 @@ def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
 
 def write_matrix(path: Path, matrix: FloatArray) -> None:
     """Write a text file of a matrix, a row on each line; folders above it are made."""
-    with writing(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
+    made_folder(path.parent)
     rows = (" ".join(f"{value:.17g}" for value in row) for row in matrix.tolist())
     write_text(path, "".join(f"{row}\n" for row in rows))
 

@@ -38,10 +38,8 @@ _LEGS = {
     "tapered": (0.0, 0.03, (1.15, 0.7)),
     "splayed": (0.03, 0.1, (1.1, 0.6)),
 }
-_WOODS, _METALS = (
-    palette("966236 ba8650 603c26 cea470 7a4628 462e22"),
-    palette("a8acb2 34363a 787c82"),
-)
+_WOODS = palette("966236 ba8650 603c26 cea470 7a4628 462e22")
+_METALS = palette("a8acb2 34363a 787c82")
 _FABRICS = palette("ac342e 2c5484 46764e d4a03c 784a78 42464e c4baa8 28787e")
 (_DARK,) = palette("26262a")
 _SPOKE_IDS = (10, 11, 12, 13, 14)
@@ -236,10 +234,8 @@ class _Bottle:
 _GREEN, _BROWN, _CLEAR = palette("284a2c 1c3828"), palette("623616"), palette("a8d0e2")
 _AMBER, _MILK = palette("ba7024 c8883c"), palette("eeece2 e2e8ec")
 _PAINT = palette("ce342c 2860a8 ecba34 408c54")
-_CAP_COLORS, _LABELS = (
-    palette("b02428 202228 ceaa54 245296 f0f0ec"),
-    palette("eee6ce f6f6f2 decea0 cedee8"),
-)
+_CAP_COLORS = palette("b02428 202228 ceaa54 245296 f0f0ec")
+_LABELS = palette("eee6ce f6f6f2 decea0 cedee8")
 _STRIPES = palette("981e26 224276 285c3c a88032 302c2e")
 _BOTTLES = (
     _Bottle(0.125, 0.6, 0.72, 0.047, 0.55, "foil", (0.14, 0.46), _GREEN),  # Bordeaux wine

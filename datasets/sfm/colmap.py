@@ -28,7 +28,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.camera_form import COLMAP_PARAMS
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
-from cadalign.io.files import as_path, damaged, read_bytes, read_text, write_text, writing
+from cadalign.io.files import as_path, damaged, made_folder, read_bytes, read_text, write_text
 
 STEMS = ("cameras", "images", "points3D")
 SUFFIXES = (".bin", ".txt")  # COLMAP itself prefers the binary files where both are there
@@ -132,11 +132,8 @@ class Colmap(CorrespondenceSet):
             raise DataError(error.what, where=where, fix=error.fix) from None
 
     def _of_another_model(self, what: str, file: Path, name: str) -> DataError:
-        where, fix = (
-            f"{self.source}, image {brief(name)}",
-            f"does {file.name} belong to the same model?",
-        )
-        return DataError(what, where=where, fix=fix)
+        where = f"{self.source}, image {brief(name)}"
+        return DataError(what, where=where, fix=f"does {file.name} belong to the same model?")
 
 
 def _find_model(root: Path) -> tuple[Path, str]:
@@ -176,9 +173,7 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
         entry = camera.to_dict()
         size = f"{camera.width} {camera.height}"
         cameras.append(f"{camera_id} {entry['model']} {size} {_written(entry['params'])}\n")
-    folder = as_path(folder, "folder")
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    folder = made_folder(as_path(folder, "folder"))
     for stem, lines in zip(STEMS, (cameras, images, ()), strict=True):
         write_text(folder / f"{stem}.txt", "".join(lines))
 

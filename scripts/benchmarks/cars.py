@@ -262,8 +262,8 @@ def car_scenes(folder: Path, sigma: float) -> list[Row]:
     mean = np.array(json.loads((folder / "car_tracks.json").read_text())["model_xyz"])
     frames: dict[int, list[KittiLabel]] = defaultdict(list)
     for label in read_labels(folder / "label_02" / "0010.txt", tracking=True):
-        if isinstance(label, KittiLabel) and label.kind == "Car" and 5 < label.numbers[12] < 35:
-            frames[label.frame or 0].append(label)
+        if label.kind == "Car" and 5 < label.numbers[12] < 35:
+            frames[label.frame].append(label)
     found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for frame, labels in frames.items():
         if 2 <= len(labels) <= 4 and frame % 2 == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from cadalign.datasets.models.annotated_symmetry import annotated_symmetry
 from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
@@ -22,6 +23,19 @@ def test_annotated_quarters_make_a_group_of_four():
         moved = xyz @ motion[:3, :3].T + motion[:3, 3]
         gaps = np.linalg.norm(moved[:, None] - xyz, axis=2)
         np.testing.assert_allclose(gaps.min(axis=1), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_square_is_turned_by_quarters_about_its_own_axis_alone(axis):
+    """Where equivalent keypoints alternate, half a turn is left."""
+    corners = np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
+    xyz = np.roll(corners, (axis + 1) % 3, axis=1) + [[0.1, 0.2, 0.3]]
+    for groups, angles in ((((0, 1, 2, 3),), [90, 180, 270]), (((0, 2), (1, 3)), [180])):
+        symmetries = Symmetries(rotations=tuple(map(RotationalSymmetry, groups)))
+        turns = annotated_symmetry(xyz, symmetries).motions[:, :3, :3]
+        about = turns[np.isclose(turns[:, axis, axis], 1)]
+        cosines = (np.trace(about, axis1=1, axis2=2) - 1) / 2
+        np.testing.assert_allclose(cosines, np.cos(np.radians(angles)), atol=1e-12)
 
 
 def test_a_circle_makes_an_axis():

@@ -15,7 +15,6 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.photos.kitti_keypoints import (
     HIDDEN,
-    SIZE,
     TRACKS,
     KeypointFrame,
     car_shape,
@@ -105,7 +104,7 @@ def recorded_video(
     views, truth = [], []
     rate = options.rate or _KITTI_RATE
     for each in frames:
-        photo = each.photo(SIZE)
+        photo = each.photo()
         (car,) = photo.objects
         assert car.keypoints is not None
         assert car.truth.box is not None
@@ -325,8 +324,6 @@ def recorded_videos(root: Path, options: TracksOptions) -> Videos:
     """The tracks of a folder of KITTI's cars."""
     tracks: dict[tuple[int, int], list[KeypointFrame]] = defaultdict(list)
     for each in list_tracks(root / TRACKS):
-        if isinstance(each, DataError):
-            raise each
         assert each.track is not None
         tracks[each.track.sequence, each.track.track].append(each)
     tasks = [

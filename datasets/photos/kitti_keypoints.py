@@ -192,8 +192,9 @@ def list_cars(path: Path, problems: dict[str, DataError] | None = None) -> Itera
         with leaving_out(f"{path}: {place}", problems):
             entry = parse(raw, Any, path=path, where=place)
             image = entry.get("image") if isinstance(entry, dict) else None
-            is_name = isinstance(image, str) and "\0" not in image
-            stem = Path(image).stem if is_name else str(number)
+            stem = str(number)
+            if isinstance(image, str) and "\0" not in image:
+                stem = Path(image).stem
             yield KeypointFrame(f"{stem}#{number}", path, place, entry)
 
 

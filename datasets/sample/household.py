@@ -20,6 +20,7 @@ from cadalign.datasets.sample.model import (
     mirrored_places,
     palette,
     pick,
+    varied,
 )
 from cadalign.geometry.mesh import Mesh
 
@@ -270,13 +271,9 @@ def bottle(rng: np.random.Generator, index: int) -> Draft:
     of the neck.
     """
     kind, color = _BOTTLES[index % len(_BOTTLES)], pick(rng, _CAP_COLORS)
-    b = replace(
-        kind,
-        radius=kind.radius * rng.uniform(0.9, 1.14),
-        shoulder=kind.shoulder + rng.uniform(-0.03, 0.03),
-        neck=kind.neck + rng.uniform(-0.02, 0.02),
-        neck_radius=kind.neck_radius * rng.uniform(0.92, 1.1),
-    )
+    b = varied(kind, rng, radius=(0.9, 1.14))
+    shoulder, neck = b.shoulder + rng.uniform(-0.03, 0.03), b.neck + rng.uniform(-0.02, 0.02)
+    b = varied(replace(b, shoulder=shoulder, neck=neck), rng, neck_radius=(0.92, 1.1))
     glass, label, stripe = (pick(rng, colors) for colors in (b.glass, _LABELS, _STRIPES))
     cap = np.array(_CAPS[b.cap]) * (b.neck_radius, 1)
     cap[:, 1] = np.maximum(cap[:, 1], b.neck + 0.025)

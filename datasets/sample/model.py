@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,10 @@ import trimesh
 from cadalign.arrays import FloatArray
 from cadalign.geometry.mesh import Mesh, join
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+Kind = TypeVar("Kind", bound="DataclassInstance")
 Color = tuple[int, int, int]
 """Red, green and blue, 0 to 255."""
 Point = tuple[float, float, float]
@@ -36,6 +40,12 @@ def palette(text: str) -> tuple[Color, ...]:
 
 def pick(rng: np.random.Generator, colors: Sequence[Color]) -> Color:
     return colors[int(rng.integers(len(colors)))]
+
+
+def varied(kind: Kind, rng: np.random.Generator, **factors: tuple[float, float]) -> Kind:
+    """A kind with some of its measures drawn anew: between two factors of what they were."""
+    drawn = {name: getattr(kind, name) * rng.uniform(*two) for name, two in factors.items()}
+    return replace(kind, **drawn)
 
 
 def part(vertices: npt.ArrayLike, faces: npt.ArrayLike, color: Color) -> Mesh:
@@ -232,10 +242,7 @@ def finish(draft: Draft, *, category: str, model_id: str, offset: FloatArray) ->
     The centre of the bounding box comes to ``offset`` (3,).
     """
     whole = split_creases(join(draft.parts, f"{category} {model_id}"))
-    center, diagonal = (
-        whole.bounds.mean(axis=0),
-        float(np.linalg.norm(np.ptp(whole.bounds, axis=0))),
-    )
+    center, diagonal = whole.bounds.mean(axis=0), np.linalg.norm(np.ptp(whole.bounds, axis=0))
     # The file holds single precision: the mesh and what is computed from it agree with that.
     scaled = ((whole.vertices - center) / diagonal + offset).astype(np.float32).astype(np.float64)
     faces = whole.faces[_areas(scaled[whole.faces]) > _TINY_AREA]  # rounding flattens some
@@ -248,8 +255,8 @@ def finish(draft: Draft, *, category: str, model_id: str, offset: FloatArray) ->
         xyz = weights @ mesh.triangles[face]
         vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
         keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights, vertex))
-    symmetries = draft.mirrored, draft.turned, draft.round
-    return SampleModel(category, model_id, mesh, tuple(keypoints), *symmetries)
+    kept = draft.mirrored, draft.turned, draft.round
+    return SampleModel(category, model_id, mesh, tuple(keypoints), *kept)
 
 
 def split_creases(mesh: Mesh) -> Mesh:

@@ -25,6 +25,7 @@ from cadalign.datasets.sample.model import (
     pick,
     rectangle,
     stack,
+    varied,
 )
 from cadalign.geometry.mesh import Mesh
 
@@ -101,11 +102,9 @@ def car(rng: np.random.Generator, index: int) -> Draft:
     """
     kind = _CARS[index % len(_CARS)]
     shift = rng.uniform(-0.012, 0.012)
+    c = varied(kind, rng, length=(0.92, 1.08), width=(0.95, 1.05), height=(0.96, 1.06))
     c = replace(
-        kind,
-        length=kind.length * rng.uniform(0.92, 1.08),
-        width=kind.width * rng.uniform(0.95, 1.05),
-        height=kind.height * rng.uniform(0.96, 1.06),
+        c,
         shoulder=rng.uniform(0.12, 0.2),
         cowl=kind.cowl + shift,
         roof=(kind.roof[0] + shift, kind.roof[1]),
@@ -168,11 +167,11 @@ def _wheel(c: _Car, axle: float) -> list[Mesh]:
     rim = reach * np.stack([np.cos(angle), np.sin(angle)], axis=1) + (c.wheel, 0)
     outline = np.concatenate([rim, [[c.sill, 0]], rim[:0:-1] * (1, -1)]) + (0, axle)
     arch = loft([np.insert(outline, 0, c.width / 2 + x, axis=1) for x in (-0.2, 0.004)], _DARK)
-    profiles = ((np.array(_TYRE), _DARK), (np.array(_DISC), _RIM))
-    return [
-        arch,
-        *(lathe(p * (c.wheel, 1), tint, center=hub, sideways=True) for p, tint in profiles),
+    turned = [
+        lathe(np.multiply(profile, (c.wheel, 1)), tint, center=hub, sideways=True)
+        for profile, tint in ((_TYRE, _DARK), (_DISC, _RIM))
     ]
+    return [arch, *turned]
 
 
 def _glass_house(c: _Car) -> list[Mesh]:
@@ -288,16 +287,9 @@ def vessel(rng: np.random.Generator, index: int) -> Draft:
     """
     turn, number = divmod(index, len(_VESSELS))
     kind, load = _VESSELS[number]
-    v = replace(
-        kind,
-        beam=kind.beam * rng.uniform(0.92, 1.08),
-        freeboard=kind.freeboard * rng.uniform(0.88, 1.12),
-        stern_width=kind.stern_width * rng.uniform(0.85, 1.08),
-        tall=rng.uniform(0.92, 1.1),
-        variant=turn % 3,
-        bottom=pick(rng, _BOTTOMS),
-        accent=pick(rng, _ACCENTS),
-    )
+    sizes = {"beam": (0.92, 1.08), "freeboard": (0.88, 1.12), "stern_width": (0.85, 1.08)}
+    v = varied(kind, rng, **sizes, tall=(0.92, 1.1))
+    v = replace(v, variant=turn % 3, bottom=pick(rng, _BOTTOMS), accent=pick(rng, _ACCENTS))
     side = _SIDES[(number + turn + int(rng.integers(2))) % len(_SIDES)]
     above, roof, tips = _above(v)
     (bow, stern), (top, width, front, rear) = v.ends(v.water), roof

@@ -31,7 +31,7 @@ from cadalign.datasets import load_mesh
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.align import align
 from cadalign.estimation.contours.proposals import align_outline
-from cadalign.estimation.contours.silhouettes import Whitened, outline_of, outline_of_mask, overlaps
+from cadalign.estimation.contours.silhouettes import FacedMask, Whitened, outline_of, overlaps
 from cadalign.estimation.contours.view_contour import cost_of_contour
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
@@ -100,7 +100,7 @@ def rank_by_mask(
         raise InputError(what, where="camera", fix=f"{fix}, or keypoints")
     inside = np.asarray(View(camera, mask=mask).mask_image) >= 0.5
     rows = chosen_models(table, options.category, exclude).tolist()
-    query = outline_of_mask(inside, camera)
+    query = FacedMask.of(inside, camera).outline
     overlapping = [
         (-float(overlaps(outline, query).max()), row)
         for row, outline in zip(rows, outlines.of(rows, workers), strict=True)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple, cast
 
 import cv2
@@ -20,7 +19,7 @@ from cadalign.estimation.contours.measured import (
     weakest_steps,
     with_displacement_modes,
 )
-from cadalign.estimation.contours.surface import Surface, surfaces_of
+from cadalign.estimation.contours.surface import Surface, SurfaceChoice, surfaces_of
 from cadalign.estimation.contours.view_contour import ViewContour, contour_view, cost_of_contour
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
@@ -125,68 +124,36 @@ def fit_masks(
     Raises InputError if a mask has no contour, or the model has no mesh; DegenerateError if there
     is no estimate without the masks and no rim near them.
     """
-    contours = [
+    used = [
         contour_view(number, view, f"views[{number}].mask", minima[0].lenses.cameras[number])
         for number, view in enumerate(views)
         if view.mask_image is not None
     ]
-    keypoints = len(prior.ids)
-    first = minima[0]
-    where = f"views[{contours[0].image}].mask"
-    surfaces, convex = surfaces_of(model, first.points[:keypoints], where)
-    is_open = first.track is None and not _is_determined(first)
-    likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
-    most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
-    used, left_out, warnings = list(contours), [], []
-    starts = [(each, each.state) for each in likely[:most]]
-    # Proposals lie near their ends, and some of these may explain no more than a part.
-    is_proposed = first.outline_score is not None and surfaces[0].is_exact
-    cost = _outline_cost if is_proposed else _misfit
-    explore = partial(_explored, starts, keypoints, is_wide=is_open and not is_proposed, cost=cost)
+    where = f"views[{used[0].image}].mask"
+    choice = surfaces_of(model, minima[0].points[: len(prior.ids)], where)
+    search = _Search.of(minima, len(prior.ids), choice)
+    left_out, warnings = [], []
     best: list[_Candidate] = []
     while used:
-        best = explore(used, surfaces)
-        if not convex and not is_open and first.track is None:
-            agrees = bool(best) and _misfit(best[0].settled) <= _AGREEING
-            if not agrees or best[0].masked.surface.is_exact:
-                others = _displaced(first, _POORLY_KNOWN if agrees else _WELL_KNOWN)
-                displaced = _explored(
-                    others, keypoints, used, surfaces, is_wide=False, cost=_misfit
-                )
-                best = sorted([*best, *displaced], key=lambda each: _misfit(each.settled))
-        hulls = [_hull_contour(each, views[each.image]) for each in used] if convex else []
-        known = [each for each in hulls if each is not None]
-        if known and len(known) == len(used):
-            by_hulls = explore(known, convex)
-            # Hulls that agree so much better: the rest of the outline is another object's.
-            if by_hulls and (
-                not best or _misfit(by_hulls[0].settled) < _HULL_GAIN * _misfit(best[0].settled)
-            ):
-                best, used = by_hulls, known
-        best = _finished(best)
-        if is_proposed and best:
-            correlation = best[0].settled.noises[0].correlation
-            scored = [each.scored_by_outline(correlation) for each in best]
-            best = sorted(scored, key=lambda each: each.score)
+        best, used = search.best(used, views)
         wrong = _contradicting(best, used)
         if wrong is None:
             break
         contour, reason = wrong
-        if len(used) == 1 and is_open:
+        where = f"views[{contour.image}].mask"
+        if len(used) == 1 and search.is_open:
             if not best:
                 raise DegenerateError(
                     "no part of the model's outline comes near its contour",
-                    where=f"views[{contour.image}].mask",
+                    where=where,
                     fix="give an init that shows the model near the mask, or keypoints",
                 )
-            warnings.append(f"views[{contour.image}].mask: {reason}")
+            warnings.append(f"{where}: {reason}")
             break
-        warnings.append(
-            f"views[{contour.image}].mask contradicts the rest and is left out: "
-            f"{reason}{_off_mask(views[contour.image])}"
-        )
+        off = _off_mask(views[contour.image])
+        warnings.append(f"{where} contradicts the rest and is left out: {reason}{off}")
         left_out.append(contour)
-        used.remove(contour)
+        used = [each for each in used if each is not contour]
     fits = best[0].settled.fits if used else ()
     residuals: list[MaskResiduals | None] = [None] * len(views)
     for contour, fit in [*zip(used, fits, strict=True), *((each, None) for each in left_out)]:
@@ -200,6 +167,88 @@ def fit_masks(
     ]
     found = [each.minimum for each in best] if used else list(minima)
     return Refined(found, summaries, warnings, tuple(residuals))
+
+
+class _Search(NamedTuple):
+    """Minima without masks, and the surfaces that are brought to the masks' contours from there.
+
+    The search ``is_open`` where nothing but the masks determines the estimate. The minima of an own
+    model and a mask alone are ``proposals``, which lie near their ends; some may explain no more
+    than a part of the contour.
+    """
+
+    starts: list[tuple[Minimum, State]]
+    keypoints: int
+    choice: SurfaceChoice
+    is_open: bool
+    proposals: bool
+
+    @classmethod
+    def of(cls, minima: Sequence[Minimum], keypoints: int, choice: SurfaceChoice) -> _Search:
+        """The search from the likely ones of minima."""
+        first = minima[0]
+        is_open = first.track is None and not _is_determined(first)
+        likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
+        starts = [(each, each.state) for each in likely]
+        most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
+        proposals = first.outline_score is not None and choice.surfaces[0].is_exact
+        return cls(starts[:most], keypoints, choice, is_open, proposals)
+
+    def best(
+        self, contours: list[ViewContour], views: Sequence[View]
+    ) -> tuple[list[_Candidate], list[ViewContour]]:
+        """Candidates, the likeliest first, and the contours, or those of hulls in their place."""
+        if self.proposals:
+            return self._by_outline(contours), contours
+        (surfaces, convex), first = self.choice, self.starts[0][0]
+        best = self._explored(contours, surfaces)
+        if not convex and not self.is_open and first.track is None:
+            agrees = bool(best) and _misfit(best[0].settled) <= _AGREEING
+            if not agrees or best[0].masked.surface.is_exact:
+                others = _displaced(first, _POORLY_KNOWN if agrees else _WELL_KNOWN)
+                best += self._replace(starts=others)._explored(contours, surfaces)
+                best.sort(key=lambda each: _misfit(each.settled))
+        hulls = [_hull_contour(each, views[each.image]) for each in contours] if convex else []
+        known = [each for each in hulls if each is not None]
+        if known and len(known) == len(contours):
+            by_hulls = self._explored(known, convex)
+            # Hulls that agree so much better: the rest of the outline is another object's.
+            if by_hulls and (
+                not best or _misfit(by_hulls[0].settled) < _HULL_GAIN * _misfit(best[0].settled)
+            ):
+                best, contours = by_hulls, known
+        return _finished(best), contours
+
+    def _by_outline(self, contours: list[ViewContour]) -> list[_Candidate]:
+        """Candidates from proposals, by the likelihood of a contour that is theirs in part."""
+        best = _finished(self._explored(contours, self.choice.surfaces))
+        if best:
+            correlation = best[0].settled.noises[0].correlation
+            best = [each.scored_by_outline(correlation) for each in best]
+        return sorted(best, key=lambda each: each.score)
+
+    def _explored(self, contours: list[ViewContour], surfaces: list[Surface]) -> list[_Candidate]:
+        """Every start with the surface of the least cost, the least first.
+
+        Surfaces of a learned shape follow its modes alone: with the keypoints' own displacements a
+        step takes several times as long, and modes distinguish the surfaces.
+        """
+        cost = _outline_cost if self.proposals else _misfit
+        is_wide = self.is_open and not self.proposals
+        found = []
+        for start, state in self.starts:
+            evidence = start.evidence
+            if not len(evidence.shape.modes):
+                evidence, state = with_displacement_modes(evidence, state)
+            tried = []
+            for surface in surfaces:
+                masked = Masked(evidence, self.keypoints, contours, surface)
+                settled = settle(masked, state, is_wide=is_wide)
+                if settled is not None:
+                    tried.append(_Candidate(start, masked, settled))
+            if tried:
+                found.append(min(tried, key=lambda each: cost(each.settled)))
+        return sorted(found, key=lambda each: cost(each.settled))
 
 
 def _is_determined(minimum: Minimum) -> bool:
@@ -221,36 +270,6 @@ def _displaced(start: Minimum, least: float) -> list[tuple[Minimum, State]]:
     if np.abs(place.moved(step).state.log_scales - start.state.log_scales).max() < least:
         return []
     return [(start, place.moved(sigmas * step).state) for sigmas in _DISPLACED]
-
-
-def _explored(
-    starts: Sequence[tuple[Minimum, State]],
-    keypoints: int,
-    contours: list[ViewContour],
-    surfaces: list[Surface],
-    *,
-    is_wide: bool,
-    cost: Callable[[Settled], float],
-) -> list[_Candidate]:
-    """Every start with the surface of the least cost, the least first.
-
-    Surfaces of a learned shape follow its modes alone: with the keypoints' own displacements a step
-    takes several times as long, and modes distinguish the surfaces.
-    """
-    found = []
-    for start, state in starts:
-        evidence = start.evidence
-        if not len(evidence.shape.modes):
-            evidence, state = with_displacement_modes(evidence, state)
-        tried = []
-        for surface in surfaces:
-            masked = Masked(evidence, keypoints, contours, surface)
-            settled = settle(masked, state, is_wide=is_wide)
-            if settled is not None:
-                tried.append(_Candidate(start, masked, settled))
-        if tried:
-            found.append(min(tried, key=lambda each: cost(each.settled)))
-    return sorted(found, key=lambda each: cost(each.settled))
 
 
 def _finished(candidates: list[_Candidate]) -> list[_Candidate]:

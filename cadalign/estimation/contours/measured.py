@@ -150,59 +150,39 @@ class Sought(NamedTuple, Generic[Shown]):
         return camera.with_focal(camera.fx * ratio)
 
     def joined(self, place: Place, rows: Sequence[Measured]) -> Joined:
-        """The evidence with what was measured at a place."""
-        return Joined.of(self.evidence, self.keypoints, rows, place)
+        """The evidence with what was measured at a place; contours' own modes are the last ones."""
+        state, first, count = place.state, self.keypoints, sum(len(each.mean) for each in rows)
+        full = state._replace(
+            coefficients=np.concatenate([state.coefficients, place.own.ravel()]),
+            displacements=np.insert(state.displacements, [first] * count, 0.0, axis=0),
+        )
+        evidence = _with_measured(self.evidence, first, rows, count, place.own.size)
+        return Joined(evidence, full, place, slice(first, first + count))
 
 
 class Joined(NamedTuple):
     """Evidence with what was measured at points of a surface.
 
-    The ``state`` of this evidence is that of the ``place``, with ``points`` more points after the
-    keypoints.
+    The ``state`` of this evidence is that of the ``place``, with the rows ``measured`` more among
+    its points.
     """
 
     evidence: Evidence
     state: State
     place: Place
-    keypoints: int
-    points: int
-
-    @classmethod
-    def of(
-        cls, evidence: Evidence, keypoints: int, rows: Sequence[Measured], place: Place
-    ) -> Joined:
-        """The evidence with ``rows``; the modes of a contour's own are the last ones."""
-        points = sum(len(each.mean) for each in rows)
-        full = _with_measured(evidence, keypoints, rows, points, place.own.size)
-        bare = cls(full, place.state, place, keypoints, points)
-        return bare._replace(state=bare.at(place))
-
-    def at(self, place: Place) -> State:
-        """Another place as a state of this evidence."""
-        state, first = place.state, self.keypoints
-        still, none = state.displacements, np.zeros((self.points, 3))
-        return State(
-            state.poses.copy(),
-            state.log_focals.copy(),
-            state.log_scales.copy(),
-            np.concatenate([state.coefficients, place.own.ravel()]),
-            np.concatenate([still[:first], none, still[first:]]),
-        )
+    measured: slice
 
     def refined(self, iterations: int) -> tuple[float, Joined] | None:
         """The cost, and the place of the least cost, where every point of the surface stays."""
         cost, state, _, _ = refine_joint(self.evidence, iterations, self.state)
         if not cost < np.inf:
             return None
-        still, first = state.displacements, self.keypoints
-        coefficients, own = np.split(
-            state.coefficients.copy(), [len(state.coefficients) - self.place.own.size]
-        )
+        last = len(state.coefficients) - self.place.own.size
         bare = state._replace(
-            coefficients=coefficients,
-            displacements=np.concatenate([still[:first], still[first + self.points :]]),
+            coefficients=state.coefficients[:last],
+            displacements=np.delete(state.displacements, self.measured, axis=0),
         )
-        place = Place(bare, own.reshape(self.place.own.shape))
+        place = Place(bare, state.coefficients[last:].reshape(self.place.own.shape))
         return cost, self._replace(state=state, place=place)
 
 
@@ -217,12 +197,10 @@ def _with_measured(
 
     Contours take them in turns: each has its own, or all have the same ones.
     """
-    shape, last = evidence.shape, len(evidence.shape.modes)
-    end = keypoints + total
-    mean = np.concatenate([shape.mean[:keypoints], np.zeros((total, 3)), shape.mean[keypoints:]])
-    modes = np.zeros((last + further, len(mean), 3))
-    modes[:last, :keypoints] = shape.modes[:, :keypoints]
-    modes[:last, end:] = shape.modes[:, keypoints:]
+    shape, last, room = evidence.shape, len(evidence.shape.modes), [keypoints] * total
+    mean = np.insert(shape.mean, room, 0.0, axis=0)
+    modes = np.zeros((last + further, *mean.shape))
+    modes[:last] = np.insert(shape.modes, room, 0.0, axis=1)
 
     def moved(points: IntArray) -> IntArray:
         return np.where(points >= keypoints, points + total, points)
@@ -242,9 +220,8 @@ def _with_measured(
         name = "sightings" if isinstance(table, Sightings) else "planes"
         tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
         first = there.stop
-    spread = np.concatenate([shape.spread[:keypoints], np.zeros(total), shape.spread[keypoints:]])
     return evidence._replace(
-        shape=Shape(mean, modes, spread),
+        shape=Shape(mean, modes, np.insert(shape.spread, room, 0.0)),
         offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
         **{name: stacked(parts) for name, parts in tables.items()},
     )

@@ -12,7 +12,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.contours.descent import MOST_ROUNDS, FirstSteps, Masked
-from cadalign.estimation.contours.silhouettes import (
+from cadalign.estimation.contours.resembling import (
     Possible,
     Resembling,
     distinct,

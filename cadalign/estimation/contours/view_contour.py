@@ -27,9 +27,9 @@ from cadalign.estimation.contours.contour import (
     mask_image,
     without_steep,
 )
-from cadalign.estimation.contours.measured import OWN_MODES, Joined, Measured, Place, solved
+from cadalign.estimation.contours.measured import OWN_MODES, Measured, Place, Sought, solved
 from cadalign.estimation.contours.surface import PosedSurface, surfaces_of
-from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_lengths, poses_of
+from cadalign.estimation.estimates import mean_state, pose_and_border, pose_and_lengths
 from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
@@ -327,14 +327,13 @@ def contour_rows(
     )
 
 
-def contour_view(image: int, view: View, where: str, camera: Camera | None = None) -> ViewContour:
+def contour_view(image: int, view: View, where: str, camera: Camera) -> ViewContour:
     """The contour of a view's mask, with what the sightings need of the camera.
 
     Samples outside of its lens are dropped.
 
     Raises InputError if the mask ``where`` has no contour.
     """
-    camera = view.camera if camera is None else camera
     mask = cast("FloatArray | BoolArray", view.mask_image)
     contour = mask_contour(mask, where)
     rays, valid = camera.normalize_where_valid(contour.points)
@@ -374,10 +373,11 @@ def with_contours(
     keypoints = len(evidence.shape.mean) - 2
     where = f"views[{masked[0]}].mask"
     (surface,), _ = surfaces_of(model, evidence.shape.mean[:keypoints], where)
-    posed = surface.at(evidence.shape, state)
-    poses, measured = poses_of(evidence, state), []
+    sought = Sought(evidence, keypoints, masked, surface)
+    (posed, poses), measured = sought.at(state), []
     for number in masked:
-        seen = contour_view(number, views[number], f"views[{number}].mask")
+        view = views[number]
+        seen = contour_view(number, view, f"views[{number}].mask", view.camera)
         sight = Sight(posed.caster, seen.camera, poses[number])
         rims = find_rims(sight, seen.contour, _BOUND_REACH)
         bias = extraction_bias(sight, seen.mask, seen.contour, rims)
@@ -390,5 +390,5 @@ def with_contours(
         rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)
         table = rows.table._replace(loss=np.full_like(rows.table.loss, LINEAR))
         measured.append(rows._replace(table=table))
-    joined = Joined.of(evidence, keypoints, measured, Place.of(state, len(measured)))
+    joined = sought.joined(Place.of(state, len(measured)), measured)
     return joined.evidence, joined.state

@@ -124,7 +124,7 @@ def test_no_step_from_the_end_of_a_descent_lowers_the_cost() -> None:
     still = np.zeros_like(evidence.shape.mean)
     start = State(pose, np.zeros(0), np.log(truth.scale), np.zeros(0), still)
     start.poses[0, 9:] *= 1.03
-    masked = Masked(evidence, 8, [contour_view(0, view, "mask")], RigidSurface(BOX))
+    masked = Masked(evidence, 8, [contour_view(0, view, "mask", view.camera)], RigidSurface(BOX))
     found = settle(masked, start)
     assert found is not None
     descent = Descent(masked, found.noises, 4.0)

@@ -12,7 +12,8 @@ import pytest
 from cadalign import Alignment, Camera, Mesh, Model, Size, Symmetry, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DegenerateError
-from cadalign.estimation.contours.silhouettes import atlas_of, distinct, resembling_poses
+from cadalign.estimation.contours.resembling import distinct, resembling_poses
+from cadalign.estimation.contours.silhouettes import atlas_of
 from cadalign.evaluation.instances.evidence import damaged_mask
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector

@@ -25,12 +25,24 @@ from cadalign.estimation.joint import result_of_minima
 from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside, no_pose_error
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
-from cadalign.estimation.prepared_views import align_facing, align_without, views_without_pose
+from cadalign.estimation.prepared_views import (
+    align_facing,
+    align_without,
+    starts_by_one_view,
+    views_without_pose,
+    with_poses_by_masks,
+)
 from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
-from cadalign.estimation.search import JointProblem, find_minima, minima_at_start, widened_by_noise
+from cadalign.estimation.search import (
+    JointProblem,
+    Minimum,
+    find_minima,
+    minima_at_start,
+    widened_by_noise,
+)
 from cadalign.estimation.single import (
     align_plain,
     align_single,
@@ -75,7 +87,9 @@ def align(
         a category.
     views : View or sequence of View
         Evidence of the images. Views with ``cam_from_rig`` share one pose and determine the
-        object's size; views without it have a pose each and share the stretch and the shape.
+        object's size; views without it have a pose each and share the stretch and the shape. Where
+        few views have keypoints, the masks of the others count with them: of a rig for every model,
+        else for an exact one with a mesh.
     size : Size, optional
         Known lengths of the object.
     init : Alignment or sequence of Alignment or None, optional
@@ -193,9 +207,10 @@ def _align_all(
     if size is None and ransac is None and not lenses.count and is_single(model, views):
         return align_single(cast(ShapeModel, model), views[0], options=options, init=inits[0])
     prior = prior_of(model)
+    align_some = partial(_align_all, model, size, options, ransac, start)
+    inits = with_poses_by_masks(model, views, inits, align_some)
     left_out = views_without_pose(prior, views, inits)
     if left_out:
-        align_some = partial(_align_all, model, size, options, ransac, start)
         return align_without(left_out, prior, views, inits, align_some)
     problem = JointProblem(prior, views, size, options, lenses)
     if is_mask_alone(model, views, inits):
@@ -206,8 +221,9 @@ def _align_all(
         minima, iterations, hypotheses = minima_at_start(problem, inits)
         mistake = None
     else:
+        starts = [] if any(inits) else starts_by_one_view(views, size, align_some)
         try:
-            problem, minima, iterations, hypotheses = find_minima(problem, inits, ransac)
+            problem, minima, iterations, hypotheses = _found(problem, starts or [inits], ransac)
         except NoConsensusError as error:
             error.fix = mistake_beside(problem, ransac) or error.fix
             raise
@@ -221,6 +237,21 @@ def _align_all(
     for each in refined:
         result = each.noted_in(result)
     return result
+
+
+def _found(
+    problem: JointProblem,
+    starts: Sequence[Sequence[Alignment | None]],
+    ransac: RansacOptions | None,
+) -> tuple[JointProblem, list[Minimum], int, int]:
+    """As `find_minima`, from each of some starts."""
+    minima: list[Minimum] = []
+    iterations = hypotheses = 0
+    for inits in starts:
+        problem, found, *effort = find_minima(problem, inits, ransac)
+        minima += found
+        iterations, hypotheses = iterations + effort[0], hypotheses + effort[1]
+    return problem, sorted(minima, key=lambda each: each.score), iterations, hypotheses
 
 
 def align_batch(

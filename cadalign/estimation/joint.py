@@ -205,8 +205,7 @@ def result_of_minima(
     prior, views = problem.prior, problem.views
     minima = [each for each in minima if np.isfinite(each.score)]
     if not minima:
-        what = "the evidence does not determine pose and shape"
-        raise DegenerateError(what, where="views", fix="give more keypoints, or a size")
+        raise _undetermined_error()
     minimum = minima[0]
     inflation = prior.inflation
     if all(view.mask is None for view in views):  # a contour is worth as much as many keypoints
@@ -220,7 +219,10 @@ def result_of_minima(
             evidence, state = widened(each.evidence, each.state, inflation)
             wide = each._replace(evidence=evidence, state=state)
             estimate = _estimate(wide, likelihood, prior)._replace(is_optimum=each is optimum)
-            likely = [*likely, estimate]
+            if all(np.isfinite(own).all() for own in estimate.covariances):
+                likely = [*likely, estimate]
+            elif not likely:
+                raise _undetermined_error()
     symmetry, known_axis = getattr(model, "symmetry", None), getattr(model, "known_axis", None)
     x, y, z = (minimum.evidence.scales.free == 0).tolist()
     held = x, y, z
@@ -261,6 +263,11 @@ def result_of_minima(
         focal="estimate" if minimum.lenses.count else "known",
         focal_prior=prior_of_camera(minimum.lenses.prior, views[0].camera),
     )
+
+
+def _undetermined_error() -> DegenerateError:
+    what = "the evidence does not determine pose and shape"
+    return DegenerateError(what, where="views", fix="give more keypoints, or a size")
 
 
 def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimate:

@@ -122,7 +122,8 @@ def no_pose_error(
     if shown:
         from cadalign.estimation.contours.surface import surfaces_of  # imports this package
 
-        surfaces_of(model, problem.prior.components[0].mean, shown[0])
+        keypoints = problem.prior.components[0].mean[: len(problem.prior.ids)]
+        surfaces_of(model, keypoints, shown[0])
     if shown and fix is None:
         is_rig = len(views) > 1 and views[0].cam_from_rig is not None
         if not seen and len(views) == 1:
@@ -133,16 +134,15 @@ def no_pose_error(
             )
         if not seen:
             return DegenerateError(
-                "masks and photos of several views tell no pose without keypoints",
+                "photos of several views tell no pose without keypoints",
                 where="views",
-                fix="give at least 3 keypoints in one view, or `init`, such as the pose by one "
-                "mask alone",
+                fix="give at least 3 keypoints in one view, masks of two, or `init`",
             )
         if is_rig and seen == 1 and problem.size is None:
             return DegenerateError(
                 "keypoints of one view alone leave open the size that the known motion gives",
                 where="views",
-                fix="give a keypoint in another view, `size`, or `init`",
+                fix="give a keypoint or a mask in another view, `size`, or `init`",
             )
     return DegenerateError(
         "no pose has the keypoints in front of the camera",

@@ -1,11 +1,13 @@
 """Views that an alignment is prepared for, and what brings its result back to the views given.
 
 Views of wide lenses are turned to their keypoints; views of unknown motion whose keypoints
-determine no pose are left out.
+determine no pose are left out, or begin at the pose by their mask alone; a rig of which one view
+alone determines the pose begins there.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -16,6 +18,7 @@ from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.facing import faced, rays_ahead, turned_alignment, turned_covariance
+from cadalign.estimation.model import is_exact_model
 from cadalign.estimation.pack import evidence_of, tells_something
 from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.problems import are_on_a_line
@@ -24,6 +27,7 @@ from cadalign.estimation.result_parts import Stated, Statistics, ViewResult
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
+from cadalign.io.evidence import Size
 from cadalign.solvers.joint.search import refine_joint
 
 Align = Callable[[Sequence[View], Sequence[Alignment | None]], Result]
@@ -32,6 +36,7 @@ Align = Callable[[Sequence[View], Sequence[Alignment | None]], Result]
 _LEAST_POINTS = 3
 _ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
 _ITERATIONS = 50
+_MOST_STARTS = 8
 _REFUSED = {
     "mask": "the outline of a mask is not measured through a wide lens",
     "image": "the outline in a photo is not measured through a wide lens",
@@ -59,6 +64,24 @@ def views_without_pose(
     ]
 
 
+def with_poses_by_masks(
+    model: object, views: Sequence[View], inits: Sequence[Alignment | None], align_some: Align
+) -> list[Alignment | None]:
+    """Starts, with those that masks alone suggest for views of unknown motion without keypoints.
+
+    The model is exact and has a mesh: others would meet no mask.
+    """
+    found = list(inits)
+    if len(views) < 2 or not is_exact_model(model) or getattr(model, "mesh", None) is None:
+        return found
+    for number, view in enumerate(views):
+        alone = view.mask is not None and view.cam_from_rig is None and not len(view.keypoint_ids)
+        if alone and found[number] is None:
+            with contextlib.suppress(DegenerateError):  # it is left out
+                found[number] = align_some([view], [None]).alignment
+    return found
+
+
 def align_without(
     left_out: Sequence[int],
     prior: ShapePrior,
@@ -78,11 +101,7 @@ def align_without(
             fix="give at least 3 keypoints, not on one line, or another view first",
         )
     used = [number for number in range(len(views)) if number not in left_out]
-    try:
-        result = align_some([views[n] for n in used], [inits[n] for n in used])
-    except CadalignError as error:  # names views by their numbers among those that are used
-        where = error.where and _renumbered(error.where, used)
-        raise type(error)(_renumbered(error.what, used), where=where, fix=error.fix) from None
+    result = _align_used([views[n] for n in used], [inits[n] for n in used], used, align_some)
     of_views = dict(zip(used, result.views, strict=True))
     masks = dict(zip(used, result.mask_residuals, strict=bool(result.mask_residuals)))
     estimated = dict(zip((views[n].camera for n in used), result.cameras, strict=True))
@@ -119,6 +138,20 @@ def align_without(
         statistics=statistics,
         mask_residuals=tuple(masks.get(number) for number in numbers) if masks else (),
     )
+
+
+def _align_used(
+    views: Sequence[View],
+    inits: Sequence[Alignment | None],
+    used: Sequence[int],
+    align_some: Align,
+) -> Result:
+    """Align some views, of which errors speak by the numbers ``used`` among all."""
+    try:
+        return align_some(views, inits)
+    except CadalignError as error:
+        where = error.where and _renumbered(error.where, used)
+        raise type(error)(_renumbered(error.what, used), where=where, fix=error.fix) from None
 
 
 def _renumbered(text: str, used: Sequence[int]) -> str:
@@ -158,6 +191,65 @@ def _explaining(prior: ShapePrior, view: View, camera: Camera, result: Result) -
     state = mean_state(evidence, result.alignment.packed[None, :12], np.log(scale))
     _, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
     return Alignment(state.poses[0, :9].reshape(3, 3), state.poses[0, 9:], scale)
+
+
+def starts_by_one_view(
+    views: Sequence[View], size: Size | None, align_some: Align
+) -> list[list[Alignment | None]]:
+    """Starts, the likeliest first, of a rig whose outlines alone tell the object's size.
+
+    One view determines the pose: the only one with keypoints or, without any, that of the largest
+    mask. The object is enlarged about its camera until it is seen amid the masks of the others.
+    There are none for other views. Raises CadalignError if that view alone has no estimate.
+    """
+    if len(views) < 2 or any(view.cam_from_rig is None for view in views):
+        return []
+    seen = [number for number, view in enumerate(views) if len(view.keypoint_ids)]
+    has_size = size is not None or any(view.depth is not None for view in views)
+    has_size |= any(view.camera_height is not None for view in views)
+    given = {n: np.asarray(view.mask) for n, view in enumerate(views) if view.mask is not None}
+    masks = {number: mask > 0.5 for number, mask in given.items() if (mask > 0.5).any()}
+    if len(seen) > 1 or (seen and has_size) or not masks:
+        return []
+    first = seen[0] if seen else max(masks, key=lambda number: int(masks[number].sum()))
+    others = [number for number in masks if number != first]
+    if not others:
+        return []
+    alone = _align_used([replace(views[first], cam_from_rig=None)], [None], [first], align_some)
+    known = {views[first].camera: alone.camera}
+    seen_by = [replace(views[n], camera=_camera_of(views[n], known)) for n in others]
+    camera = np.asarray(views[first].cam_from_rig)
+    starts: list[list[Alignment | None]] = []
+    found = [(alone.alignment, alone.box)]
+    found += [(each.alignment, each.box) for each in alone.alternatives]
+    for pose, box in found[:_MOST_STARTS]:
+        factor = _factor_by_masks(box.center, camera, seen_by)
+        if factor is None:
+            continue
+        turn, shift = camera[:3, :3].T, factor * pose.translation - camera[:3, 3]
+        in_rig = Alignment(turn @ pose.rotation, turn @ shift, factor * pose.scale)
+        starts.append([in_rig, *[None] * (len(views) - 1)])
+    return starts
+
+
+def _factor_by_masks(
+    center: FloatArray, camera: FloatArray, others: Sequence[View]
+) -> float | None:
+    """Factor of a point's distance from a camera (4, 4) of a rig, by the masks that show it.
+
+    The point is seen where they have their centres; None if it lies ahead of no camera there.
+    """
+    by_factor, rest = [], []
+    for view in others:
+        own = np.asarray(view.cam_from_rig) @ np.linalg.inv(camera)
+        along, offset = own[:3, :3] @ center, own[:3, 3]
+        middle = np.argwhere(np.asarray(view.mask_image) > 0.5).mean(axis=0)[::-1]
+        for axis, ray in enumerate(view.camera.normalize(middle[None])[0].tolist()):
+            by_factor.append(along[axis] - ray * along[2])
+            rest.append(offset[axis] - ray * offset[2])
+    squares = np.dot(by_factor, by_factor)
+    factor = -float(np.dot(by_factor, rest) / squares) if squares > 0 else 0.0
+    return factor if factor > 0 else None
 
 
 def facing_view(view: View, number: int = 0) -> View:

@@ -26,10 +26,6 @@ SEEN = View(CAMERA, PIXELS, cam_from_rig=around(0))
 UNIT = "in another unit (millimetres for metres)?"
 
 
-def masked(*cameras: np.ndarray) -> list[View]:
-    return [View(CAMERA, mask=BODY, cam_from_rig=camera) for camera in cameras]
-
-
 def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: float) -> np.ndarray:
     pose = pose.copy()
     pose[rows, columns] *= factor
@@ -98,14 +94,20 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
             "sought; give `init`, at least 3 keypoints, or a mask",
         ),
         (
-            lambda: align(MODEL, masked(around(0), around(30))),
-            "views: masks and photos of several views tell no pose without keypoints; "
-            "give at least 3 keypoints in one view, or `init`, such as the pose by one mask alone",
+            lambda: align(
+                MODEL, [View(CAMERA, image=PHOTO, cam_from_rig=around(a)) for a in (0, 30)]
+            ),
+            "views: photos of several views tell no pose without keypoints; "
+            "give at least 3 keypoints in one view, masks of two, or `init`",
         ),
         (
-            lambda: align(MODEL, [SEEN, *masked(around(30))]),
+            lambda: align(MODEL, View(CAMERA, mask=BODY)),  # a face of the box, seen head-on
+            "views: the evidence does not determine pose and shape; give more keypoints, or a size",
+        ),
+        (
+            lambda: align(MODEL, [SEEN, View(CAMERA, image=PHOTO, cam_from_rig=around(30))]),
             "views: keypoints of one view alone leave open the size that the known motion gives; "
-            "give a keypoint in another view, `size`, or `init`",
+            "give a keypoint or a mask in another view, `size`, or `init`",
         ),
         (
             lambda: align(PLAIN, [seen(POINTS, truth_of(), around(0)), View(CAMERA)]),

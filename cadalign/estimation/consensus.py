@@ -193,12 +193,6 @@ def find_consensus(search: RobustSearch) -> Consensus:
         raise InputError(
             f"{count} keypoints are too few", where="points_3d", fix=f"give at least {size}"
         )
-    if options.focal == "estimate" and ransac.minimal != "ap4p":
-        raise InputError(
-            f"{ransac.minimal!r} does not estimate the focal length",
-            where="minimal",
-            fix="leave it at 'ap4p'",
-        )
     by_score = _order_of_scores(search.scores, count)
     order = np.random.default_rng(ransac.seed).permutation(count)
     ranked = np.arange(count) if by_score is None else np.argsort(order)[by_score]

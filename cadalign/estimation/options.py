@@ -238,8 +238,8 @@ class RansacOptions:
     seed: int = 0
     """Seed of the samples; the same seed gives the same result, bit for bit."""
     minimal: str = "ap4p"
-    """Minimal solver: ap4p on 4 points, or the linear aepnp on 6 as in the AEPnP paper, which needs
-    a known focal length. Neither finds anything where all keypoints lie in one plane."""
+    """Minimal solver: ap4p on 4 points, or the linear aepnp on 6 as in the AEPnP paper.
+    Neither finds anything where all keypoints lie in one plane."""
     refine: bool = True
     """Optimise new best hypotheses locally, and the last one on all its inliers; otherwise return
     the best hypothesis as the minimal solver left it."""

@@ -320,13 +320,13 @@ def test_keypoints_in_one_plane_are_refused_in_those_words(focal: str) -> None:
     assert alone.rms < 1e3
 
 
-def test_minimal_solver_that_wants_the_focal_length_is_refused_without() -> None:
-    problem, points_2d, _ = spoiled(0, points=30, outliers=0)
-    with pytest.raises(InputError, match="minimal: 'aepnp' does not estimate the focal length"):
-        fit(
-            problem.points_3d,
-            points_2d,
-            CAMERA,
-            focal="estimate",
-            ransac=RansacOptions(minimal="aepnp"),
-        )
+@pytest.mark.parametrize("minimal", ["ap4p", "aepnp"])
+def test_unknown_focal_length_is_found_by_either_minimal_solver(minimal: str) -> None:
+    problem, points_2d, wrong = spoiled(0, points=40, outliers=8)
+    camera = Camera.without_focal(CAMERA.width, CAMERA.height)
+    ransac = RansacOptions(minimal=minimal)
+    result = fit(problem.points_3d, points_2d, camera, focal="estimate", ransac=ransac)
+    assert not result.inliers[wrong].any()
+    assert result.inliers[~wrong].all()
+    assert result.std is not None
+    assert abs(np.log(result.camera.fx / CAMERA.fx)) < 3 * result.std.focal

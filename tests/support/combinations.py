@@ -341,14 +341,6 @@ class Request(NamedTuple):
     act: Callable[[], object]
 
 
-def refusal_of(cell: Cell) -> str | None:
-    """The message that a cell is refused with; None for those that `align` takes."""
-    is_plain = cell.evidence == "keypoints" and cell.model in ("exact", "held", "symmetric")
-    if is_plain and cell.focal != "known" and cell.outliers == "six":
-        return "minimal: 'aepnp' does not estimate the focal length; leave it at 'ap4p'"
-    return None
-
-
 def has_covariance(cell: Cell) -> bool:
     """False for the unrefined hypothesis of a minimal solver, which is no optimum."""
     is_plain = cell.evidence == "keypoints" and cell.model in ("exact", "held", "symmetric")
@@ -374,18 +366,6 @@ def requests() -> list[Request]:
     mask, _ = _images((1.0, 1.0, 1.0))
     held_first = [_seen(cam_from_rig=np.eye(4)), _seen()]
     return [
-        Request(
-            '`RansacOptions(minimal="aepnp")`, unknown focal length, exact model, keypoints alone',
-            "the linear solver of six keypoints needs a focal length; with other models and "
-            "evidence it is called at each one of a grid",
-            "minimal: 'aepnp' does not estimate the focal length; leave it at 'ap4p'",
-            lambda: align(
-                exact,
-                _seen(is_known=False),
-                focal="estimate",
-                ransac=RansacOptions(minimal="aepnp"),
-            ),
-        ),
         Request(
             "a mask, `Model` without a mesh",
             "keypoints have no outline",
@@ -537,9 +517,4 @@ def _tables() -> str:
 def _mark(model: str, evidence: str) -> str:
     """How the cells of a model and a piece of evidence end."""
     cells = [Cell(model, evidence, *each) for each in product(FOCALS, NOISES, OUTLIERS)]
-    notes = ""
-    if any(refusal_of(each) for each in cells):
-        notes += " (1)"
-    if not all(has_covariance(each) for each in cells):
-        notes += " (2)"
-    return f"yes{notes}"
+    return "yes" if all(has_covariance(each) for each in cells) else "yes (1)"

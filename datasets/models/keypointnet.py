@@ -213,8 +213,7 @@ class KeypointNet:
         InputError
             If a category or the split is unknown.
         """
-        chosen = object.__new__(KeypointNet)
-        chosen.__dict__.update(self.__dict__)
+        chosen = copy.copy(self)
         if categories is not None:
             names = [categories] if isinstance(categories, str) else categories
             chosen.categories = tuple(sorted({self._require(name) for name in names}))

@@ -7,8 +7,7 @@ bop_toolkit's ``docs/bop_datasets_format.md``.
 from __future__ import annotations
 
 import os
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.bop_files import (
     TRUTH,
     BopModels,
-    Estimates,
+    BopPoses,
     Nine,
     ScenePose,
     object_name,
@@ -40,13 +39,7 @@ from cadalign.datasets.photos.dataset import (
     read_each,
     read_table,
 )
-from cadalign.datasets.photos.photo import (
-    DepthImage,
-    Photo,
-    PhotoObject,
-    Truth,
-    first_existing,
-)
+from cadalign.datasets.photos.photo import DepthImage, Photo, PhotoObject, Truth, first_existing
 from cadalign.datasets.photos.placed import PlacedObject, converted
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
@@ -218,10 +211,10 @@ class Bop(PhotoDataset):
     def open_poses(self, path: Path) -> PoseFile:
         """Open a CSV file of results of the BOP challenge, or one as ``scene_gt.json``."""
         if path.suffix.lower() == ".csv":
-            return _Poses(path, read_bop_results(path), self)
+            return BopPoses(path, read_bop_results(path), self)
         if isinstance(read_json(path), list):
             raise self.other_poses(path, f"give a CSV file of results, or one as {TRUTH}")
-        return _Poses(path, read_scene_gt(path), self)
+        return BopPoses(path, read_scene_gt(path), self)
 
 
 def find_scenes(folder: Path) -> Iterator[Path]:
@@ -250,38 +243,6 @@ def _common_camera(folder: Path) -> _SceneCamera | None:
                 found: _SceneCamera = convert(data, _SceneCamera)
             return found
     return None
-
-
-class _Poses(PoseFile):
-    """BOP's poses, by the numbers of scene and image."""
-
-    def __init__(self, path: Path, estimates: Estimates, dataset: Bop) -> None:
-        poses, self.problems = estimates
-        self._own = str(int(dataset.root.name)) if dataset.root.name.isdecimal() else ""
-        scenes = {each.scene for each in poses}
-        is_numbered = self._own or any("/" in name for name in dataset.names)
-        if not is_numbered and len(scenes) > 1:
-            what = f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number"
-            fix = "give the data set's folder, or a file of that scene alone"
-            raise DataError(what, where=str(path), fix=fix)
-        # A file or a folder without a number is of the one scene there is.
-        self._any_scene = not is_numbered or scenes == {""}
-        self._poses: dict[tuple[str, str], list[PoseEstimate]] = defaultdict(list)
-        for each in poses:
-            self._poses["" if self._any_scene else each.scene, each.image].append(each)
-
-    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
-        return tuple(self._poses.get(self._key(photo.name), ()))
-
-    def strays(self, names: Sequence[str]) -> int:
-        known = {self._key(name) for name in names}
-        return sum(len(poses) for key, poses in self._poses.items() if key not in known)
-
-    def _key(self, name: str) -> tuple[str, str]:
-        scene, _, image = name.rpartition("/")
-        scene = scene.rpartition("/")[2]
-        number = str(int(scene)) if scene.isdecimal() else self._own
-        return "" if self._any_scene else number, str(int(image)) if image.isdecimal() else image
 
 
 def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:

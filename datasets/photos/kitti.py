@@ -16,13 +16,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import (
-    PhotoDataset,
-    PhotoFormat,
-    has,
-    leaving_out,
-    read_each,
-)
+from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, has, leaving_out, read_each
 from cadalign.datasets.photos.kitti_keypoints import (
     CARS,
     SIZE,

@@ -15,7 +15,12 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray, as_floats
-from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
+from cadalign.datasets.sfm.correspondences import (
+    Correspondences,
+    CorrespondenceSet,
+    find_layout,
+    rigid_pose,
+)
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.alignment import Alignment
@@ -30,12 +35,16 @@ _LARGEST_IMAGE = 2**30
 _PAIRED = 0.05
 
 
-# Names of the required pickles of a layout, rotations and translations last: the optional ones.
-LAYOUTS = {
-    ("matches", "R", "t"): ("inlier_matches", "focal"),
-    ("p2d", "p3d", "R_gt", "t_gt"): ("W_gt", "num_points_2d", "num_points_3d", "focal"),
+LAYOUTS = tuple(
+    tuple(f"{folder}/{name}.pkl" for name in names)
+    for folder in (".", "preprocessed")
+    for names in (("matches", "R", "t"), ("p2d", "p3d", "R_gt", "t_gt"))
+)
+"""The pickles that a split needs, rotations and translations last, wherever they may lie."""
+_OPTIONAL = {
+    "matches": ("inlier_matches", "focal"),
+    "p2d": ("W_gt", "num_points_2d", "num_points_3d", "focal"),
 }
-FOLDERS = (".", "preprocessed")
 
 
 class BlindPnP(CorrespondenceSet):
@@ -88,11 +97,14 @@ class BlindPnP(CorrespondenceSet):
         if focal is not None and not (np.isfinite(focal) and focal > 0):
             raise InputError(f"{focal!r} is not a focal length", where="focal")
         self._focal = focal
-        folder, required = _find_layout(as_path(path))
-        self._is_matches = "matches" in required
-        *_, self._rotation, self._translation = required
-        optional = [name for name in LAYOUTS[required] if (folder / f"{name}.pkl").is_file()]
-        self._files = {name: folder / f"{name}.pkl" for name in (*required, *optional)}
+        fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl, or preprocessed/"
+        nothing = "there are no correspondences"
+        required = find_layout(as_path(path), LAYOUTS, nothing=nothing, fix=fix)
+        folder, first = required[0].parent, required[0].stem
+        optional = (folder / f"{name}.pkl" for name in _OPTIONAL[first])
+        self._files = {file.stem: file for file in (*required, *filter(Path.is_file, optional))}
+        self._is_matches = first == "matches"
+        *_, self._rotation, self._translation = (file.stem for file in required)
         # The smallest file is enough to count the samples.
         translations = _load_samples(self._files[self._translation])
         self._data: dict[str, Any] = {self._translation: translations}
@@ -193,22 +205,6 @@ class BlindPnP(CorrespondenceSet):
             return self._data[name][position]
         except KeyError:
             raise InputError("there is no such sample", where=name) from None
-
-
-def _find_layout(root: Path) -> tuple[Path, tuple[str, ...]]:
-    if not root.is_dir():
-        raise DataError("no such folder", where=str(root), fix="give a split's folder")
-    closest: tuple[int, str] = (0, "there are no correspondences")
-    for folder in (root / name for name in FOLDERS):
-        for required in LAYOUTS:
-            missing = [name for name in required if not (folder / f"{name}.pkl").is_file()]
-            if not missing:
-                return folder, required
-            found = len(required) - len(missing)
-            text = ", ".join(f"{name}.pkl" for name in missing)
-            closest = max(closest, (found, f"{text} missing in {folder}"))
-    fix = "give a split's folder, which holds matches.pkl, R.pkl and t.pkl, or preprocessed/"
-    raise DataError(closest[1], where=str(root), fix=fix)
 
 
 def _load_samples(file: Path) -> Any:

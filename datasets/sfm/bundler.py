@@ -28,6 +28,8 @@ ImageSize = tuple[int, int]
 _IMAGE_SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"))
 # How far keypoints may lie outside the image's pixel centres [px].
 _MARGIN = 1.0
+PATTERNS = ("bundle.out", "bundle/bundle.out", "*.out")
+"""The file in a folder, in the order in which it is looked for."""
 _HEADER = "# Bundle file v0.3"
 _CAMERA_VALUES = 15
 # A point: xyz, colour, the number of its views; then the views.
@@ -109,10 +111,8 @@ class Bundler(CorrespondenceSet):
         if size is None:
             return 2 * int(np.ceil(reach[0])) + 1, 2 * int(np.ceil(reach[1])) + 1
         if (reach > (np.array(size) - 1) / 2 + _MARGIN).any():
-            what = (
-                f"observations reach {reach[0]:.1f} and {reach[1]:.1f} px from the middle, outside"
-            )
-            what = f"{what} an image of {size[0]} x {size[1]}"
+            what = f"observations reach {reach[0]:.1f} and {reach[1]:.1f} px from the middle"
+            what += f", outside an image of {size[0]} x {size[1]}"
             fix = "give the sizes of the photos that the model was made from"
             raise DataError(what, where=f"{self.source}, image {name}", fix=fix)
         return size
@@ -123,7 +123,7 @@ def _find_file(path: Path) -> Path:
         return path
     if not path.is_dir():
         raise DataError("no such file", where=str(path), fix="give a bundle.out")
-    for pattern in ("bundle.out", "bundle/bundle.out", "*.out"):
+    for pattern in PATTERNS:
         found = sorted(path.glob(pattern))
         if len(found) == 1:
             return found[0]
@@ -201,10 +201,8 @@ def _read_bundler(path: Path) -> _Model:
     is_known = (cameras >= 0) & (cameras < camera_count) & (cameras == np.floor(cameras))
     if not is_known.all():
         row = int(np.argmin(is_known))
-        what = (
-            f"point {view_points[row]} is observed in camera {cameras[row]:g}, which doesn't exist"
-        )
-        raise damaged(f"{what}; there are {camera_count}", path)
+        seen = f"point {view_points[row]} is observed in camera {cameras[row]:g}"
+        raise damaged(f"{seen}, which doesn't exist; there are {camera_count}", path)
     order = np.argsort(cameras, kind="stable")
     return _Model(
         cameras=values[2:start].reshape(-1, _CAMERA_VALUES),

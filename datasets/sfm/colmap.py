@@ -21,6 +21,7 @@ from cadalign.datasets.sfm.correspondences import (
     CameraView,
     Correspondences,
     CorrespondenceSet,
+    find_layout,
     rigid_pose,
 )
 from cadalign.errors import DataError, InputError, brief, quote
@@ -28,11 +29,16 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.camera_form import COLMAP_PARAMS
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, damaged, made_folder, read_bytes, read_text, write_text
 
-STEMS = ("cameras", "images", "points3D")
-SUFFIXES = (".bin", ".txt")  # COLMAP itself prefers the binary files where both are there
-SUBFOLDERS = (".", "sparse/0", "sparse", "0")
+_STEMS = ("cameras", "images", "points3D")
+LAYOUTS = tuple(
+    tuple(f"{folder}/{stem}{suffix}" for stem in _STEMS)
+    for folder in (".", "sparse/0", "sparse", "0")
+    for suffix in (".bin", ".txt")  # COLMAP itself prefers the binary files where both are there
+)
+"""The files of a model below a folder, in each of the places where they may lie."""
 _INVALID_POINT = -1  # of an observation that belongs to no point
 _MOST_BYTES = 2**37  # of one file: models of cities have billions of observations
 
@@ -84,9 +90,10 @@ class Colmap(CorrespondenceSet):
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        folder, suffix = _find_model(as_path(path))
-        self._camera_file, image_file, self._point_file = (folder / f"{s}{suffix}" for s in STEMS)
-        is_text = suffix == ".txt"
+        fix = "give the folder of cameras, images and points3D, all three as .bin or as .txt"
+        files = find_layout(as_path(path), LAYOUTS, nothing="there is no COLMAP model", fix=fix)
+        self._camera_file, image_file, self._point_file = files
+        is_text = image_file.suffix == ".txt"
         read_cameras, read_points, read_images = _TEXT_READERS if is_text else _BINARY_READERS
         self._cameras = read_cameras(self._camera_file)
         ids, xyz = read_points(self._point_file)
@@ -125,30 +132,12 @@ class Colmap(CorrespondenceSet):
     def _camera(self, camera_id: int, name: str) -> Camera:
         if camera_id not in self._cameras:
             raise self._of_another_model(f"there is no camera {camera_id}", self._camera_file, name)
-        try:
+        with in_file(f"{self._camera_file}, camera {camera_id}"):
             return Camera.from_dict(self._cameras[camera_id])
-        except InputError as error:
-            where = f"{self._camera_file}, camera {camera_id}"
-            raise DataError(error.what, where=where, fix=error.fix) from None
 
     def _of_another_model(self, what: str, file: Path, name: str) -> DataError:
         where = f"{self.source}, image {brief(name)}"
         return DataError(what, where=where, fix=f"does {file.name} belong to the same model?")
-
-
-def _find_model(root: Path) -> tuple[Path, str]:
-    if not root.is_dir():
-        raise DataError("no such folder", where=str(root), fix="give the folder of a COLMAP model")
-    incomplete = ""
-    for folder in (root / name for name in SUBFOLDERS):
-        for suffix in SUFFIXES:
-            missing = [stem for stem in STEMS if not (folder / f"{stem}{suffix}").is_file()]
-            if not missing:
-                return folder, suffix
-            if len(missing) < len(STEMS) and not incomplete:
-                incomplete = f"{folder / missing[0]}{suffix} is missing"
-    fix = "cameras, images and points3D are needed, all three as .bin or as .txt"
-    raise DataError(incomplete or "there is no COLMAP model", where=str(root), fix=fix)
 
 
 def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
@@ -174,7 +163,7 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
         size = f"{camera.width} {camera.height}"
         cameras.append(f"{camera_id} {entry['model']} {size} {_written(entry['params'])}\n")
     folder = made_folder(as_path(folder, "folder"))
-    for stem, lines in zip(STEMS, (cameras, images, ()), strict=True):
+    for stem, lines in zip(_STEMS, (cameras, images, ()), strict=True):
         write_text(folder / f"{stem}.txt", "".join(lines))
 
 

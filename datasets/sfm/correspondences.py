@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -222,6 +222,24 @@ class CorrespondenceSet(ABC):
             where = f"{self.source}, image {self.ids[position][:200]}"
             where += "" if error.where is None else f", {error.where}"
             raise DataError(error.what, where=where, fix=error.fix) from None
+
+
+def find_layout(
+    root: Path, layouts: Iterable[tuple[str, ...]], *, nothing: str, fix: str
+) -> tuple[Path, ...]:
+    """Find the files of the first of some layouts, names below a folder, that is whole.
+
+    Raises DataError if none is, which names what is missing of the one that has most of its files.
+    """
+    if not root.is_dir():
+        raise DataError("no such folder", where=str(root), fix=fix)
+    sets = [[root / name for name in layout] for layout in layouts]
+    found = [(files, [file for file in files if not file.is_file()]) for files in sets]
+    files, missing = min(found, key=lambda each: len(each[1]) / len(each[0]))
+    if not missing:
+        return tuple(files)
+    what = f"{', '.join(map(str, missing))} {'is' if len(missing) == 1 else 'are'} missing"
+    raise DataError(nothing if missing == files else what, where=str(root), fix=fix)
 
 
 def rigid_pose(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Alignment:

@@ -8,8 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.datasets.sfm import blind_pnp, colmap
-from cadalign.datasets.sfm.bundler import Bundler
+from cadalign.datasets.sfm import blind_pnp, bundler, colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError
 from cadalign.io.files import as_path, open_input
@@ -41,27 +40,19 @@ _FORMATS = {
     "colmap": _Format(
         colmap.Colmap,
         "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)",
-        tuple(
-            tuple(f"{folder}/{stem}{suffix}" for stem in colmap.STEMS)
-            for folder in colmap.SUBFOLDERS
-            for suffix in colmap.SUFFIXES
-        ),
+        colmap.LAYOUTS,
     ),
     "bundler": _Format(
-        Bundler,
+        bundler.Bundler,
         "bundle.out (also in bundle, or one *.out)",
-        (("bundle.out",), ("bundle/bundle.out",), ("*.out",)),
+        tuple((pattern,) for pattern in bundler.PATTERNS),
         header=_BUNDLER_HEADER,
     ),
     "blind-pnp": _Format(
         blind_pnp.BlindPnP,
         "matches.pkl, R.pkl and t.pkl, or p2d.pkl, p3d.pkl, R_gt.pkl and t_gt.pkl "
         "(also in preprocessed)",
-        tuple(
-            tuple(f"{folder}/{stem}.pkl" for stem in required)
-            for folder in blind_pnp.FOLDERS
-            for required in blind_pnp.LAYOUTS
-        ),
+        blind_pnp.LAYOUTS,
     ),
 }
 AUTO = "auto"

@@ -270,7 +270,7 @@ def test_missing_files_are_named(tmp_path):
     with pytest.raises(DataError, match="there are no correspondences"):
         BlindPnP(tmp_path)
     (Samples().write(tmp_path) / "matches.pkl").unlink()
-    with pytest.raises(DataError, match=r"matches.pkl missing"):
+    with pytest.raises(DataError, match=r"matches.pkl is missing"):
         BlindPnP(tmp_path)
     write(tmp_path / "matches.pkl", [])
     write(tmp_path / "t.pkl", np.float64(3))

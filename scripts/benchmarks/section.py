@@ -7,6 +7,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from resource import RUSAGE_CHILDREN, getrusage
 from typing import Any, NamedTuple, TypeVar
@@ -132,7 +133,13 @@ def meshed_models(
 
 
 def learned_shape(dataset: KeypointNet, category: str) -> cadalign.ShapeModel:
-    """The shape of a category, learned from the split train."""
+    """The shape of a category, learned once from the split train."""
+    return _learned_shape(dataset.root, category)
+
+
+@cache
+def _learned_shape(root: Path, category: str) -> cadalign.ShapeModel:
+    dataset = KeypointNet(root)
     return cadalign.ShapeModel.from_dataset(dataset, category, split="train", meshes=False)
 
 

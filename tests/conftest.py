@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -38,19 +39,46 @@ REQUIRED = os.environ.get("CADALIGN_REQUIRED", "").split()
 """Names of optional packages that are known to be here: a test skipped for want of one fails."""
 
 
+COMPILED = pytest.StashKey[Future[None]]()
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the usual kernels before xdist starts the processes that run the tests."""
+    """Compile the usual kernels while the processes of xdist, which run the tests, collect them."""
     if session.config.getoption("numprocesses", None):
         from cadalign.cli.compile_ahead import compile_ahead
 
-        compile_ahead()
+        session.config.stash[COMPILED] = ThreadPoolExecutor(1).submit(compile_ahead)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished(node: Any) -> None:
+    """Let the processes of xdist wait for the usual kernels; otherwise each compiles its own."""
+    node.config.stash[COMPILED].result()
+
+
+class BackwardFolder(pytest.Dir):
+    """A folder collected from its end."""
+
+    def collect(self) -> Iterable[pytest.Item | pytest.Collector]:
+        return reversed(list(super().collect()))
+
+
+def pytest_collect_directory(path: Path, parent: pytest.Collector) -> pytest.Collector | None:
+    """Let every other process of xdist begin with the last folder.
+
+    Each compiles the modules of tests that it is the first to load, and finds those of the others.
+    """
+    worker = getattr(parent.config, "workerinput", {"workerid": "gw0"})["workerid"]
+    if int(worker.removeprefix("gw")) % 2 and path.is_relative_to(Path(__file__).parent):
+        return BackwardFolder.from_parent(parent, path=path)
+    return None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Let the processes of xdist begin with long modules: in the end none works on one alone."""
     if hasattr(config, "workerinput"):
         long = {item.path for item in items if item.get_closest_marker("long")}
-        items.sort(key=lambda item: item.path not in long)
+        items.sort(key=lambda item: (item.path not in long, item.path))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -1,7 +1,7 @@
 """Every combination of model, evidence, focal length, noise and outliers aligns.
 
 All pairs of them are in the quick part, whose results are drawn, too; the long one adds cells until
-every model has been aligned with every piece of evidence and focal length, noise and outliers in turns.
+every model is aligned with every piece of evidence and focal length, noise and outliers in turns.
 """
 
 from __future__ import annotations

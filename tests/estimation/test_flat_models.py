@@ -91,9 +91,7 @@ def test_no_result_costs_more_than_the_truth(points: int, noise_px: float) -> No
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("points", "noise_px"), [(5, 1.0), (7, 1.0), (12, 1.0), (6, 4.0), (8, 4.0), (12, 4.0)]
-)
+@pytest.mark.parametrize(("points", "noise_px"), [(5, 1.0), (12, 1.0), (6, 4.0), (12, 4.0)])
 def test_regions_hold_the_truth(points: int, noise_px: float) -> None:
     """Of 300, a region of 95 % holds less than 0.89 with a chance of 1e-5.
 

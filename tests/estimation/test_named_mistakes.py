@@ -329,6 +329,6 @@ KINDS = (
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_right_problems_are_no_mistakes(kind: str, real_data: Path) -> None:
-    """56 of each category, 224 of each kind: 2,016 in all."""
-    texts = [right(real_data, kind, each, seed) for each in CATEGORIES for seed in range(56)]
+    """28 of each category, 112 of each kind: 1,008, where 1 alarm in 200 is noticed at 99 %."""
+    texts = [right(real_data, kind, each, seed) for each in CATEGORIES for seed in range(28)]
     assert [text for text in texts if any(name in text for name in NAMES)] == []

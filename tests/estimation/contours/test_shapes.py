@@ -28,13 +28,16 @@ def bottles(tmp_path_factory: pytest.TempPathFactory) -> tuple[AnnotatedModel, .
     return dataset["bottle"]
 
 
-def learned(models: tuple[AnnotatedModel, ...]) -> ShapeModel:
-    examples = examples_of(models, meshes=True, on_progress=lambda done, total: None)
+@pytest.fixture(scope="module")
+def shape(bottles: tuple[AnnotatedModel, ...]) -> ShapeModel:
+    """The shape of all bottles but the first four."""
+    examples = examples_of(bottles[4:], meshes=True, on_progress=lambda done, total: None)
     return ShapeModel.learn(examples, category="bottle", components=1)
 
 
-def test_a_learned_shape_is_better_with_a_mask(bottles: tuple[AnnotatedModel, ...]) -> None:
-    shape = learned(bottles[4:])
+def test_a_learned_shape_is_better_with_a_mask(
+    bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
+) -> None:
     alone, joint = [], []
     for number, model in enumerate(bottles[:4]):
         rng = np.random.default_rng(number)
@@ -54,9 +57,9 @@ def test_a_learned_shape_is_better_with_a_mask(bottles: tuple[AnnotatedModel, ..
 
 
 def test_depth_over_a_learned_surface_counts_as_similar(
-    bottles: tuple[AnnotatedModel, ...],
+    bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
 ) -> None:
-    shape, model = learned(bottles[4:]), bottles[0]
+    model = bottles[0]
     rng = np.random.default_rng(5)
     scene, points = Scene(model.load_mesh()), model.keypoints.xyz
     shown = sample_view(scene, points, CAMERA, rng=rng, min_visible=6, roll=10.0)
@@ -133,16 +136,20 @@ class TestLearnedWithoutAnnotatedMask:
         shown = sample_view(scene, model.keypoints.xyz, CAMERA, rng=rng, min_visible=6, roll=10.0)
         return shown, cast_geometry(scene, CAMERA, shown.cam_from_model).mask
 
-    def test_a_mask_alone_gives_proposals(self, bottles: tuple[AnnotatedModel, ...]) -> None:
+    def test_a_mask_alone_gives_proposals(
+        self, bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
+    ) -> None:
         shown, mask = self.shown(bottles[1], 1)
-        found = align(learned(bottles[4:]), View(CAMERA, mask=mask))
+        found = align(shape, View(CAMERA, mask=mask))
         poses = [found.alignment, *(each.alignment for each in found.alternatives)]
         axes = np.array([pose.rotation[:, 1] for pose in poses])
         cosines = np.abs(axes @ shown.cam_from_model.rotation[:, 1])
         assert np.degrees(np.arccos(min(cosines.max(), 1.0))) < 8.0  # upright or upside down
         assert any("is a proposal" in text for text in found.warnings)
 
-    def test_a_photo_counts_beside_clicks(self, bottles: tuple[AnnotatedModel, ...]) -> None:
+    def test_a_photo_counts_beside_clicks(
+        self, bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
+    ) -> None:
         shown, mask = self.shown(bottles[0], 0)
         points, ids = bottles[0].keypoints.xyz, bottles[0].keypoints.ids
         rng = np.random.default_rng(0)
@@ -151,7 +158,7 @@ class TestLearnedWithoutAnnotatedMask:
         colors = np.where(mask[:, :, None], [190, 60, 50], [70, 120, 90])
         photo = np.clip(colors + rng.normal(0, 6, colors.shape), 0, 255).astype(np.uint8)
         view = View(CAMERA, clicks, ids=ids[shown.visible].tolist(), sigma=4.0, image=photo)
-        found = align(learned(bottles[4:8]), view)
+        found = align(shape, view)
         (summary,) = [each for each in found.evidence if each.kind == "photo"]
         assert summary.share is not None
         assert summary.share > 0.5

@@ -9,9 +9,9 @@ from support.annotating import Case, make_case
 from support.clips import Clip, make_clip
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def original(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    """One photo for a module; to be read, not changed."""
+    """One photo for all modules; to be read, not changed."""
     return make_case(sample_root, tmp_path_factory.mktemp("annotate"))
 
 
@@ -21,7 +21,7 @@ def case(original: Case, tmp_path: Path) -> Case:
     return original.copied_to(tmp_path / "photos")
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def clip(original: Case, tmp_path_factory: pytest.TempPathFactory) -> Clip:
     """A video of the same chair, turning."""
     return make_clip(original, tmp_path_factory.mktemp("clip"))

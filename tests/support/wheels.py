@@ -80,7 +80,6 @@ class Environment:
         pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python")]
         install = ["install", "--quiet", "--no-index", "--no-deps", "--force-reinstall"]
         subprocess.run([*pip, *install, str(wheel)], check=True)
-        made._take_over_compiled_kernels()
         return made
 
     @property
@@ -103,16 +102,3 @@ class Environment:
         )
         assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
         return done.stdout
-
-    def _take_over_compiled_kernels(self) -> None:
-        """Take compiled kernels from the checkout, which saves compiling them again.
-
-        Their stamp is the time and size of source files; see `cadalign.compile`.
-        """
-        for name, path in source_files().items():
-            stat = path.stat()
-            os.utime(self.site / name, ns=(stat.st_atime_ns, stat.st_mtime_ns))
-            target = self.site / Path(name).parent / "__pycache__"
-            for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.nb*"):
-                if compiled.suffix in (".nbi", ".nbc"):
-                    shutil.copy2(compiled, target)

@@ -37,8 +37,6 @@ PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "combinations.md"
 SIGMAS = 5.0
 LARGEST_ROTATION_DEG = 12.0
 LARGEST_LOG_FOCAL = 0.4
-
-
 PAIRS = covering(2)
 
 

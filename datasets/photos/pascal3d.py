@@ -293,7 +293,7 @@ class Pascal3DDetections(PhotoDataset):
         if not names:
             raise DataError(f"there are no {DETECTED}/*.mat", where=str(folder))
         super().__init__(folder, names)
-        self._observations: dict[str, Path] | None = None
+        self._observed: dict[str, list[_Keypoint]] | None = None  # by the photos' names
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
@@ -310,14 +310,17 @@ class Pascal3DDetections(PhotoDataset):
         return Photo(name, image, Camera.without_focal(*photo_size(image)), (shown,))
 
     def _keypoints(self, name: str) -> PhotoKeypoints | None:
-        if self._observations is None:
-            self._observations = {}
+        if self._observed is None:
+            self._observed = {}
             for path in sorted((self.root / _OBSERVATIONS).glob("*.json")):
-                stem = Path(read_document(path, _Observation).image).stem
-                self._observations[stem] = path
-        if name not in self._observations:
+                try:
+                    observation = read_document(path, _Observation)
+                    self._observed[Path(observation.image).stem] = observation.keypoints
+                except DataError as error:
+                    self._tell(str(path), error)
+        if name not in self._observed:
             return None
-        found = read_document(self._observations[name], _Observation).keypoints
+        found = self._observed[name]
         scores = [each.confidence for each in found if each.confidence is not None]
         return PhotoKeypoints(
             points_2d=np.array([each.uv for each in found], dtype=float).reshape(-1, 2),

@@ -189,6 +189,8 @@ def test_detections_in_photos(tmp_path):
     write_cad(tmp_path / "cad" / "chair.mat")
     keypoints = [{"uv": [1.5, 2], "name": "left", "confidence": 0.4}]
     write_json(tmp_path / "observations" / "x.json", {"image": "../a.jpg", "keypoints": keypoints})
+    bad = tmp_path / "observations" / "bad.json"
+    write_text(bad, "{")
     dataset = cadalign.datasets.open(tmp_path)
     assert isinstance(dataset, Pascal3DDetections)
     (photo,) = dataset
@@ -197,6 +199,7 @@ def test_detections_in_photos(tmp_path):
     assert chair.keypoints.scores.tolist() == [0.4]
     assert chair.model.load_keypoints().names == ("left", "right")
     assert "image is missing" in str(dataset.problems["b"])
+    assert "not valid JSON" in str(dataset.problems[str(bad)])
     write_text(tmp_path / "annot" / "more.mat", "x")
     with pytest.raises(DataError, match=r"more\.mat"):
         Pascal3DDetections(tmp_path)

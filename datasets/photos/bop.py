@@ -167,14 +167,11 @@ class Bop(PhotoDataset):
                 self._photos += [(scene, key) for key in keys]
                 names += [f"{prefix}{key}" for key in keys]
         super().__init__(folder, names, bad)
-        self._scene: _Scene | None = None
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         folder, key = self._photos[index]
-        if self._scene is None or self._scene.folder != folder:
-            self._scene = _Scene(folder)  # kept, as photos come scene by scene
-        scene = self._scene
+        scene = self._read_once(folder, _Scene)
         image = _image(folder, ("rgb", "gray"), key)
         camera, depth_scale = scene.camera(key, image)
         poses: list[Any] = parse(scene.truth[key], list[Any], path=folder / TRUTH, where=key)

@@ -94,6 +94,7 @@ class PhotoDataset(ABC):
         self.root = root
         self.names = tuple(names)
         """The photos' names, in the annotations' order."""
+        self._kept: tuple[Path, Any] | None = None
         self.problems = problems or {}
         """Why records or objects could not be read, of those read so far, by name."""
         if self.problems and not self.names:
@@ -188,6 +189,13 @@ class PhotoDataset(ABC):
             where = f"{self.root}, {self.names[index]}"
             where += f": {error.where}" if error.where else ""
             raise DataError(error.what, where=where, fix=error.fix) from None
+
+    def _read_once(self, path: Path, read: Callable[[Path], T]) -> T:
+        """Read what several photos lie in, such as a scene; kept until another is asked for."""
+        if self._kept is None or self._kept[0] != path:
+            self._kept = path, read(path)
+        found: T = self._kept[1]
+        return found
 
     def _tell(self, name: str, error: DataError) -> None:
         if name not in self.problems and len(self.problems) <= _LOGGED:

@@ -9,6 +9,7 @@ import os
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -117,7 +118,6 @@ class KittiCars(PhotoDataset):
             fix = f"give a folder of {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}"
             raise DataError("no KITTI labels are here", where=str(folder), fix=fix)
         super().__init__(folder, [frame.name for frame in self._frames], bad)
-        self._sequence: tuple[Path, dict[int, list[KittiLabel]]] | None = None
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
@@ -145,16 +145,11 @@ class KittiCars(PhotoDataset):
         if frame.frame is None:
             labels = read_labels(frame.labels, tracking=False, problems=bad)
         else:
-            labels = self._labels(frame.labels).get(frame.frame, [])
+            by_frame = self._read_once(frame.labels, partial(_by_frame, problems={}))
+            labels = by_frame.get(frame.frame, [])
         objects, problems = read_each(labels, read_object, where=str(frame.labels))
         problems = (*bad.values(), *problems)
         return Photo(frame.name, image, camera, objects, up=UP, problems=problems)
-
-    def _labels(self, path: Path) -> dict[int, list[KittiLabel]]:
-        """Labels of a sequence by frame, kept for its other photos."""
-        if self._sequence is None or self._sequence[0] != path:
-            self._sequence = path, _by_frame(path, {})
-        return self._sequence[1]
 
 
 def _list_frames(

@@ -20,7 +20,6 @@ from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, leaving_
 from cadalign.datasets.photos.objectron_files import (
     ArCamera,
     ObjectronAnnotation,
-    Sequence,
     read_sequence,
 )
 from cadalign.datasets.photos.photo import (
@@ -128,14 +127,11 @@ class Objectron(PhotoDataset):
         if not names and not bad:
             raise DataError("the annotation files have no frames", where=str(folder))
         super().__init__(folder, names, bad)
-        self._sequence: Sequence | None = None
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
         path, number = self._frames[index]
-        if self._sequence is None or self._sequence.path != path:
-            self._sequence = read_sequence(path)
-        sequence = self._sequence
+        sequence = self._read_once(path, read_sequence)
         frame = sequence.frame(number)
         camera = _camera(frame.camera)
         view: FloatArray = np.reshape(frame.camera.view_matrix, (4, 4)).astype(float)

@@ -15,10 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, DegenerateError, InputError
+from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.facing import faced, rays_ahead, turned_alignment, turned_covariance
 from cadalign.estimation.model import is_exact_model
+from cadalign.estimation.options import pixel_information
 from cadalign.estimation.pack import evidence_of, tells_something
 from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.problems import are_on_a_line
@@ -37,11 +38,8 @@ _LEAST_POINTS = 3
 _ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
 _ITERATIONS = 50
 _MOST_STARTS = 8
-_REFUSED = {
-    "mask": "the outline of a mask is not measured through a wide lens",
-    "image": "the outline in a photo is not measured through a wide lens",
-    "depth": "depths are not measured along the rays of a wide lens",
-}
+_LEAST_AHEAD = 0.05  # cosine off a wide lens's axis below which a depth says nothing of a point
+_MOST_PIXELS = 500  # of a mask, amid which a wide lens is turned
 
 
 def views_without_pose(
@@ -252,23 +250,50 @@ def _factor_by_masks(
     return factor if factor > 0 else None
 
 
-def facing_view(view: View, number: int = 0) -> View:
-    """The view in the frame that faces its keypoints; ``up`` and the like stay in the lens's.
+def facing_view(view: View) -> View:
+    """The view in the frame that faces what it shows; ``up`` and the like stay in the lens's.
 
-    Raises InputError if the view, with a wide lens, has a mask or depths.
+    It faces the keypoints or, without any, the mask. Depths, along the lens's axis as they are
+    given, become those along the frame's.
     """
     if not needs_facing([view.camera]):
         return view
-    for name, what in _REFUSED.items():
-        if getattr(view, name) is not None:
-            fix = "leave it away, or undistort the photo to a pinhole's"
-            raise InputError(what, where=f"views[{number}].{name}", fix=fix)
-    camera, rig = faced(view.camera, view.pixels), view.cam_from_rig
+    shown = view.pixels
+    if not len(shown) and view.mask is not None:
+        inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
+        shown = inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)
+    camera, rig = faced(view.camera, shown), view.cam_from_rig
     if rig is not None:
         turn = np.eye(4)
         turn[:3, :3] = camera.lens_from_camera.T
         rig = turn @ np.asarray(rig)
-    return replace(view, camera=camera, cam_from_rig=rig)
+    turned = replace(view, camera=camera, cam_from_rig=rig)
+    return turned if view.depth is None else _with_facing_depths(turned, view.camera)
+
+
+def _with_facing_depths(turned: View, lens: Camera) -> View:
+    """A turned view whose depths, along the axis of its lens, become those along its own.
+
+    NaN for those of points beside the lens, of which that axis says nothing. A keypoint's noise
+    turns its ray, which adds to the standard deviation of its depth.
+    """
+    depth = np.array(turned.depth, dtype=np.float64)
+    known = np.isfinite(depth)
+    is_image = depth.ndim == 2
+    pixels = np.argwhere(known)[:, ::-1].astype(float) if is_image else turned.pixels[known]
+    rays, valid = lens.rays_where_valid(pixels)
+    along, ahead = rays[:, 2], rays @ turned.camera.lens_from_camera[:, 2]
+    usable = valid & (along > _LEAST_AHEAD) & (ahead > _LEAST_AHEAD)
+    along, ahead = (np.where(usable, each, 1.0) for each in (along, ahead))
+    depth[known] *= np.where(usable, ahead / along, np.nan)
+    if is_image:
+        return replace(turned, depth=depth)
+    noise = 1.0 if turned.sigma is None else turned.sigma
+    variances = np.linalg.inv(pixel_information(noise, len(depth)))[known]
+    angles = np.sqrt(np.trace(variances, axis1=1, axis2=2) / 2) / lens.fx
+    sigma = np.broadcast_to(np.asarray(turned.depth_sigma, dtype=np.float64), depth.shape).copy()
+    sigma[known] = np.sqrt(sigma[known] ** 2 + angles**2 * (along**-2 - 1 + ahead**-2 - 1))
+    return replace(turned, depth=depth, depth_sigma=sigma)
 
 
 def align_facing(
@@ -282,7 +307,7 @@ def align_facing(
 
     Raises InputError if keypoints lie all around a wide lens, unless they ``may_surround`` it.
     """
-    views = [facing_view(view, number) for number, view in enumerate(given)]
+    views = [facing_view(view) for view in given]
     for view in views:
         if view.camera.is_wide and not may_surround:
             rays_ahead(view.pixels, view.camera)

@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DegenerateError
+from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.assemble import canonical_result
 from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
@@ -213,7 +213,10 @@ def _mistake_in(
     def explain(mistake: Mistake) -> Explained | None:
         if mistake.mirrored:  # not a learned shape: its models share one frame
             return None
-        seen = seen_keypoints(view, mistake.undo_2d(given, view.camera), rows, options)
+        try:
+            seen = seen_keypoints(view, mistake.undo_2d(given, view.camera), rows, options)
+        except InputError:  # which a wide lens that faces the given ones does not see
+            return None
         minima, _ = search_view(mixture, seen, _given(None))
         if not minima.counts[0] or minima.costs[0] > _SUSPICIOUS * (2 * len(rows) - POSE):
             return None

@@ -62,11 +62,11 @@ class View(DeclaredEvidence):
     time : float, optional
         When the image was taken [s], for an estimate with a motion: views of one time share a pose.
     depth : (n,) or (h, w) float, or path, optional
-        Depths of the keypoints, their z in the camera's frame, or an image of such depths that is
-        registered to the photo, as an array or as a 16-bit PNG [model units, or the unit in which
-        the object's size is wanted]; 0 or NaN where unknown. A depth image is sampled robustly at
-        the keypoints and, with a mask and a mesh, over the visible surface; beside a photo its
-        steps show the outline.
+        Depths of the keypoints, their z in the camera's frame, also of a wide lens, or an image of
+        such depths that is registered to the photo, as an array or as a 16-bit PNG [model units, or
+        the unit in which the object's size is wanted]; 0 or NaN where unknown. A depth image is
+        sampled robustly at the keypoints and, with a mask and a mesh, over the visible surface;
+        beside a photo its steps show the outline.
     depth_sigma : float or (n,) float
         Standard deviation of the depths, relative; by default 0.01, 1 %.
     depth_scale : float, optional
@@ -147,6 +147,7 @@ class View(DeclaredEvidence):
             raise InputError(f"{quote(self.time)} is not a finite number", where="time")
         if self.depth is not None:
             self._keep("depth", _depths(self.depth, camera, len(points), self.depth_scale))
+            object.__setattr__(self, "depth_scale", None)  # a changed copy is not scaled again
         if self.up is not None:
             self._keep("up", _upwards(self.up, self.up_sigma_deg))
         if self.cam_from_rig is not None:

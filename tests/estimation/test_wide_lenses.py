@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
+from scipy.stats import chi2
 
 from cadalign import (
     Alignment,
     Camera,
     FocalPrior,
+    Mesh,
     Model,
     RansacOptions,
     Result,
@@ -26,6 +30,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.uncertainty.next_best import rank_evidence
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.render import Scene, cast_geometry
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import observe
 
@@ -313,12 +318,100 @@ def test_what_wide_lenses_do_not_go_with_is_refused() -> None:
     model = Model(points_3d=points, shape_sigma=0.1)
     with pytest.raises(InputError, match=text):
         align(model, View(FISHEYE, pixels), focal="estimate")
-    mask = np.zeros((1000, 1000), dtype=bool)
-    mask[400:600, 400:600] = True
-    with pytest.raises(InputError, match=r"^views\[0\].mask: the outline of a mask is not"):
-        align(model, View(FISHEYE, pixels, mask=mask))
-    with pytest.raises(InputError, match=r"^views\[0\].depth: depths are not measured along"):
-        align(model, View(FISHEYE, pixels, depth=np.full(20, 5.0)))
+
+
+class TestPictures:
+    """Masks, photos and depths of a body without symmetry, through a fisheye."""
+
+    CAMERA = Camera(480, 480, 140.0, 140.0, 239.5, 239.5, (0.01, -0.003, 0.0, 0.0), lens="fisheye")
+
+    def seen(self, angle: float, *names: str, keypoints: bool = True) -> tuple[View, Alignment]:
+        """A view of the body, with that evidence of it, and its pose."""
+        rng = np.random.default_rng(3)
+        truth = Alignment(placed(angle, 4).rotation, towards(angle, distance=2.5), (1, 1.2, 0.8))
+        frame = cast_geometry(Scene(self.mesh()), self.CAMERA, truth)
+        mask = frame.mask
+        rows, columns = np.nonzero(mask)
+        rays = self.CAMERA.unproject(np.stack([columns, rows], axis=1).astype(float))
+        given: dict[str, Any] = {}
+        if "mask" in names:
+            given["mask"] = mask
+        if "image" in names:
+            colors = np.where(mask[..., None], [190, 120, 60], [60, 90, 140])
+            photo = colors + rng.normal(0, 12, colors.shape)
+            given["image"] = photo.clip(0, 255).astype(np.uint8)
+        if "depth" in names:
+            given["depth"] = np.full(mask.shape, np.nan)
+            noise = 1 + 0.005 * rng.normal(size=len(rows))
+            given["depth"][rows, columns] = frame.depth[rows, columns] * rays[:, 2] * noise
+            given["depth"][given["depth"] <= 0] = np.nan
+            given["depth_sigma"] = 0.005
+        if keypoints:
+            pixels = self.CAMERA.project(truth.apply(self.mesh().vertices))
+            given["points_2d"] = pixels + rng.normal(size=pixels.shape)
+        return View(self.CAMERA, **given), truth
+
+    @staticmethod
+    def mesh() -> Mesh:
+        """Two blocks: a seat and a back."""
+        blocks = [trimesh.creation.box([1.0, 0.2, 0.6]), trimesh.creation.box([0.3, 0.6, 0.2])]
+        blocks[1].apply_translation([0.3, 0.35, -0.2])
+        joined = trimesh.util.concatenate(blocks)
+        return Mesh(np.asarray(joined.vertices), np.asarray(joined.faces))
+
+    def model(self) -> Model:
+        return Model(points_3d=self.mesh().vertices, mesh=self.mesh())
+
+    @pytest.mark.parametrize("angle", [0, 60, 100])
+    @pytest.mark.parametrize("names", [["mask"], ["image"], ["mask", "depth"]], ids="+".join)
+    def test_sharpen_the_estimate(self, angle: float, names: list[str]) -> None:
+        if angle > 80 and "depth" in names:  # whose depths are nowhere known
+            names = ["mask"]
+        view, truth = self.seen(angle, *names)
+        alone, _ = self.seen(angle)
+        found, before = align(self.model(), view), align(self.model(), alone)
+        share = 0.85 if "image" in names else 0.6
+        assert found.std.rotation_deg < share * before.std.rotation_deg
+        errors, covariance = errors_of(found, truth)[_FREE], found.covariance[np.ix_(_FREE, _FREE)]
+        assert errors @ np.linalg.solve(covariance, errors) < chi2.ppf(0.999, 8)
+        assert found.camera == self.CAMERA
+        assert {each.kind for each in found.evidence} >= {names[0].replace("image", "photo")}
+
+    @pytest.mark.parametrize("angle", [30, 100])
+    def test_a_mask_alone(self, angle: float) -> None:
+        view, truth = self.seen(angle, "mask", keypoints=False)
+        assert degrees_off(align(self.model(), view), truth) < 1.0
+
+    def test_a_mask_of_the_other_camera_of_a_rig(self) -> None:
+        view, truth = self.seen(30, "mask", keypoints=False)
+        pinhole = Camera(480, 480, 400, 400, 239.5, 239.5)
+        motion = np.eye(4)
+        motion[:3, :3] = rotation_from_vector([0.0, -np.radians(20), 0.0])
+        motion[:3, 3] = [-0.3, 0.0, 0.2]
+        pose = Alignment(
+            motion[:3, :3] @ truth.rotation,
+            motion[:3, :3] @ truth.translation + motion[:3, 3],
+            truth.scale,
+        )
+        pixels = pinhole.project(pose.apply(self.mesh().vertices))
+        views = [
+            View(pinhole, pixels, cam_from_rig=motion),
+            replace(view, cam_from_rig=np.eye(4)),
+        ]
+        found = align(self.model(), views)
+        assert found.alignment.scale == pytest.approx(truth.scale, rel=0.02)
+
+    def test_depths_at_keypoints(self) -> None:
+        rng = np.random.default_rng(1)
+        points, truth = points_of(1), placed(60)
+        in_camera = truth.apply(points)
+        pixels = FISHEYE.project(in_camera) + rng.normal(size=(20, 2))
+        depth = in_camera[:, 2] * (1 + 0.005 * rng.normal(size=20))
+        depth[depth < 0.3] = np.nan
+        model = Model(points_3d=points, shape_sigma=0.01)
+        found = align(model, View(FISHEYE, pixels, depth=depth, depth_sigma=0.005))
+        assert found.std.scale[0] > 0  # the size is estimated
+        assert found.alignment.scale == pytest.approx(truth.scale, abs=4 * max(found.std.scale))
 
 
 def test_retrieval_and_the_annotator_take_no_wide_lens(tmp_path) -> None:

@@ -451,20 +451,6 @@ def requests() -> list[Request]:
             lambda: align(similar, _wide(), focal="estimate"),
         ),
         Request(
-            "a mask, fisheye or fov lens",
-            "distances from an outline are measured in a pinhole's image plane",
-            "views[0].mask: the outline of a mask is not measured through a wide lens; "
-            "leave it away, or undistort the photo to a pinhole's",
-            lambda: align(exact, _wide(mask=mask)),
-        ),
-        Request(
-            "depths, fisheye or fov lens",
-            "a depth along the optical axis says nothing of a point beside the camera",
-            "views[0].depth: depths are not measured along the rays of a wide lens; "
-            "leave it away, or undistort the photo to a pinhole's",
-            lambda: align(exact, _wide(depth=np.full(len(SHOWN), 3.0))),
-        ),
-        Request(
             "keypoints on all sides of a camera",
             "rays are compared in the image of a pinhole that faces them",
             "points_2d: the keypoints surround the camera: 6 of 15 lie more than 85 degrees off "

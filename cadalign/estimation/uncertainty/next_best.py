@@ -255,7 +255,7 @@ class _KnownScene:
     def covariance(self) -> FloatArray:
         """Covariance (9, 9) of an estimate, as `cadalign.Result.covariance`, linearised."""
         if needs_facing([view.camera for view in self.views]):
-            views = tuple(facing_view(view, number) for number, view in enumerate(self.views))
+            views = tuple(map(facing_view, self.views))
             turns = [view.camera.lens_from_camera for view in views]
             pairs = zip(self.poses, turns, strict=True)
             poses = tuple(turned_alignment(pose, turn.T) for pose, turn in pairs)

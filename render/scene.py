@@ -14,14 +14,8 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.raycaster import (
-    EmbreeEngine,
-    FaceArray,
-    RayCaster,
-    SingleArray,
-    face_normals,
-)
+from cadalign.geometry.mesh import Mesh, face_normals
+from cadalign.geometry.raycaster import FaceArray, RayCaster, SingleArray
 from cadalign.render.drawing.canvas import ByteImage, composite
 from cadalign.render.raycast.surface import SurfaceColors, coincident_faces, corner_normals
 
@@ -77,12 +71,12 @@ class Scene:
     @cached_property
     def caster(self) -> RayCaster:
         """The ray hierarchy."""
-        return RayCaster(self.mesh, self.face_normals, engine=EmbreeEngine)
+        return RayCaster(self.mesh, normals=self.face_normals)
 
     @cached_property
     def open3d_caster(self) -> RayCaster:
         """The same built by Open3D, which must be importable."""
-        return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
+        return RayCaster(self.mesh, normals=self.face_normals, engine=Open3DEngine)
 
     def derived(self, make: Callable[[Scene], T]) -> T:
         """Make of the scene what a renderer draws, once; ``make`` is a function of its module."""

@@ -11,7 +11,8 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh, cluster, mesh_edges, simplify
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import cluster, mesh_edges, simplify
 from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene
 from cadalign.render.viewpoints import visible_keypoints

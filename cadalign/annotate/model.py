@@ -15,8 +15,9 @@ from trimesh.triangles import closest_point
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
-from cadalign.geometry.mesh import Mesh, mesh_edges, simplify
+from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray, RayCaster
+from cadalign.geometry.simplify import mesh_edges, simplify
 from cadalign.render.drawing.canvas import bytes_from_linear
 from cadalign.render.raycast.surface import coincident_faces
 from cadalign.render.scene import Scene

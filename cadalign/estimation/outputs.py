@@ -141,7 +141,7 @@ def _plot_keypoints(
 
 def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
     """Brightness (h, w) of a mesh lit from the camera on a coarse grid; NaN beside it."""
-    from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
+    from cadalign.geometry.raycaster import RayCaster
 
     step = max(1.0, max(camera.width, camera.height) / _LONGEST_SIDE)
     width, height = round(camera.width / step), round(camera.height / step)
@@ -153,7 +153,7 @@ def _shade(camera: Camera, alignment: Alignment, mesh: Mesh) -> FloatArray:
     # depth * ray = R (scale * x) + t, in the model's own coordinates
     directions = rays @ alignment.rotation / alignment.scale
     origin = -(alignment.translation @ alignment.rotation) / alignment.scale
-    caster = RayCaster(mesh, face_normals(mesh.triangles), engine=EmbreeEngine)
+    caster = RayCaster(mesh)
     faces, distance = caster.first_hits(origin, directions)
     hit = (faces >= 0) & valid & (distance > 0)
     normals = (caster.normals(faces[hit]) / alignment.scale) @ alignment.rotation.T

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points, is_masked, is_number
-from cadalign.errors import InputError, quote
+from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
+from cadalign.errors import InputError
+from cadalign.geometry.calibration import Calibration
 from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
-from cadalign.geometry.camera_form import read_form, read_matrix, write_form
 from cadalign.geometry.pixels import (
-    PIXEL_CENTRE,
-    LensKind,
-    PixelOrigin,
-    checked_coefficients,
     distort,
     image_of,
     largest_angle,
     perspective,
     rays_of_image,
-    require_perspective_lens,
-    rescaled_pixels,
     undistort,
 )
 
@@ -32,8 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-@dataclass(frozen=True)
-class Camera:
+class Camera(Calibration):
     """A calibrated camera: a pinhole, with lens distortion or without, or a wide lens.
 
     Camera axes are OpenCV's: x right, y down, z forward. Integer pixel coordinates are pixel
@@ -74,177 +67,6 @@ class Camera:
     [[633.66, 319.5]]
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-    lens: LensKind = field(default="perspective", kw_only=True)
-    focal_known: bool = field(default=True, kw_only=True, repr=False)
-    turn: tuple[float, ...] = field(default=(), kw_only=True, repr=False)
-    """Rotation by rows from the frame that `turned` gave to the lens's own; empty for none."""
-
-    def __post_init__(self) -> None:
-        for name in ("width", "height"):
-            size = getattr(self, name)
-            if not is_number(size) or int(size) != size or size < 1:
-                what = f"{quote(size)} is not a size"
-                raise InputError(what, where=f"camera.{name}", fix=_SIZE_FIX)
-            object.__setattr__(self, name, int(size))
-        for name in ("fx", "fy", "cx", "cy"):
-            value = getattr(self, name)
-            if not is_number(value):
-                raise InputError(f"{quote(value)} is not a finite number", where=f"camera.{name}")
-            object.__setattr__(self, name, float(value))
-        for name in ("fx", "fy"):
-            if getattr(self, name) <= 0:
-                what = f"the focal length is {getattr(self, name):g}"
-                fix = "give the calibrated focal length in pixels"
-                raise InputError(what, where=f"camera.{name}", fix=fix)
-        known: object = self.focal_known
-        if not isinstance(known, bool | np.bool_):
-            what = f"{quote(known)} is neither True nor False"
-            raise InputError(what, where="camera.focal_known")
-        try:
-            if np.iscomplexobj(self.distortion) or is_masked(self.distortion):
-                raise TypeError
-            coefficients = tuple(float(value) for value in self.distortion)
-        except (TypeError, ValueError, OverflowError, NotImplementedError):  # of a memoryview
-            raise InputError("not a sequence of numbers", where="camera.distortion") from None
-        coefficients = checked_coefficients(self.lens, coefficients)
-        object.__setattr__(self, "distortion", coefficients)
-        if not self.focal_known:
-            require_perspective_lens(self.lens, where="camera.lens")
-
-    @classmethod
-    def from_fov(cls, width: int, height: int, *, fov_x: float) -> Camera:
-        """Make a camera with square pixels from its horizontal field of view ``fov_x`` [degrees].
-
-        Examples
-        --------
-        >>> round(Camera.from_fov(640, 480, fov_x=90.0).fx, 6)
-        320.0
-        """
-        if not is_number(fov_x) or not 0 < fov_x < 180:
-            raise InputError(f"{quote(fov_x)} is not between 0 and 180 degrees", where="fov_x")
-        for name, size in (("width", width), ("height", height)):
-            if not is_number(size):
-                what = f"{quote(size)} is not a size"
-                raise InputError(what, where=f"camera.{name}", fix=_SIZE_FIX)
-        with np.errstate(over="ignore"):
-            focal = 0.5 * width / np.tan(np.radians(fov_x) / 2)
-        return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-
-    @classmethod
-    def from_matrix(
-        cls,
-        matrix: npt.ArrayLike,
-        width: int,
-        height: int,
-        *,
-        pixel_origin: PixelOrigin = "center",
-        distortion: tuple[float, ...] = (),
-        lens: LensKind = "perspective",
-    ) -> Camera:
-        """Make a camera from its calibration matrix K.
-
-        Parameters
-        ----------
-        matrix : (3, 3) float
-            ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` [px], without skew.
-        pixel_origin : {"center", "corner"}
-            Where (0, 0) lies for the principal point: at the centre of the top-left pixel (OpenCV,
-            Kalibr, BOP), or at the top-left corner of the image (COLMAP, PyTorch3D, many
-            renderers), half a pixel away.
-
-        Raises
-        ------
-        InputError
-            If it is no such matrix.
-
-        Examples
-        --------
-        >>> K = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]
-        >>> Camera.from_matrix(K, 640, 480, pixel_origin="corner").cx
-        319.5
-        """
-        return cls(width, height, *read_matrix(matrix, pixel_origin), distortion, lens=lens)
-
-    @classmethod
-    def without_focal(
-        cls,
-        width: int,
-        height: int,
-        *,
-        cx: float | None = None,
-        cy: float | None = None,
-        distortion: tuple[float, ...] = (),
-    ) -> Camera:
-        """Make a camera of which only the image is known, for ``fit(..., focal="estimate")``.
-
-        Its pixels are square. ``fx`` and ``fy`` are placeholders; `project`, `normalize` and fits
-        with a known focal length refuse it. The principal point is the image's centre by default.
-
-        Examples
-        --------
-        >>> camera = Camera.without_focal(640, 480)
-        >>> camera.cx, camera.cy, camera.focal_known
-        (319.5, 239.5, False)
-        >>> camera.with_focal(700).fy
-        700.0
-        """
-        if not is_number(width) or not is_number(height) or min(width, height) < 1:
-            what = f"{quote(width)} x {quote(height)} is not a size"
-            raise InputError(what, where="camera.width", fix=_SIZE_FIX)
-        focal = float(max(width, height))
-        cx = (width - 1) / 2 if cx is None else cx
-        cy = (height - 1) / 2 if cy is None else cy
-        return cls(width, height, focal, focal, cx, cy, distortion, focal_known=False)
-
-    def with_focal(self, focal: float) -> Camera:
-        """The same camera with the horizontal focal length ``focal`` [px], known from now on.
-
-        The shape of its pixels stays: ``fy`` changes in proportion.
-        """
-        if not is_number(focal):
-            raise InputError(f"{quote(focal)} is not a finite number", where="focal")
-        return replace(self, fx=focal, fy=focal * (self.fy / self.fx), focal_known=True)
-
-    def resized(self, width: int, height: int) -> Camera:
-        """The camera of the image after it was resized to so many pixels.
-
-        Examples
-        --------
-        >>> Camera(4, 2, fx=3, fy=3, cx=1.5, cy=0.5).resized(8, 4).cx
-        3.5
-        """
-        factors = np.array([width / self.width, height / self.height])
-        cx, cy = rescaled_pixels(np.array([self.cx, self.cy]), factors).tolist()
-        fx, fy = (factors * (self.fx, self.fy)).tolist()
-        return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
-
-    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The camera of a part of the image whose first pixel is (``left``, ``top``).
-
-        The part may reach beyond the image, as a crop with a border does.
-
-        Examples
-        --------
-        >>> camera = Camera(640, 480, fx=900, fy=900, cx=319.5, cy=239.5)
-        >>> part = camera.cropped(100, 50, 200, 300)
-        >>> part.cx, part.cy, part.width
-        (219.5, 189.5, 200)
-        """
-        cx, cy = self.cx - left, self.cy - top
-        return replace(self, width=width, height=height, cx=cx, cy=cy)
-
-    @property
-    def matrix(self) -> FloatArray:
-        """The calibration matrix K, (3, 3) float, of pixels whose centres are integers."""
-        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=float)
-
     def turned(self, rotation: npt.ArrayLike) -> Camera:
         """The same camera of a wide lens, its points in a frame that is turned about its centre.
 
@@ -284,12 +106,6 @@ class Camera:
             return np.asarray(points[:, 2] > 0)
         angle = np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2])
         return np.asarray((angle < largest_angle(self.lens, self.distortion)) & points.any(axis=1))
-
-    def require_focal(self) -> None:
-        """Refuse a camera `without_focal` by an InputError."""
-        if not self.focal_known:
-            fix = 'estimate it with focal="estimate", or give it: camera.with_focal(...)'
-            raise InputError("the focal length is unknown", where="camera", fix=fix)
 
     def project(self, points_cam: npt.ArrayLike) -> FloatArray:
         """Project points (n, 3) of the camera frame to pixels (n, 2), in the image or beside it.
@@ -447,18 +263,6 @@ class Camera:
             return np.asarray(slopes / np.array([[self.fx], [self.fy]]))
         return distort(normalized, self.lens, self.distortion)[1]
 
-    @property
-    def is_centred(self) -> bool:
-        """True if the principal point is within an eighth of the image's size of its middle."""
-        x, y = (self.cx + PIXEL_CENTRE) / self.width, (self.cy + PIXEL_CENTRE) / self.height
-        return max(abs(x - 1 / 2), abs(y - 1 / 2)) < 1 / 8
-
-    def contains(self, points_2d: FloatArray, *, margin: float = 0.0) -> BoolArray:
-        """Say which pixels (..., 2) lie at least ``margin`` [px] inside the image; (...) bool."""
-        low = -0.5 + margin
-        high = np.array([self.width, self.height]) - 0.5 - margin
-        return np.asarray(((points_2d >= low) & (points_2d <= high)).all(axis=-1))
-
     def _repr_html_(self) -> str:
         focal, angle = "unknown", "unknown"
         if self.focal_known:
@@ -488,65 +292,6 @@ class Camera:
         picture = draw_picture(draw, aspect=self.height / self.width)
         return card("Camera", rows, picture=picture)
 
-    def to_dict(self, *, pixel_origin: PixelOrigin | None = None) -> dict[str, Any]:
-        """Write the camera as COLMAP does: ``{"model", "width", "height", "params"}``.
-
-        COLMAP puts the centre of the top-left pixel at (0.5, 0.5), so the principal point there
-        is larger by half a pixel than ``cx`` and ``cy`` here. An unknown focal length is None,
-        ``null`` in JSON.
-
-        Parameters
-        ----------
-        pixel_origin : {"corner", "center"}, optional
-            Where (0, 0) lies for the written principal point: the top-left corner of the image,
-            or the centre of the top-left pixel; stated in ``pixel_origin``. By default COLMAP's
-            corner, not stated.
-
-        Examples
-        --------
-        >>> camera = Camera(640, 480, 500, 500, 319.5, 239.5)
-        >>> camera.to_dict()["params"]
-        [500.0, 500.0, 320.0, 240.0]
-        >>> camera.to_dict(pixel_origin="center")["params"]
-        [500.0, 500.0, 319.5, 239.5]
-        """
-        if self.turn:
-            what = "a camera in a turned frame has no form in files"
-            raise InputError(what, where="camera", fix="write the camera that was turned")
-        return write_form(vars(self), pixel_origin)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Camera:
-        """Read a camera in COLMAP's form, see `to_dict`, or as a calibration matrix.
-
-        Parameters
-        ----------
-        data : mapping
-            ``model`` (SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV,
-            SIMPLE_RADIAL_FISHEYE, RADIAL_FISHEYE, OPENCV_FISHEYE, THIN_PRISM_FISHEYE or FOV),
-            ``width``, ``height``, and ``params`` in COLMAP's order and pixel convention. None in
-            the place of the focal lengths, or ``width`` and ``height`` alone, give a camera
-            `without_focal`. Or ``matrix`` (3, 3), ``width``, ``height`` and optionally
-            ``distortion`` and ``lens``, as for `from_matrix`. ``pixel_origin`` states where (0, 0)
-            lies: by default ``"corner"`` for ``params`` and ``"center"`` for ``matrix``.
-
-        Raises
-        ------
-        InputError
-            If a field is missing, the model is unknown, or the number of parameters is wrong.
-
-        Examples
-        --------
-        >>> Camera.from_dict({"model": "SIMPLE_RADIAL", "width": 640, "height": 480,
-        ...                   "params": [500, 320, 240, 0.1]}).distortion
-        (0.1, 0.0, 0.0, 0.0)
-        >>> matrix = [[500, 0, 319.5], [0, 500, 239.5], [0, 0, 1]]
-        >>> Camera.from_dict({"matrix": matrix, "width": 640, "height": 480}).cx
-        319.5
-        """
-        fields = read_form(data)
-        return cls(**fields) if "fx" in fields else cls.without_focal(**fields)
-
 
 def needs_facing(cameras: Sequence[Camera]) -> bool:
     """True if any of the cameras has a wide lens whose frame faces nothing yet."""
@@ -563,6 +308,3 @@ def _check_undone(valid: BoolArray) -> None:
         what = f"the lens distortion cannot be undone at {len(failed)} of {len(valid)} pixels, "
         fix = "these lie outside the area in which the lens model is valid; drop them"
         raise InputError(f"{what}the first is point {failed[0]}", where="points_2d", fix=fix)
-
-
-_SIZE_FIX = "give the image size in whole pixels"

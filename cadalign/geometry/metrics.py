@@ -23,6 +23,18 @@ from cadalign.geometry.rotations import angles_between, dots, lengths
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 
+__all__ = [
+    "alignment_box_iou",
+    "box_iou",
+    "box_iou_up_to_scale",
+    "nearest_truth",
+    "reprojection_error",
+    "rotation_error",
+    "scale_error",
+    "translation_error",
+    "translation_error_up_to_scale",
+]
+
 _SAME_STRETCH = 0.01  # relative difference of true scales that annotations do not tell from 0
 _LEAST_SIDE = 1e-9  # of the longest side of a box with a volume
 

@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from cadalign.arrays import FloatArray
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, face_normals
 
 FaceArray = npt.NDArray[np.int32]
 SingleArray = npt.NDArray[np.float32]
@@ -64,22 +64,21 @@ class EmbreeEngine:
         return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
 
 
-def face_normals(triangles: FloatArray) -> FloatArray:
-    """Unit normals of triangles (m, 3, 3), (m, 3) float; zero for one without area."""
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.asarray(normals / np.where(length > 0, length, 1.0))
-
-
 class RayCaster:
-    """A bounding volume hierarchy over a mesh, then only read; safe in several threads."""
+    """A bounding volume hierarchy over a mesh, then only read; safe in several threads.
 
-    def __init__(self, mesh: Mesh, face_normals: FloatArray, *, engine: EngineMaker) -> None:
+    ``normals`` (m, 3) are the unit normals of its faces, where they are known already.
+    """
+
+    def __init__(
+        self, mesh: Mesh, *, normals: FloatArray | None = None, engine: EngineMaker = EmbreeEngine
+    ) -> None:
         low, high = mesh.bounds
         self._center = (low + high) / 2
         # A mesh of a single point has no size; any radius serves.
         self._radius = float(np.linalg.norm(high - low)) / 2 or 1.0
-        self._triangles, self._normals = mesh.triangles, face_normals
+        self._triangles = mesh.triangles
+        self._normals = face_normals(self._triangles) if normals is None else normals
         unit = (mesh.vertices - self._center) / self._radius
         self._engine = engine(unit.astype(np.float32), mesh.faces.astype(np.int32))
 

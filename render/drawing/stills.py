@@ -12,7 +12,6 @@ import numpy.typing as npt
 from cadalign.errors import InputError, unknown
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import resized_camera
 from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.drawing.pictures import (
     depth_picture,
@@ -153,7 +152,7 @@ def turntable(
 
 
 def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:
-    doubled = resized_camera(camera, 2 * camera.width, 2 * camera.height)
+    doubled = camera.resized(2 * camera.width, 2 * camera.height)
     lines = line_picture(cast_geometry(scene, doubled, cam_from_model))
     # Two pixels wide there is one pixel wide here.
     lines[:, :, 3] = cv2.dilate(lines[:, :, 3], np.ones((2, 2), np.uint8))

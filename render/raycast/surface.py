@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.geometry.mesh import Mesh, number_rows
+from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray
+from cadalign.geometry.simplify import number_rows
 from cadalign.render.drawing.canvas import LinearArray, linear_from_bytes, linear_from_srgb
 
 

@@ -15,7 +15,7 @@ from cadalign.annotate.lines import Wireframe, box_lines
 from cadalign.annotate.model import ClickableModel, display_bytes, find_rim
 from cadalign.datasets import KeypointNet, ModelKeypoints, load_mesh
 from cadalign.errors import DataError, InputError
-from cadalign.geometry.mesh import simplify
+from cadalign.geometry.simplify import simplify
 
 SQUARE = [[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]]
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from cadalign import Mesh
-from cadalign.geometry.mesh import cluster, first_of_each, mesh_edges, number_rows, simplify
+from cadalign.geometry.simplify import cluster, first_of_each, mesh_edges, number_rows, simplify
 
 
 def soup(mesh: trimesh.Trimesh, *, seed: int = 0) -> Mesh:

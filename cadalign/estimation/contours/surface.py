@@ -20,7 +20,7 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.estimation.model import Model
 from cadalign.geometry.mesh import Mesh
-from cadalign.geometry.raycaster import EmbreeEngine, RayCaster, face_normals
+from cadalign.geometry.raycaster import RayCaster
 from cadalign.io.meshes.load import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.warp import LinearWarp, linear_warp
@@ -127,7 +127,7 @@ def corners_of(mesh: Mesh) -> FloatArray:
 
 def caster_of(mesh: Mesh) -> RayCaster:
     """The ray hierarchy of a mesh."""
-    return RayCaster(mesh, face_normals(mesh.triangles), engine=EmbreeEngine)
+    return RayCaster(mesh)
 
 
 def _barycentric(triangles: FloatArray, points: FloatArray) -> FloatArray:

@@ -24,7 +24,8 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import resized_camera
-from cadalign.geometry.mesh import Mesh, cluster, mesh_edges, simplify
+from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.simplify import cluster, mesh_edges, simplify
 from cadalign.io.files import dense_json, made_folder, write_text, write_whole
 from cadalign.io.images import write_image
 from cadalign.render import RaycastRenderer, draw_overlay

@@ -21,6 +21,7 @@ from cadalign.datasets.photos.photo import (
 )
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import extent
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import nearest_rigid
@@ -149,7 +150,7 @@ class AlignedObject:
             return self.mesh.bounds
         if not len(self.points_3d):
             raise InputError("there is neither a mesh nor a keypoint", where="mesh", fix="give one")
-        return np.array([self.points_3d.min(axis=0), self.points_3d.max(axis=0)])
+        return extent(self.points_3d)
 
     def require_mesh(self) -> Mesh:
         """The mesh.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, quote
 from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame, photos_of
 from cadalign.export.camera_files import write_nerf, write_open3d
+from cadalign.export.scene_parts import write_line_set
 from cadalign.export.usd import write_usd
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
@@ -89,14 +89,10 @@ class Format:
     endings: tuple[str, ...] = ()
 
 
-def _with_trimesh(name: str) -> Writer:
-    """A writer of `cadalign.export.glb`, which is loaded when it is called."""
+def _glb(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    from cadalign.export.glb import write_glb  # loads trimesh
 
-    def write(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
-        writer = getattr(import_module("cadalign.export.glb"), name)
-        writer(path, exported, frame=options.frame)
-
-    return write
+    write_glb(path, exported, frame=options.frame)
 
 
 def _mesh_in_metres(exported: AlignedObject, options: ExportOptions) -> Mesh:
@@ -185,9 +181,7 @@ def _camera_views(exported: AlignedObject, options: ExportOptions) -> list[Camer
 
 
 FORMATS: dict[str, Format] = {
-    "glb": Format(
-        "textured model, cameras and photos, for viewers", _with_trimesh("write_glb"), (".glb",)
-    ),
+    "glb": Format("textured model, cameras and photos, for viewers", _glb, (".glb",)),
     "usd": Format(
         "the same as USD",
         lambda path, exported, options: write_usd(path, exported, frame=options.frame),
@@ -205,7 +199,7 @@ FORMATS: dict[str, Format] = {
     ),
     "lines": Format(
         "box and cameras as Open3D's line set (PLY)",
-        _with_trimesh("write_line_set"),
+        lambda path, exported, options: write_line_set(path, exported, frame=options.frame),
         (".lines.ply",),
     ),
     "bop-results": Format(

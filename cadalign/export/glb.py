@@ -23,18 +23,15 @@ import trimesh
 from PIL import Image
 from trimesh.visual.color import srgb_to_linear
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.scene_parts import MeshPart, PhotoPlane, parts_of, photo_depth, photo_plane
-from cadalign.geometry.box import BOX_EDGES, Box
+from cadalign.export.scene_parts import MeshPart, PlacedPhoto, parts_of, placed_parts
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
-from cadalign.io.files import write_text, write_whole
+from cadalign.io.files import write_whole
 
-_FLIP = np.diag([*OPENGL_AXES, 1.0])
-_NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
 _gltf: Any = trimesh.exchange.gltf  # which has no types
 _visual: Any = trimesh.visual
 _UNLIT = "KHR_materials_unlit"
@@ -56,23 +53,23 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
     DataError
         If a photo cannot be read.
     """
-    root = _FLIP if frame == "camera" else np.eye(4)
-    nodes, cameras = _model_nodes(exported, root, frame), []
-    for number, view in enumerate(exported.views):
-        plane = photo_plane(view.camera, view.read_image())
-        depth = photo_depth(exported, number) * exported.metres
-        pose = root @ exported.frame_from_cam(frame, number) @ _FLIP
-        pose[:3, 3] *= exported.metres
-        cameras.append((_camera(plane, depth), pose))
-        if plane.image is not None:
-            nodes.append(_photo_node(f"photo_{number}", plane, depth, pose))
+    placing, photos = placed_parts(exported, frame)
+    nodes: list[_Node] = [
+        (f"{exported.name}_{number}", part_mesh(part), part_material(part), placing)
+        for number, part in enumerate(parts_of(exported.require_mesh()))
+    ]
+    nodes += [
+        _photo_node(f"photo_{number}", photo)
+        for number, photo in enumerate(photos)
+        if photo.plane.image is not None
+    ]
     scene = trimesh.Scene()
     for name, mesh, _, place in nodes:
         scene.add_geometry(mesh, geom_name=name, node_name=name, transform=place)
 
     def complete(tree: dict[str, Any]) -> None:
         set_materials(tree, {name: material for name, _, material, _ in nodes})
-        _add_cameras(tree, cameras)
+        _add_cameras(tree, photos)
 
     _write(path, scene, complete)
 
@@ -80,15 +77,6 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
 def _write(path: Path, scene: Any, complete: Callable[[dict[str, Any]], None]) -> None:
     data = _gltf.export_glb(scene, include_normals=False, tree_postprocessor=complete)
     write_whole(path, lambda unfinished: unfinished.write_bytes(data))
-
-
-def _model_nodes(exported: AlignedObject, root: FloatArray, frame: Frame) -> list[_Node]:
-    placing = root @ exported.frame_from_model(frame).cam_from_model
-    placing[:3] *= exported.metres
-    return [
-        (f"{exported.name}_{number}", part_mesh(part), part_material(part), placing)
-        for number, part in enumerate(parts_of(exported.require_mesh()))
-    ]
 
 
 def part_mesh(part: MeshPart) -> trimesh.Trimesh:
@@ -108,14 +96,14 @@ def _textured(vertices: FloatArray, faces: Any, uv: FloatArray, texture: Any) ->
     return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
 
 
-def _photo_node(name: str, plane: PhotoPlane, depth: float, pose: FloatArray) -> _Node:
-    mesh = _textured(*plane.rectangle(depth), plane.image)
+def _photo_node(name: str, photo: PlacedPhoto) -> _Node:
+    mesh = _textured(*photo.plane.rectangle(photo.depth), photo.plane.image)
     material = {
         "name": name,
         "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
         "extensions": {_UNLIT: {}},
     }
-    return name, mesh, material, pose
+    return name, mesh, material, photo.pose
 
 
 def part_material(part: MeshPart) -> dict[str, Any]:
@@ -141,18 +129,6 @@ def part_material(part: MeshPart) -> dict[str, Any]:
     return look
 
 
-def _camera(plane: PhotoPlane, depth: float) -> dict[str, Any]:
-    return {
-        "type": "perspective",
-        "perspective": {
-            "aspectRatio": plane.aspect,
-            "yfov": plane.yfov,
-            "znear": _NEAR * depth,
-            "zfar": _FAR * depth,
-        },
-    }
-
-
 def set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> None:
     """Replace trimesh's materials, which only bring the textures along."""
     brought = tree.get("materials", [])
@@ -175,69 +151,18 @@ def set_materials(tree: dict[str, Any], looks: dict[str, dict[str, Any]]) -> Non
         tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", []), _UNLIT})
 
 
-def _add_cameras(
-    tree: dict[str, Any], cameras: Sequence[tuple[dict[str, Any], FloatArray]]
-) -> None:
+def _add_cameras(tree: dict[str, Any], photos: Sequence[PlacedPhoto]) -> None:
     tree["cameras"] = []
     roots = tree["scenes"][tree["scene"]]["nodes"]
-    for number, (camera, place) in enumerate(cameras):
+    for number, photo in enumerate(photos):
         name = f"camera_{number}"
-        tree["cameras"].append({"name": name, **camera})
+        near, far = photo.clipping
+        plane = photo.plane
+        look = {"aspectRatio": plane.aspect, "yfov": plane.yfov, "znear": near, "zfar": far}
+        tree["cameras"].append({"name": name, "type": "perspective", "perspective": look})
         roots.append(len(tree["nodes"]))
-        matrix = place.T.ravel().tolist()
+        matrix = photo.pose.T.ravel().tolist()
         tree["nodes"].append({"name": name, "camera": number, "matrix": matrix})
-
-
-_BOX_COLOR = (230, 60, 50)
-_CAMERA_COLOR = (40, 90, 200)
-_FRUSTUM = 0.25  # depth of a drawn camera over the object's distance
-_FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
-
-_Lines = tuple[FloatArray, IntArray, tuple[int, int, int]]
-
-
-def write_line_set(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
-    """Write the box of the object and a pyramid for each camera as edges of a PLY file.
-
-    ``open3d.io.read_line_set`` reads it.
-
-    Raises
-    ------
-    InputError
-        If the frame is not known, or there is neither mesh nor keypoints.
-    """
-    box = Box.from_model(exported.bounds, exported.frame_from_model(frame))
-    pieces: list[_Lines] = [(box.corners, np.array(BOX_EDGES), _BOX_COLOR)]
-    pieces += [_pyramid(exported, number, frame) for number in range(len(exported.views))]
-    points = np.concatenate([points for points, _, _ in pieces]) * exported.metres
-    starts = np.cumsum([0, *(len(points) for points, _, _ in pieces)])
-    edges = [
-        f"{a + start} {b + start} {red} {green} {blue}"
-        for (_, pairs, (red, green, blue)), start in zip(pieces, starts, strict=False)
-        for a, b in pairs.tolist()
-    ]
-    header = [
-        "ply",
-        "format ascii 1.0",
-        f"element vertex {len(points)}",
-        *(f"property double {axis}" for axis in "xyz"),
-        f"element edge {len(edges)}",
-        "property int vertex1",
-        "property int vertex2",
-        *(f"property uchar {name}" for name in ("red", "green", "blue")),
-        "end_header",
-    ]
-    vertices = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points.tolist()]
-    write_text(path, "\n".join([*header, *vertices, *edges]) + "\n")
-
-
-def _pyramid(exported: AlignedObject, number: int, frame: Frame) -> _Lines:
-    view = exported.views[number]
-    distance = float(np.linalg.norm(view.cam_from_model.translation))
-    corners = photo_plane(view.camera, None).corners * _FRUSTUM * (distance or 1.0)
-    pose = exported.frame_from_cam(frame, number)
-    points = np.vstack([np.zeros(3), corners]) @ pose[:3, :3].T + pose[:3, 3]
-    return points, np.array(_FRUSTUM_EDGES), _CAMERA_COLOR
 
 
 _FLOAT = 5126  # as glTF numbers it

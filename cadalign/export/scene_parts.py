@@ -1,4 +1,4 @@
-"""Parts of a scene for viewers: a photo as a rectangle before its camera, meshes of one material.
+"""Parts of a scene for viewers: photos as rectangles, meshes of one material, cameras as lines.
 
 glTF's cameras have their principal point in the image's centre and no lens distortion. So the photo
 becomes a textured rectangle at the place where the camera sees it, and the camera's field of view
@@ -10,14 +10,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.export.aligned_object import AlignedObject
+from cadalign.export.aligned_object import AlignedObject, Frame
+from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.geometry.conventions import OPENGL_AXES, OPENGL_FLIP
 from cadalign.geometry.mesh import Material, Mesh
+from cadalign.io.files import write_text
 from cadalign.io.images import ByteImage
 
 _BORDER = 0.5  # from the corner pixel's centre to the image's border [px]
@@ -25,6 +28,7 @@ _GROWTH = 2.0  # how much larger than the photo an undistorted one may become, e
 _AGREES = 1e-6
 _RIM = 1.5  # how far the border's colours go on beyond the photo [px]
 _BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
+_NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +85,43 @@ def photo_plane(camera: Camera, image: ByteImage | None) -> PhotoPlane:
     return PhotoPlane(image, (-_BORDER - centre) / focal, (size - _BORDER - centre) / focal)
 
 
-def photo_depth(exported: AlignedObject, number: int) -> float:
+@dataclass(frozen=True, eq=False)
+class PlacedPhoto:
+    """A photo in a scene, behind the object."""
+
+    plane: PhotoPlane
+    """Its rectangle at depth 1."""
+    depth: float
+    """Depth at which it stands [m]."""
+    pose: FloatArray
+    """Pose (4, 4) of its camera, which has glTF's axes [m]."""
+
+    @property
+    def clipping(self) -> tuple[float, float]:
+        """Depths between which a viewer draws [m]."""
+        return _NEAR * self.depth, _FAR * self.depth
+
+
+def placed_parts(
+    exported: AlignedObject, frame: Frame
+) -> tuple[FloatArray, tuple[PlacedPhoto, ...]]:
+    """Place an object's model, (4, 4) float, and its photos in a scene that is measured in metres.
+
+    The scene has the axes of the frame; those of the first camera are turned to glTF's.
+    """
+    root = OPENGL_FLIP if frame == "camera" else np.eye(4)
+    placing = root @ exported.frame_from_model(frame).cam_from_model
+    placing[:3] *= exported.metres
+    photos = []
+    for number, view in enumerate(exported.views):
+        pose = root @ exported.frame_from_cam(frame, number) @ OPENGL_FLIP
+        pose[:3, 3] *= exported.metres
+        depth = _photo_depth(exported, number) * exported.metres
+        photos.append(PlacedPhoto(photo_plane(view.camera, view.read_image()), depth, pose))
+    return placing, tuple(photos)
+
+
+def _photo_depth(exported: AlignedObject, number: int) -> float:
     """Depth at which a view's photo stands, behind the object [units of the camera frame]."""
     low, high = exported.bounds
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -169,3 +209,55 @@ def parts_of(mesh: Mesh) -> Iterator[MeshPart]:
         colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
         faces = inverse.reshape(-1, 3).astype(np.int64)
         yield MeshPart(material, mesh.vertices[used], faces, uv, colors)
+
+
+_BOX_COLOR = (230, 60, 50)
+_CAMERA_COLOR = (40, 90, 200)
+_FRUSTUM = 0.25  # depth of a drawn camera over the object's distance
+_FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
+
+_Lines = tuple[FloatArray, IntArray, tuple[int, int, int]]
+
+
+def write_line_set(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
+    """Write the box of the object and a pyramid for each camera as edges of a PLY file.
+
+    ``open3d.io.read_line_set`` reads it.
+
+    Raises
+    ------
+    InputError
+        If the frame is not known, or there is neither mesh nor keypoints.
+    """
+    box = Box.from_model(exported.bounds, exported.frame_from_model(frame))
+    pieces: list[_Lines] = [(box.corners, np.array(BOX_EDGES), _BOX_COLOR)]
+    pieces += [_pyramid(exported, number, frame) for number in range(len(exported.views))]
+    points = np.concatenate([points for points, _, _ in pieces]) * exported.metres
+    starts = np.cumsum([0, *(len(points) for points, _, _ in pieces)])
+    edges = [
+        f"{a + start} {b + start} {red} {green} {blue}"
+        for (_, pairs, (red, green, blue)), start in zip(pieces, starts, strict=False)
+        for a, b in pairs.tolist()
+    ]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(points)}",
+        *(f"property double {axis}" for axis in "xyz"),
+        f"element edge {len(edges)}",
+        "property int vertex1",
+        "property int vertex2",
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        "end_header",
+    ]
+    vertices = [f"{x:.17g} {y:.17g} {z:.17g}" for x, y, z in points.tolist()]
+    write_text(path, "\n".join([*header, *vertices, *edges]) + "\n")
+
+
+def _pyramid(exported: AlignedObject, number: int, frame: Frame) -> _Lines:
+    view = exported.views[number]
+    distance = float(np.linalg.norm(view.cam_from_model.translation))
+    corners = photo_plane(view.camera, None).corners * _FRUSTUM * (distance or 1.0)
+    pose = exported.frame_from_cam(frame, number)
+    points = np.vstack([np.zeros(3), corners]) @ pose[:3, :3].T + pose[:3, 3]
+    return points, np.array(_FRUSTUM_EDGES), _CAMERA_COLOR

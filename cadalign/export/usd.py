@@ -16,8 +16,8 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.scene_parts import PhotoPlane, parts_of, photo_depth, photo_plane
-from cadalign.geometry.conventions import OPENGL_AXES
+from cadalign.export.scene_parts import PlacedPhoto, parts_of, placed_parts
+from cadalign.geometry.box import extent
 from cadalign.io.files import write_whole
 from cadalign.io.images import ByteImage, write_image
 
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 INSTALL = "pip install 'cadalign[usd]'   (or: pip install usd-core)"
-_FLIP = np.diag([*OPENGL_AXES, 1.0])
 _APERTURE = 36.0  # width of the film; USD counts it in tenths of the scene's unit
-_NEAR, _FAR = 1e-3, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +79,12 @@ def _require_library() -> None:
 def _write_stage(path: Path, exported: AlignedObject, frame: Frame) -> None:
     from pxr import Usd, UsdGeom
 
-    root = _FLIP if frame == "camera" else np.eye(4)
     mesh = exported.require_mesh()
+    placing, photos = placed_parts(exported, frame)
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, "/scene").GetPrim())
-    placing = root @ exported.frame_from_model(frame).cam_from_model
-    placing[:3] *= exported.metres
     _place(UsdGeom.Xform.Define(stage, "/scene/model"), placing)
     for number, part in enumerate(parts_of(mesh)):
         texture = None
@@ -99,18 +95,17 @@ def _write_stage(path: Path, exported: AlignedObject, frame: Frame) -> None:
             f"model/part_{number}", part.vertices, part.faces, part.uv, tuple(color), texture
         )
         _add_surface(stage, surface)
-    for number, view in enumerate(exported.views):
-        plane = photo_plane(view.camera, view.read_image())
-        pose = root @ exported.frame_from_cam(frame, number) @ _FLIP
-        pose[:3, 3] *= exported.metres
-        depth = photo_depth(exported, number) * exported.metres
-        _place(UsdGeom.Xform.Define(stage, f"/scene/view_{number}"), pose)
-        _add_camera(stage, f"/scene/view_{number}/camera", plane, depth)
+    for number, photo in enumerate(photos):
+        view, plane = f"view_{number}", photo.plane
+        _place(UsdGeom.Xform.Define(stage, f"/scene/{view}"), photo.pose)
+        _add_camera(stage, f"/scene/{view}/camera", photo)
         if plane.image is not None:
             texture = _write_texture(path, f"photo_{number}", plane.image)
-            photo = plane.rectangle(depth)
-            surface = _Surface(f"view_{number}/photo", *photo, (0, 0, 0, 1), texture, is_photo=True)
-            _add_surface(stage, surface)
+            rectangle = plane.rectangle(photo.depth)
+            black = (0, 0, 0, 1)
+            _add_surface(
+                stage, _Surface(f"{view}/photo", *rectangle, black, texture, is_photo=True)
+            )
     write_whole(path, lambda unfinished: stage.GetRootLayer().Export(str(unfinished)))
 
 
@@ -126,15 +121,15 @@ def _place(xform: Any, matrix: FloatArray) -> None:
     xform.AddTransformOp().Set(Gf.Matrix4d(matrix.T.tolist()))  # rows are columns in USD
 
 
-def _add_camera(stage: Usd.Stage, place: str, plane: PhotoPlane, depth: float) -> None:
+def _add_camera(stage: Usd.Stage, place: str, photo: PlacedPhoto) -> None:
     from pxr import Gf, UsdGeom
 
     camera = UsdGeom.Camera.Define(stage, place)
-    across, down = plane.half_field.tolist()
+    across, down = photo.plane.half_field.tolist()
     camera.GetFocalLengthAttr().Set(_APERTURE / (2 * across))
     camera.GetHorizontalApertureAttr().Set(_APERTURE)
     camera.GetVerticalApertureAttr().Set(_APERTURE * down / across)
-    camera.GetClippingRangeAttr().Set(Gf.Vec2f(_NEAR * depth, _FAR * depth))
+    camera.GetClippingRangeAttr().Set(Gf.Vec2f(*photo.clipping))
 
 
 def _add_surface(stage: Usd.Stage, surface: _Surface) -> None:
@@ -148,8 +143,8 @@ def _add_surface(stage: Usd.Stage, surface: _Surface) -> None:
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateDoubleSidedAttr(not surface.is_photo)
-    extent = np.array([surface.vertices.min(axis=0), surface.vertices.max(axis=0)])
-    mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent.astype(np.float32)))
+    bounds = extent(surface.vertices).astype(np.float32)
+    mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(bounds))
     if surface.uv is not None:
         primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
             "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex

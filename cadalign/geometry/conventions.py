@@ -17,6 +17,7 @@ from cadalign.geometry.pixels import PIXEL_CENTRE, rescaled_pixels
 
 __all__ = [
     "OPENGL_AXES",
+    "OPENGL_FLIP",
     "PIXEL_CENTRE",
     "alignment_from_opengl",
     "opengl_from_model",
@@ -28,7 +29,8 @@ __all__ = [
 OPENGL_AXES = np.array([1.0, -1.0, -1.0])
 """Signs of OpenGL's camera axes in cadalign's: multiply coordinates (n, 3) to go either way."""
 
-_FLIP = np.diag([*OPENGL_AXES, 1.0])
+OPENGL_FLIP = np.diag([*OPENGL_AXES, 1.0])
+"""Motion (4, 4) between the axes of the two cameras, either way."""
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera:
@@ -45,7 +47,7 @@ def opengl_from_model(cam_from_model: Alignment) -> FloatArray:
     >>> opengl_from_model(Alignment(np.eye(3), [1, 2, 3], [1, 1, 1]))[:, 3].tolist()
     [1.0, -2.0, -3.0, 1.0]
     """
-    return np.asarray(_FLIP @ cam_from_model.cam_from_model)
+    return np.asarray(OPENGL_FLIP @ cam_from_model.cam_from_model)
 
 
 def alignment_from_opengl(opengl_from_world: FloatArray) -> Alignment:
@@ -56,7 +58,7 @@ def alignment_from_opengl(opengl_from_world: FloatArray) -> Alignment:
     InputError
         If the matrix is not a rotation and a translation.
     """
-    matrix = _FLIP @ opengl_from_world
+    matrix = OPENGL_FLIP @ opengl_from_world
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-9:
         raise InputError("the last row is not (0, 0, 0, 1)", where="transform")
     return Alignment(matrix[:3, :3], matrix[:3, 3], np.ones(3))

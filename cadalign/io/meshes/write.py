@@ -8,7 +8,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import write_text, write_whole, writing
+from cadalign.io.files import made_folder, write_text, write_whole
 from cadalign.io.images import write_image
 
 
@@ -20,7 +20,7 @@ def write_obj_mesh(path: Path, mesh: Mesh) -> None:
 
     Raises DataError if a file cannot be written.
     """
-    _make_folder(path)
+    made_folder(path.parent)
     library = path.with_suffix(".mtl")
     names = [f"material_{number}" for number in range(len(mesh.materials))]
     lines = [f"mtllib {library.name}", *_vertex_lines(mesh)]
@@ -43,16 +43,11 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
     """
     import trimesh  # takes long to import, which OBJ files need not
 
-    _make_folder(path)
+    made_folder(path.parent)
     colors = np.round(255 * _vertex_colors(mesh)).astype(np.uint8)
     plain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
     data = trimesh.exchange.ply.export_ply(plain, vertex_normal=False)
     write_whole(path, lambda unfinished: unfinished.write_bytes(data))
-
-
-def _make_folder(path: Path) -> None:
-    with writing(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _vertex_colors(mesh: Mesh) -> FloatArray:

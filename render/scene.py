@@ -15,7 +15,7 @@ from cadalign.errors import RenderError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh, face_normals
-from cadalign.geometry.raycaster import FaceArray, RayCaster, SingleArray
+from cadalign.geometry.raycaster import Open3DEngine, RayCaster
 from cadalign.render.drawing.canvas import ByteImage, composite
 from cadalign.render.raycast.surface import SurfaceColors, coincident_faces, corner_normals
 
@@ -145,38 +145,6 @@ class Scene:
     def surface(self) -> SurfaceColors:
         """The colours of the mesh."""
         return SurfaceColors(self.mesh)
-
-
-class Open3DEngine:
-    """Embree by way of Open3D, which casts with all cores by itself; see `EmbreeEngine`."""
-
-    def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
-        import open3d
-
-        self._tensor = open3d.core.Tensor
-        self._no_hit = np.uint32(open3d.t.geometry.RaycastingScene.INVALID_ID)
-        self._scene = open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            self._tensor(np.ascontiguousarray(vertices)),
-            self._tensor(np.ascontiguousarray(faces.astype(np.uint32))),
-        )
-        # The hierarchy is built on the first query; let no two threads make that one at once.
-        self.first_faces(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
-
-    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
-        """See `RayEngine`."""
-        found = self._scene.cast_rays(self._rays(origins, directions))["primitive_ids"].numpy()
-        return np.asarray(np.where(found == self._no_hit, -1, found.astype(np.int32)), np.int32)
-
-    def blocked(
-        self, origins: SingleArray, directions: SingleArray, reach: float
-    ) -> npt.NDArray[np.bool_]:
-        """See `RayEngine`."""
-        rays = self._rays(origins, directions)
-        return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=reach).numpy(), bool)
-
-    def _rays(self, origins: SingleArray, directions: SingleArray) -> Any:
-        return self._tensor(np.concatenate([origins, directions], axis=1))
 
 
 LIGHT_GREY = (228, 230, 233)

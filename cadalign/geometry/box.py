@@ -24,6 +24,11 @@ def extent(points: FloatArray) -> FloatArray:
     return np.array([points.min(axis=0), points.max(axis=0)])
 
 
+def bounds_corners(low: FloatArray, high: FloatArray) -> FloatArray:
+    """The 8 corners (8, 3) between lowest and highest coordinates, in the order of a `Box`."""
+    return np.where(_CORNER_SIGNS > 0, high, low)
+
+
 @dataclass(frozen=True, eq=False)
 class Box:
     """An oriented box.

@@ -184,7 +184,7 @@ def join(pieces: Sequence[Mesh], source: str) -> Mesh:
     return Mesh(
         vertices=np.concatenate([piece.vertices for piece in pieces]),
         faces=np.concatenate(faces),
-        vertex_colors=np.concatenate([*map(_piece_colors, pieces)]) if colored else None,
+        vertex_colors=np.concatenate([*map(spread_colors, pieces)]) if colored else None,
         corner_uv=np.concatenate(uv) if textured else None,
         materials=tuple(material for piece in pieces for material in piece.materials),
         face_material=np.concatenate(materials),
@@ -192,13 +192,17 @@ def join(pieces: Sequence[Mesh], source: str) -> Mesh:
     )
 
 
-def _piece_colors(piece: Mesh) -> FloatArray:
-    """Vertex colours of a piece among coloured ones: its materials' where it has none."""
-    if piece.vertex_colors is not None:
-        return piece.vertex_colors
-    palette = np.array([material.color for material in piece.materials])
-    colors = np.ones((len(piece.vertices), 4))
-    colors[piece.faces] = palette[piece.face_material][:, None]
+def spread_colors(mesh: Mesh, palette: FloatArray | None = None) -> FloatArray:
+    """Colours (n, 4) of a mesh's vertices; where it has none, its materials' or a palette's (k, 4).
+
+    The palette has a colour for each material.
+    """
+    if mesh.vertex_colors is not None:
+        return mesh.vertex_colors
+    if palette is None:
+        palette = np.array([material.color for material in mesh.materials])
+    colors = np.ones((len(mesh.vertices), 4))
+    colors[mesh.faces] = palette[mesh.face_material][:, None]
     return colors
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -62,6 +62,38 @@ class EmbreeEngine:
         """See `RayEngine`."""
         far = np.full(len(origins), reach, dtype=np.float32)
         return np.asarray(self._scene.run(origins, directions, far, query="OCCLUDED") >= 0)
+
+
+class Open3DEngine:
+    """Embree by way of Open3D, which casts with all cores by itself; see `EmbreeEngine`."""
+
+    def __init__(self, vertices: SingleArray, faces: FaceArray) -> None:
+        import open3d
+
+        self._tensor = open3d.core.Tensor
+        self._no_hit = np.uint32(open3d.t.geometry.RaycastingScene.INVALID_ID)
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(
+            self._tensor(np.ascontiguousarray(vertices)),
+            self._tensor(np.ascontiguousarray(faces.astype(np.uint32))),
+        )
+        # The hierarchy is built on the first query; let no two threads make that one at once.
+        self.first_faces(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    def first_faces(self, origins: SingleArray, directions: SingleArray) -> FaceArray:
+        """See `RayEngine`."""
+        found = self._scene.cast_rays(self._rays(origins, directions))["primitive_ids"].numpy()
+        return np.asarray(np.where(found == self._no_hit, -1, found.astype(np.int32)), np.int32)
+
+    def blocked(
+        self, origins: SingleArray, directions: SingleArray, reach: float
+    ) -> npt.NDArray[np.bool_]:
+        """See `RayEngine`."""
+        rays = self._rays(origins, directions)
+        return np.asarray(self._scene.test_occlusions(rays, tnear=0.0, tfar=reach).numpy(), bool)
+
+    def _rays(self, origins: SingleArray, directions: SingleArray) -> Any:
+        return self._tensor(np.concatenate([origins, directions], axis=1))
 
 
 class RayCaster:

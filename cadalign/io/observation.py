@@ -19,6 +19,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
 from cadalign.io.files import as_path, write_json
@@ -217,7 +218,7 @@ class ObservationChanges:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
         if self.camera is None:
             return None
-        return _read_camera(self.camera, size, self.pixel_origin)
+        return _read_camera(self.camera, size=size, pixel_origin=self.pixel_origin)
 
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
         """The observation with all of this in the place of its own; ``where`` is its file.
@@ -243,10 +244,4 @@ class ObservationChanges:
         return changed.with_lens(self.focal, fov=self.fov)
 
 
-@lru_cache(maxsize=64)
-def _read_camera(
-    path: Path, size: tuple[int, int] | None, pixel_origin: PixelOrigin | None
-) -> Camera:
-    from cadalign.io.camera_file import read_camera
-
-    return read_camera(path, size=size, pixel_origin=pixel_origin)
+_read_camera = lru_cache(maxsize=64)(read_camera)  # one file for many observations

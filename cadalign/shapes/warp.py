@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.errors import InputError
+from cadalign.geometry.box import bounds_corners
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.parts import checked_box
 
@@ -136,7 +137,8 @@ def _weights(
     from scipy.interpolate import RBFInterpolator
 
     everything = np.vstack([box, places])
-    around = _corners(everything.min(axis=0), everything.max(axis=0), _MARGIN * diagonal)
+    margin = _MARGIN * diagonal
+    around = bounds_corners(everything.min(axis=0) - margin, everything.max(axis=0) + margin)
     shares = RBFInterpolator(
         np.vstack([places, around]),
         np.eye(len(places) + len(around), len(places)),
@@ -182,8 +184,3 @@ def _stretch_of_keypoints(
     stretch = ((offsets * moved).sum(axis=0) + weight * equal) / ((offsets**2).sum(axis=0) + weight)
     stretch = np.maximum(stretch, _LEAST_STRETCH * equal)
     return lambda points: (points - centre) * stretch + to
-
-
-def _corners(low: FloatArray, high: FloatArray, margin: float) -> FloatArray:
-    ends = np.array([low - margin, high + margin])
-    return np.array([[ends[corner >> axis & 1, axis] for axis in range(3)] for corner in range(8)])

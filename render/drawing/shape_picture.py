@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.geometry.box import BOX_EDGES
+from cadalign.geometry.box import BOX_EDGES, bounds_corners
 from cadalign.io.files import write_whole
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
@@ -107,10 +107,7 @@ def _draw_mean(
     )
     axes.set_title(title, fontsize=8)
     low, high = component.mean[-BOX_ROWS:]
-    corners = [
-        np.where([corner >> axis & 1 for axis in range(3)], high, low) for corner in range(8)
-    ]
-    seen = np.array(corners) @ view
+    seen = bounds_corners(low, high) @ view
     for first, second in BOX_EDGES:
         axes.plot(*seen[[first, second]].T, color=_BOX, lw=0.7, zorder=0)
     flat = component.mean[:-BOX_ROWS] @ view

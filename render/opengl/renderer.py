@@ -20,7 +20,7 @@ from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.probe import missing_libraries
 from cadalign.render.raycast.occlusion import darken_corners
 from cadalign.render.raycast.posed import Rectangle, pose_scene
-from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry, check_samples
+from cadalign.render.raycast.renderer import RaycastRenderer, check_samples, geometry_of
 from cadalign.render.raycast.surface import Studio
 from cadalign.render.scene import Frame, Scene, check_image_size
 
@@ -73,9 +73,9 @@ class PyrenderRenderer:
             return self._fallback.render(scene, camera, cam_from_model, samples=samples)
         check_samples(samples)
         check_image_size(camera)
-        geometry = cast_geometry(scene, camera, cam_from_model)
-        color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         posed = pose_scene(scene, camera, cam_from_model, caster=None)
+        geometry = geometry_of(camera, posed)
+        color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         if posed is not None:
             block = posed.block.slices
             self._stage.place(scene, cam_from_model, posed.seen_sides(geometry.face_id[block]))

@@ -91,19 +91,19 @@ class RaycastRenderer:
         """
         check_samples(samples)
         check_image_size(camera)
-        geometry = _empty_geometry(camera)
         color: ByteImage = np.zeros((camera.height, camera.width, 4), dtype=np.uint8)
         posed = pose_scene(scene, camera, cam_from_model, caster=self._caster_of(scene))
+
+        def shade(
+            posed: PosedScene, band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
+        ) -> None:
+            light = posed.light_of_hits(rays, face, depth, self.studio)
+            color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
+
         if posed is not None:
             posed.prepare_color()
-
-            def shade(
-                band: Rectangle, rays: FloatArray, face: FaceArray, depth: FloatArray
-            ) -> None:
-                light = posed.light_of_hits(rays, face, depth, self.studio)
-                color[band.slices] = _encode(light).reshape(band.height, band.width, 4)
-
-            _cast(geometry, posed, shade)
+        geometry = geometry_of(camera, posed, shade)
+        if posed is not None:
             if samples > 1:
                 self._antialias(color, posed, samples)
             darken_corners(color, geometry, posed, self.studio)
@@ -180,11 +180,7 @@ def cast_geometry(
         If the image is too large.
     """
     check_image_size(camera)
-    geometry = _empty_geometry(camera)
-    posed = pose_scene(scene, camera, cam_from_model, caster=caster)
-    if posed is not None:
-        _cast(geometry, posed)
-    return geometry
+    return geometry_of(camera, pose_scene(scene, camera, cam_from_model, caster=caster))
 
 
 def check_samples(samples: int) -> None:
@@ -193,18 +189,20 @@ def check_samples(samples: int) -> None:
         raise InputError(f"{samples} is not from 1 to {_MAX_SAMPLES}", where="samples")
 
 
-def _empty_geometry(camera: Camera) -> Geometry:
-    shape = (camera.height, camera.width)
-    face_id = np.full(shape, -1, dtype=np.int32)
-    return Geometry(np.zeros(shape), face_id, np.zeros((*shape, 3), dtype=np.float32))
+_Shade = Callable[[PosedScene, Rectangle, FloatArray, FaceArray, FloatArray], None]
 
 
-def _cast(
-    geometry: Geometry,
-    posed: PosedScene,
-    shade: Callable[[Rectangle, FloatArray, FaceArray, FloatArray], None] | None = None,
-) -> None:
-    """Fill the images with hits of one ray through each pixel's centre, and shade these."""
+def geometry_of(camera: Camera, posed: PosedScene | None, shade: _Shade | None = None) -> Geometry:
+    """Hits of one ray through each pixel's centre, which ``shade`` draws; none of an unseen scene.
+
+    ``shade`` takes the scene, a part of its block, and the rays, triangles and depths of the pixels
+    there.
+    """
+    whole = (camera.height, camera.width)
+    face_id = np.full(whole, -1, dtype=np.int32)
+    geometry = Geometry(np.zeros(whole), face_id, np.zeros((*whole, 3), dtype=np.float32))
+    if posed is None:
+        return geometry
 
     def draw(band: Rectangle) -> None:
         rays, valid = posed.camera.rays_where_valid(band.pixels)
@@ -218,9 +216,10 @@ def _cast(
         normal[hit] = posed.normals[face[hit]]
         geometry.normal[band.slices] = normal.reshape(*shape, 3)
         if shade is not None:
-            shade(band, rays, face, depth)
+            shade(posed, band, rays, face, depth)
 
     in_threads(draw, posed.block.tiles(posed.block.width, _RAYS_AT_ONCE // posed.block.width))
+    return geometry
 
 
 def _unlike_neighbours(color: ByteImage) -> BoolArray:

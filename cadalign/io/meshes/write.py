@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, spread_colors
 from cadalign.io.files import made_folder, write_text, write_whole
 from cadalign.io.images import write_image
 
@@ -44,22 +44,19 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
     import trimesh  # takes long to import, which OBJ files need not
 
     made_folder(path.parent)
-    colors = np.round(255 * _vertex_colors(mesh)).astype(np.uint8)
+    colors = np.round(255 * spread_colors(mesh, _palette(mesh))).astype(np.uint8)
     plain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
     data = trimesh.exchange.ply.export_ply(plain, vertex_normal=False)
     write_whole(path, lambda unfinished: unfinished.write_bytes(data))
 
 
-def _vertex_colors(mesh: Mesh) -> FloatArray:
-    if mesh.vertex_colors is not None:
-        return np.asarray(mesh.vertex_colors)
+def _palette(mesh: Mesh) -> FloatArray:
+    """Colours (k, 4) of materials, those of textures on average."""
     palette = np.array([each.color for each in mesh.materials])
     for row, each in enumerate(mesh.materials):
         if each.texture is not None:
             palette[row, :3] = each.texture[..., :3].reshape(-1, 3).mean(axis=0) / 255
-    colors = np.ones((len(mesh.vertices), 4))
-    colors[mesh.faces] = palette[mesh.face_material][:, None]
-    return colors
+    return palette
 
 
 def _vertex_lines(mesh: Mesh) -> list[str]:

@@ -21,7 +21,7 @@ from cadalign.estimation.result_parts import Alternative
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.keypoint_layer import confidence_regions
+from cadalign.render.drawing.layers import confidence_regions
 from cadalign.shapes.model import ShapeModel
 
 _LABELS = {

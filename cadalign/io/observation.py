@@ -28,7 +28,6 @@ from cadalign.io.observation_file import (
     read_fields,
     read_image_fields,
     read_size,
-    read_start,
     write_image_fields,
 )
 from cadalign.names import renamed
@@ -143,6 +142,8 @@ class Observation(ObservedImage):
             with nullcontext() if each is read else within(f"views[{number}]"):
                 images.append(read_image_fields(each, folder))
         first, *others = images
+        with within("init"):
+            init = None if read.init is None else read.init.alignment
         return cls(
             **vars(first),
             model=None if read.model is None else path_from(read.model, folder),
@@ -151,7 +152,7 @@ class Observation(ObservedImage):
             size=read_size(read.size),
             shape=None if read.shape is None else path_from(read.shape, folder),
             symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
-            init=read_start(read.init),
+            init=init,
             object_name=read.object,
             up_axis=read.up_axis,
             unfinished=read.unfinished,

@@ -31,7 +31,6 @@ from cadalign.io.documents import (
     convert,
     path_from,
     require_unique,
-    within,
     written_path,
 )
 from cadalign.io.evidence import (
@@ -249,17 +248,6 @@ def read_size(read: SizeFields | None) -> Size | None:
     Raises InputError if it has no length, or neither one standard deviation nor three.
     """
     return None if read is None else Size(**msgspec.structs.asdict(read))
-
-
-def read_start(read: StartFields | None) -> Alignment | None:
-    """The alignment to start from, if there is any.
-
-    Raises DataError if the rotation is none, or a scale is not positive.
-    """
-    if read is None:
-        return None
-    with within("init"):
-        return read.alignment
 
 
 def write_image_fields(

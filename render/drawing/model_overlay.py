@@ -23,9 +23,8 @@ from cadalign.io.images import read_image
 from cadalign.io.meshes.load import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.canvas import ByteImage
-from cadalign.render.drawing.keypoint_layer import confidence_regions
+from cadalign.render.drawing.layers import LINES, SHADED, TRANSLUCENT, confidence_regions
 from cadalign.render.drawing.overlay import draw_overlay
-from cadalign.render.drawing.pictures import LINES, SHADED, TRANSLUCENT
 from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
 from cadalign.render.scene import LIGHT_GREY, Geometry, Scene, check_image_size
 

@@ -13,15 +13,12 @@ from cadalign.errors import InputError
 from cadalign.geometry.box import BOX_EDGES, Box
 from cadalign.geometry.camera import Camera
 from cadalign.render.drawing.canvas import ByteImage, Canvas, Color, LegendEntry
-from cadalign.render.drawing.keypoint_layer import KeypointMarks
-from cadalign.render.drawing.pictures import (
-    SHADED,
+from cadalign.render.drawing.layers import (
     TRANSLUCENT,
     VEIL_OPACITY,
-    check_model_style,
+    KeypointMarks,
     draw_lines,
-    shade,
-    veil,
+    with_model,
 )
 from cadalign.render.raycast.posed import within_lens_field
 from cadalign.render.scene import LIGHT_GREY, Geometry, check_image_size
@@ -102,7 +99,7 @@ def draw_overlay(
         Predicted keypoints that were not observed [px].
     regions : (r, j, 2) float, optional
         Outlines of regions that hold keypoints [px]; see
-        `cadalign.render.drawing.keypoint_layer.confidence_regions`.
+        `cadalign.render.drawing.layers.confidence_regions`.
     axes : bool or Box
         Whether to draw the axes, or the box to draw them in.
     legend : bool
@@ -130,11 +127,7 @@ def draw_overlay(
     check_image_size(camera)
     pixels = _as_rgb(image, camera)
     if est_frame is not None:
-        check_model_style(est_frame, pixels, model_style, model_opacity)
-        if model_style == SHADED:
-            pixels = shade(pixels, est_frame, model_opacity)
-        elif model_style == TRANSLUCENT:
-            pixels = veil(pixels, est_frame, EST_COLOR, model_opacity)
+        pixels = with_model(pixels, est_frame, EST_COLOR, style=model_style, opacity=model_opacity)
     canvas = Canvas(pixels)
     if est_frame is not None and model_lines:
         draw_lines(canvas, est_frame, EST_COLOR)

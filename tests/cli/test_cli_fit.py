@@ -21,7 +21,7 @@ from cadalign import RansacOptions, Result, fit
 from cadalign.cli import main
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.keypoint_layer import REPROJECTED_COLOR
+from cadalign.render.drawing.layers import REPROJECTED_COLOR
 
 PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
 

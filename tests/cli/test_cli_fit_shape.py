@@ -26,7 +26,7 @@ from cadalign import (
 )
 from cadalign.cli import main
 from cadalign.io.observation import Observation
-from cadalign.render.drawing.keypoint_layer import UNSEEN_COLOR
+from cadalign.render.drawing.layers import UNSEEN_COLOR
 from cadalign.render.drawing.overlay import EST_COLOR
 from cadalign.shapes.examples import Example
 

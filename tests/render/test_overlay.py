@@ -17,7 +17,7 @@ from cadalign.render import (
     feature_lines,
     look_at,
 )
-from cadalign.render.drawing.keypoint_layer import OBSERVED_COLOR, REPROJECTED_COLOR
+from cadalign.render.drawing.layers import OBSERVED_COLOR, REPROJECTED_COLOR
 from cadalign.render.drawing.overlay import AXIS_COLORS, EST_COLOR, GT_COLOR
 
 CAMERA = Camera.from_fov(640, 480, fov_x=50)

@@ -10,7 +10,7 @@ from support.refusals import refusal_text
 
 from cadalign import Camera
 from cadalign.render import draw_overlay
-from cadalign.render.drawing.keypoint_layer import REGION_SHARE, UNSEEN_COLOR, confidence_regions
+from cadalign.render.drawing.layers import REGION_SHARE, UNSEEN_COLOR, confidence_regions
 
 CAMERA = Camera(64, 48, 60.0, 70.0, 31.5, 23.5)
 BENT = Camera(64, 48, 60.0, 70.0, 31.5, 23.5, (-0.2, 0.05, 0.01, 0.002))

@@ -71,12 +71,12 @@ class Scene:
     @cached_property
     def caster(self) -> RayCaster:
         """The ray hierarchy."""
-        return RayCaster(self.mesh, normals=self.face_normals)
+        return RayCaster(self.mesh, self.face_normals)
 
     @cached_property
     def open3d_caster(self) -> RayCaster:
         """The same built by Open3D, which must be importable."""
-        return RayCaster(self.mesh, normals=self.face_normals, engine=Open3DEngine)
+        return RayCaster(self.mesh, self.face_normals, engine=Open3DEngine)
 
     def derived(self, make: Callable[[Scene], T]) -> T:
         """Make of the scene what a renderer draws, once; ``make`` is a function of its module."""

@@ -103,7 +103,7 @@ class RayCaster:
     """
 
     def __init__(
-        self, mesh: Mesh, *, normals: FloatArray | None = None, engine: EngineMaker = EmbreeEngine
+        self, mesh: Mesh, normals: FloatArray | None = None, *, engine: EngineMaker = EmbreeEngine
     ) -> None:
         low, high = mesh.bounds
         self._center = (low + high) / 2

@@ -8,16 +8,20 @@ row and the translation, and a slope the derivative of a residual by the point i
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
 from cadalign.errors import InputError
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 from cadalign.solvers.constants import NOT_FOUND, OK, OUT_OF_RANGE, UNKNOWNS
 from cadalign.solvers.linalg import Triple, cross, dot
 from cadalign.solvers.unknowns import is_pose
+
+if TYPE_CHECKING:  # kernels are compiled anew where a module that theirs imports has changed
+    from cadalign.geometry.alignment import Alignment
+    from cadalign.geometry.camera import Camera
 
 _OF_A_RESULT = 10  # unknowns of a result's covariance, focal length included
 Scalars = tuple[float, ...]

@@ -16,8 +16,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -101,25 +100,6 @@ def _file_of(module: str) -> Iterator[Path]:
     for path in (place.with_suffix(".py"), place / "__init__.py"):
         if path.is_file():
             yield path
-
-
-@dataclass(frozen=True)
-class ShippedFiles:
-    """Index and code of one shipped kernel."""
-
-    file: Any
-    target: tuple[str, str, str]
-
-    def load(self, key: Any) -> Any:
-        """Code for a signature, whatever the processor."""
-        signature, _, *rest = key
-        return self.file.load((signature, self.target, *rest))
-
-
-def shipped_files(name: str, stamp: str) -> ShippedFiles | None:
-    """Files of a kernel in the installation, None if it has none for this processor."""
-    target = usable_target(SHIPPED)
-    return target and ShippedFiles(CodeFiles(str(SHIPPED), name, stamp), target)
 
 
 @cache
@@ -311,7 +291,16 @@ class KernelFiles(CodeFiles):
             found = super().load(key)
         except OSError:  # a folder that cannot be read
             found = None
-        return self._shipped.load(key) if found is None and self._shipped else found
+        return self._load_shipped(key) if found is None else found
+
+    def _load_shipped(self, key: Any) -> Any:
+        """Code of the installation for a signature, None if it has none for this processor."""
+        target = usable_target(SHIPPED)
+        if target is None:
+            return None
+        signature, _, *rest = key
+        shipped = CodeFiles(str(SHIPPED), Path(self._index_name).stem, self._source_stamp)
+        return shipped.load((signature, target, *rest))
 
     def save(self, key: Any, data: Any) -> None:
         """Save compiled code, one process at a time, before the index that names it.
@@ -334,10 +323,6 @@ class KernelFiles(CodeFiles):
             _remove_unused(Path(self._cache_path))
         except OSError:
             return
-
-    @cached_property
-    def _shipped(self) -> Any:
-        return shipped_files(Path(self._index_name).stem, self._source_stamp)
 
 
 @cache

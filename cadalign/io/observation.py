@@ -19,7 +19,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import in_file, path_from, read_json, within, written_path
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
 from cadalign.io.files import as_path, write_json
@@ -245,4 +244,9 @@ class ObservationChanges:
         return changed.with_lens(self.focal, fov=self.fov)
 
 
-_read_camera = lru_cache(maxsize=64)(read_camera)  # one file for many observations
+@lru_cache(maxsize=64)
+def _read_camera(path: Path, **given: Any) -> Camera:
+    """One file for many observations."""
+    from cadalign.io.camera_file import read_camera
+
+    return read_camera(path, **given)

@@ -100,7 +100,7 @@ def _log_likelihoods(
     query = observed.query
     count = len(covariances)
     rays = np.tile(query.rays, (count, 1))
-    white = whitening_of(covariances.reshape(-1, 2, 2), rays, observed.camera)
+    white = whitening_of(covariances.reshape(-1, 2, 2), rays, observed.facing)
     a, b, c = white.reshape(count, -1, 3)[:, rows].transpose(3, 0, 1, 2)  # (t, m, n) each
     columns = poses[:, :9].reshape(-1, 3, 3) * poses[:, None, 12:]
     points_cam = points_3d @ columns.swapaxes(1, 2) + poses[:, None, 9:12]

@@ -33,14 +33,15 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
+from cadalign.estimation.facing import turned_alignment
 from cadalign.estimation.focal import FocalPrior
-from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.shape_posterior import (
     ShapePosterior,
     gaussians_of,
     shape_posterior,
 )
 from cadalign.estimation.view import View
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.retrieval.models import ModelTable
 from cadalign.retrieval.options import RetrievalOptions
@@ -132,7 +133,8 @@ def rank_by_shape(
         if chosen.any():
             rows, known = np.flatnonzero(chosen), _shapes_of(table, category, shape)
             models = candidates.models[rows] - own.start
-            logs, poses, kept = _rank_category(models, known, view, gains, options, shape)
+            turn = observed.facing.lens_from_camera.T
+            logs, poses, kept = _rank_category(models, known, view, gains, options, shape, turn)
             parts.append((rows[kept], logs[kept], poses[kept]))
     if not parts:
         raise _no_shape()
@@ -202,8 +204,12 @@ def _rank_category(
     gains: float,
     options: RetrievalOptions,
     shape: ShapeModel,
+    turn: FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Log probabilities (c,) of a category's models, their poses (c, 15), and which are ahead."""
+    """Log probabilities (c,) of a category's models, their poses (c, 15), and which are ahead.
+
+    The ``turn`` (3, 3) leads from the camera's frame to that of the poses.
+    """
     result = align(shape, view, loss=options.loss, loss_scale=options.loss_scale)
     posterior = shape_posterior(result, view, loss=options.loss, loss_scale=options.loss_scale)
     estimate = np.concatenate([result.points_3d, result.bounds])
@@ -225,7 +231,8 @@ def _rank_category(
     logs += has[:, seen].sum(axis=1) * np.log1p(-options.missing_prob)
     axes, centres = options.fitting.stretched_axes, known.centres[models]
     scales = _scales(squares, products, axes)
-    poses = _poses(result, scales, aim - scales * centres, axes, options.max_stretch)
+    pose = turned_alignment(result.alignment, turn)
+    poses = _poses(pose, scales, aim - scales * centres, axes, options.max_stretch)
     # Models share the probability of their category.
     logs += posterior.log_evidence + gains - np.logaddexp.reduce(logs)
     across = poses[:, 6:9] * poses[:, 12:]  # the last row of the linear part
@@ -271,10 +278,9 @@ def _scales(squares: FloatArray, products: FloatArray, free: str) -> FloatArray:
 
 
 def _poses(
-    result: Result, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
+    pose: Alignment, scales: FloatArray, shifts: FloatArray, free: str, max_stretch: float
 ) -> FloatArray:
     """Packed poses (n, 15) of scaled and shifted models, the scale of an axis not free being 1."""
-    pose = result.alignment
     held = next(axis for axis, name in enumerate("xyz") if name not in free)
     size = scales[:, [held]]
     stretch = np.clip(scales / size, 1 / max_stretch, max_stretch)

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.datasets.models.categories import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
-from cadalign.estimation.facing import require_perspective
+from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.fit import fit_batch
 from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
@@ -73,6 +73,7 @@ class Observed:
     points_2d: FloatArray  # (n, 2) [px]
     covariances: FloatArray  # (n, 2, 2) [px^2]
     camera: Camera
+    facing: Camera  # the camera turned to the keypoints if its lens is wide, as poses and rays are
     query: Query  # semantic ids and rays of the keypoints, for the kernels
     spurious: float  # log-likelihood of the keypoints if all of them are spurious
 
@@ -93,7 +94,7 @@ class Ranking:
     """Searched candidates, one for each of m models, the best first."""
 
     candidates: IntArray  # (m,), rows of the candidate set
-    poses: FloatArray  # (m, 15)
+    poses: FloatArray  # (m, 15), in the frame of the facing camera
     log_likelihoods: FloatArray  # (m,)
     scores: FloatArray  # (m,), probabilities of the models
     searched: int  # number of candidates that were searched for a pose
@@ -104,20 +105,20 @@ def observe(
 ) -> Observed:
     """Check an image's keypoints and prepare them for the kernels."""
     require_kind(camera, Camera, "camera")
-    require_perspective(camera, "retrieval")
     pixels = as_points(points_2d, name="points_2d", dimension=2)
     ids = check_semantic_ids(ids, len(pixels), where="ids")
     order = np.argsort(ids)
     pixels, ids = pixels[order], ids[order]
     covariances = _covariances(options, pixels, order)
-    rays = np.require(rays_of(pixels, camera), np.float64, ["C", "W"])
+    facing = faced(camera, pixels)
+    rays = np.require(rays_of(pixels, facing), np.float64, ["C", "W"])
     fitting = options.fitting
     density = np.log1p(-options.missing_prob) - np.log(2 * np.pi)
     off = np.log(options.spurious / (camera.width * camera.height))
     query = Query(
         ids=ids,
         rays=rays,
-        whitening=whitening_of(covariances, rays, camera),
+        whitening=whitening_of(covariances, rays, facing),
         loss=LOSSES[fitting.loss],
         loss_scale=float(fitting.loss_scale),
         prior_weight=fitting.prior_weight,
@@ -125,7 +126,7 @@ def observe(
         max_stretch=float(options.max_stretch),
         gains=density - 0.5 * np.log(np.linalg.det(covariances)) - off,
     )
-    return Observed(order, pixels, covariances, camera, query, float(off) * len(ids))
+    return Observed(order, pixels, covariances, camera, facing, query, float(off) * len(ids))
 
 
 def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray) -> FloatArray:
@@ -339,12 +340,14 @@ def _search_unstretched(
     shared = [shared_keypoints(candidates, observed, each) for each in chosen.tolist()]
     seen = [observed.points_2d[rows] for _, rows in shared]
     batch = fit_batch([points for points, _ in shared], seen, observed.camera, method="epnp")
+    facing_from_camera = observed.facing.lens_from_camera.T
     poses, costs = np.zeros((len(chosen), POSE_SIZE)), np.full(len(chosen), np.inf)
     each = len(observed.query.whitening) > 1
     for m in np.flatnonzero(batch.solved).tolist():
         points, rows = shared[m]
-        poses[m] = np.concatenate([batch.rotation[m].ravel(), batch.translation[m], batch.scale[m]])
-        inside = points @ batch.rotation[m].T + batch.translation[m]
+        found = turned_alignment(batch.alignment(m), facing_from_camera)
+        poses[m] = found.packed
+        inside = found.apply(points)
         across, down = (perspective(inside) - observed.query.rays[rows]).T
         a, b, c = observed.query.whitening[rows if each else [0]].T
         costs[m] = ((a * across + b * down) ** 2 + (c * down) ** 2).sum()
@@ -376,7 +379,8 @@ def make_matches(
     for place, candidate in enumerate(ranking.candidates[:top].tolist()):
         points_3d, rows = shared_keypoints(candidates, observed, candidate)
         model = table.model(int(candidates.models[candidate]))
-        alignment = Alignment.from_packed(ranking.poses[place])
+        found = Alignment.from_packed(ranking.poses[place])
+        alignment = turned_alignment(found, observed.facing.lens_from_camera)
         residuals = observed.camera.project(alignment.apply(points_3d)) - observed.points_2d[rows]
         match = Match(
             category=model.category,

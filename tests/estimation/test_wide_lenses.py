@@ -31,8 +31,6 @@ from cadalign.estimation.uncertainty.next_best import rank_evidence
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.render import Scene, cast_geometry
-from cadalign.retrieval.options import RetrievalOptions
-from cadalign.retrieval.ranking import observe
 
 FISHEYE = Camera(
     1000, 1000, 280.0, 285.0, 499.5, 498.0, (0.01, -0.003, 0.0005, 0.0), lens="fisheye"
@@ -414,11 +412,8 @@ class TestPictures:
         assert found.alignment.scale == pytest.approx(truth.scale, abs=4 * max(found.std.scale))
 
 
-def test_retrieval_and_the_annotator_take_no_wide_lens(tmp_path) -> None:
+def test_the_annotator_takes_no_wide_lens(tmp_path) -> None:
     fix = "undistort the photo, or crop it to a pinhole's view"
-    with pytest.raises(InputError) as caught:
-        observe([[500, 500]], [0], FISHEYE, RetrievalOptions())
-    assert str(caught.value) == f"camera.lens: retrieval takes no fisheye lens; {fix}"
     Image.new("RGB", (1000, 1000)).save(tmp_path / "photo.png")
     with pytest.raises(DataError, match=rf"photo.png.*: the annotator takes no fov lens; {fix}$"):
         intrinsics_of(PhotoFile.open(tmp_path / "photo.png"), FOV)

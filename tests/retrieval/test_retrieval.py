@@ -29,6 +29,7 @@ from cadalign.retrieval.ranking import gather_candidates, observe, rank
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)
 LENS = replace(CAMERA, distortion=(-0.1, 0.03, 0.001, -0.002))
+FISHEYE = Camera(900, 900, 250.0, 250.0, 449.5, 449.5, (0.01, -0.003, 0.0, 0.0), lens="fisheye")
 IDS = np.arange(10)
 
 
@@ -67,10 +68,12 @@ def same(one: Sequence[Match], other: Sequence[Match]) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+@pytest.mark.parametrize("camera", [CAMERA, LENS, FISHEYE], ids=["pinhole", "lens", "fisheye"])
 def test_the_model_is_found_with_pose_and_stretch(camera: Camera) -> None:
     for number in (0, 17, 59):
         pose = pose_of(number)
+        if camera.is_wide:  # beside the camera, behind its plane
+            pose = Alignment(pose.rotation, [1.6, 0.3, -0.2], pose.scale)
         pixels = view(MODELS[number], pose, camera=camera)
         best = LIBRARY.retrieve(pixels, IDS, camera)[0]
         assert best.model_id == f"{number:03d}"
@@ -265,6 +268,9 @@ class TestStretch:
         best = LIBRARY.retrieve(pixels, IDS, CAMERA, method="epnp")[0]
         assert best.model_id == "004"
         assert best.alignment.scale.tolist() == [1, 1, 1]
+        beside = Alignment(pose_of(4).rotation, [1.6, 0.3, -0.2], np.ones(3))
+        wide = view(MODELS[4], beside, camera=FISHEYE)
+        assert LIBRARY.retrieve(wide, IDS, FISHEYE, method="epnp")[0].model_id == "004"
         stretched = view(MODELS[4], pose_of(4, scale=(1.8, 0.6)), noise_px=0.5)
         assert LIBRARY.retrieve(stretched, IDS, CAMERA)[0].rms < 2
         assert LIBRARY.retrieve(stretched, IDS, CAMERA, method="epnp")[0].rms > 5

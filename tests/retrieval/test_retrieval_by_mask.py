@@ -38,6 +38,19 @@ def masked(library: Library, key: tuple[str, str]) -> tuple[np.ndarray, Alignmen
     return cast_geometry(Scene(library[key].load_mesh()), CAMERA, truth).mask, truth
 
 
+def test_a_wide_lens_finds_what_is_beside_it(library: Library) -> None:
+    wide = Camera(400, 400, 120, 120, 199.5, 199.5, (0.01, -0.003, 0, 0), lens="fisheye")
+    key = next(key for key in library.keys if key[0] == "car")
+    pose = look_at(azimuth=40.0, elevation=20.0, distance=1.4)
+    turn = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # to the camera's right
+    scale = np.array([1.0, 1.2, 0.85])
+    truth = Alignment(turn @ pose.rotation, turn @ pose.translation, scale)
+    mask = cast_geometry(Scene(library[key].load_mesh()), wide, truth).mask
+    match, *_ = library.retrieve(mask=mask, camera=wide)
+    assert (match.category, match.model_id) == key
+    assert rotation_error(est=match.alignment, gt=truth) < 2
+
+
 @pytest.mark.parametrize("category", ["chair", "car"])
 def test_the_stretched_model_is_found(library: Library, category: str) -> None:
     key = next(key for key in library.keys if key[0] == category)

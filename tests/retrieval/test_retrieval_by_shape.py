@@ -67,8 +67,20 @@ def first(model: LibraryModel, library: Library = LIBRARY, **options: Any) -> An
     return library.retrieve(seen(model, 1.0), model.ids, CAMERA, **options)[0]
 
 
-def iou(match: Any, model: LibraryModel) -> float:
-    return box_iou_up_to_scale(est=match.box, gt=Box.from_model(model.bounds, POSE))
+def test_a_wide_lens_ranks_what_is_beside_it() -> None:
+    camera = Camera(900, 900, 250.0, 250.0, 449.5, 449.5, (0.01, -0.003, 0, 0), lens="fisheye")
+    pose = Alignment(POSE.rotation, [1.2, 0.2, -0.1], POSE.scale)
+    model = OBJECTS[0]
+    pixels = camera.project(pose.apply(model.xyz))
+    wide, *_ = LIBRARY.retrieve(pixels, model.ids, camera, shape=SHAPE)
+    straight, *_ = LIBRARY.retrieve(seen(model), model.ids, CAMERA, shape=SHAPE)
+    assert wide.alignment.translation[2] < 0.2
+    assert np.abs(wide.residuals).max() < 30
+    assert abs(iou(wide, model, pose) - iou(straight, model)) < 0.15
+
+
+def iou(match: Any, model: LibraryModel, pose: Alignment = POSE) -> float:
+    return box_iou_up_to_scale(est=match.box, gt=Box.from_model(model.bounds, pose))
 
 
 @pytest.mark.long

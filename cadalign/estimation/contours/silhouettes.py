@@ -251,10 +251,8 @@ class FacedMask(NamedTuple):
         inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
         rows, columns = np.nonzero(inside)
         some = slice(None, None, max(1, len(rows) // 20_000))
-        rays, valid = camera.normalize_where_valid(
-            np.column_stack([columns, rows])[some].astype(float)
-        )
-        seen = np.column_stack([rays[valid], np.ones(int(valid.sum()))])
+        found, valid = camera.rays_where_valid(np.column_stack([columns, rows])[some].astype(float))
+        seen = found[valid]
         axis = seen.mean(axis=0)
         axis /= np.linalg.norm(axis)
         right = np.cross([0.0, 1.0, 0.0], axis)
@@ -269,7 +267,8 @@ class FacedMask(NamedTuple):
         x, y = np.meshgrid(corner[0] + places, corner[1] + places)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
         in_camera = rays @ turn.T
-        pixels = camera.project(np.where(in_camera[:, 2:] > 1e-6, in_camera, [0, 0, 1]))
+        is_ahead = camera.is_wide | (in_camera[:, 2:] > 1e-6)
+        pixels = camera.project(np.where(is_ahead, in_camera, [0, 0, 1]))
         single = np.clip(pixels, -1e6, 1e6).astype(np.float32).reshape(CELLS, CELLS, 2)
         # Averages over a cell, where it holds several pixels.
         blur = max(cell * camera.fx / 3, 0.3)

@@ -8,22 +8,19 @@ The photo and the model are those of `align_other_chair.py`, whose files are nee
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import tyro
-from common import COMMAND
-from playwright.sync_api import Page
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
+from support.annotating import IDLE, opened_page, wait
 from support.chromium import chromium
 
+from cadalign.annotate.opening import open_session
+from cadalign.annotate.options import SessionOptions
 from cadalign.io.observation import Observation
-
-READY = """!!(annotator.state?.alignment.status === "done" && annotator.model.mesh
-    && annotator.photo.picture)"""
 
 
 def main(*, out: Path = Path("docs/annotator.png"), files: Path) -> None:
@@ -38,29 +35,15 @@ def main(*, out: Path = Path("docs/annotator.png"), files: Path) -> None:
     """
     observation = files / "photo.json"
     model = Observation.load(observation).model
-    command = [*COMMAND, "annotate", "--no-open", "--image", str(files / "photo.png")]
-    command += ["--model", str(model), "--observation", str(observation)]
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    try:
-        assert server.stdout is not None
-        url = server.stdout.readline().strip()
-        with chromium() as browser:
-            page = browser.new_page(viewport={"width": 1280, "height": 960}, color_scheme="light")
-            page.goto(url)
-            wait(page)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            page.screenshot(path=out)
-    finally:
-        server.terminate()
-        server.wait()
-
-
-def wait(page: Page) -> None:
-    """Wait until everything is drawn."""
-    while not page.evaluate(READY):
-        page.wait_for_timeout(100)
-    page.keyboard.press("v")
-    page.wait_for_timeout(1000)
+    options = SessionOptions(image=files / "photo.png", model=model, observation=observation)
+    session = open_session(options)
+    session.warm_up()
+    with chromium() as browser, opened_page(browser, session, width=1280, height=960) as page:
+        wait(page, f"{IDLE} && annotator.state.alignment.status === 'done'")
+        page.keyboard.press("v")
+        page.wait_for_timeout(1000)  # until everything is drawn
+        out.parent.mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=out)
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ import cadalign
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import ImageKeypoints, sample_models
 from cadalign.geometry.metrics import box_iou_up_to_scale
-from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.geometry.rotations import angle_between
 from cadalign.io.files import write_json
 from cadalign.torch import PoseBatch, align, fit, posterior_loss, rotation_loss
 from cadalign.torch.detector import KeypointDetector, LossOfKeypoints, train
@@ -143,8 +143,7 @@ def judged(
     for b in range(len(views)):
         view = cadalign.View(views.camera, pixels[b], ids=views.ids, sigma=sigma[b])
         result = cadalign.align(shape, view)
-        turn = vector_from_rotation(result.alignment.rotation.T @ views.rotation[b])
-        turns.append(float(np.degrees(np.linalg.norm(turn))))
+        turns.append(angle_between(result.alignment.rotation, views.rotation[b]))
         ious.append(box_iou_up_to_scale(est=result.box, gt=views.box(b)))
     return {
         "keypoints, px": float(np.median(lengths)),

@@ -181,11 +181,9 @@ def _wide_problem(camera: Camera, reach: float, points: int, rng: np.random.Gene
     while True:
         drawn = simulate_problem(rng, points=points, noise_px=0.0, depth=(3.0, 6.0))
         pose = turned_alignment(drawn.alignment, random_rotation(rng))
-        seen = pose.apply(drawn.points_3d)
-        if (np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]) < reach).all():
-            pixels = camera.project(seen)
-            pixels += rng.standard_normal(pixels.shape)
-            return Problem(drawn.points_3d, pixels, camera, pose, None)
+        x, y, z = pose.apply(drawn.points_3d).T
+        if (np.arctan2(np.hypot(x, y), z) < reach).all():
+            return section.seen_in(camera, pose, drawn.points_3d, 1.0, rng)
 
 
 def _keypointnet_sources(root: Path) -> Iterator[tuple[str, float, Draw]]:
@@ -201,9 +199,7 @@ def _keypointnet_problem(models: list[FloatArray], rng: np.random.Generator) -> 
     chosen = points[rng.choice(len(points), 7, replace=False)]
     scale = np.array([1.0, *(1 / rng.uniform(*STRETCH_RANGE, 2))])
     alignment = Alignment(random_rotation(rng), [0.0, 0.0, rng.uniform(1.5, 3)], scale)
-    pixels = KEYPOINT_CAMERA.project(alignment.apply(chosen / scale))
-    pixels += rng.standard_normal(pixels.shape)
-    return Problem(chosen / scale, pixels, KEYPOINT_CAMERA, alignment, None)
+    return section.seen_in(KEYPOINT_CAMERA, alignment, chosen / scale, 1.0, rng)
 
 
 def _spans_volume(points: FloatArray) -> bool:
@@ -240,20 +236,25 @@ def _speed(problem: Problem, points: int, repetitions: int) -> Iterator[Row]:
         "fit optimal": lambda: cadalign.fit(x, uv, camera),
         "fit aepnp-paper": lambda: cadalign.fit(x, uv, camera, method="aepnp-paper"),
     }
-    timed = {name: partial(section.seconds, call) for name, call in calls.items()}
-    medians = section.medians_in_turns(timed, repetitions, per_turn=10)
+    medians = _medians(calls, repetitions)
     if points == 10:
-        xs, uvs = np.tile(x, (_BATCH, 1, 1)), np.tile(uv, (_BATCH, 1, 1))
-        for name, workers in {"1 thread": 1, "all cores": -1}.items():
-            run = partial(cadalign.fit_batch, xs, uvs, camera, method="aepnp", workers=workers)
-            median = section.medians_in_turns({"": partial(section.seconds, run)}, 10, per_turn=10)[
-                ""
-            ]
-            medians[f"fit_batch aepnp, {name}"] = median / _BATCH
+        batch = np.tile(x, (_BATCH, 1, 1)), np.tile(uv, (_BATCH, 1, 1)), camera
+        runs = {
+            f"fit_batch aepnp, {name}": partial(
+                cadalign.fit_batch, *batch, method="aepnp", workers=workers
+            )
+            for name, workers in {"1 thread": 1, "all cores": -1}.items()
+        }
+        medians |= {name: median / _BATCH for name, median in _medians(runs, 10).items()}
     for name in (*(each for each in medians if not each.startswith("cv2")), "cv2 SQPNP"):
         peer = "cv2 ITERATIVE" if name == "fit optimal" else "cv2 EPNP"
         ratio, label = medians[name] / medians[peer], f"{name}, {points} keypoints"
         yield section.figure(label, 1e6 * medians[name], "us", ratio, peer)
+
+
+def _medians(calls: dict[str, Callable[[], object]], count: int) -> dict[str, float]:
+    timed = {name: partial(section.seconds, call) for name, call in calls.items()}
+    return section.medians_in_turns(timed, count, per_turn=10)
 
 
 # Unknown focal length -----------------------------------------------------------------------------

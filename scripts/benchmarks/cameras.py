@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from benchmarks.cars import car_scenes
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
+from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.simulation.problems import UNIT_BOUNDS, Problem, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
@@ -57,38 +58,33 @@ def photo_lenses(
         shape = section.learned_shape(dataset, category)
         mean = shape.components[0].mean[: len(shape.ids)]
         similar = cadalign.Model(points_3d=mean, ids=shape.ids, shape_sigma=0.05)
-        seen = list(_seen(dataset, category, shape, given.seed, objects, noise_px))
-        for title, model in (
-            ("learned shape", shape),
-            ("its mean as a similar model", similar),
-        ):
+        found = section.unseen_objects(dataset, category, objects, noise_px=noise_px)
+        seen = list(_seen(found, shape, given.seed, noise_px))
+        for title, model in (("learned shape", shape), ("its mean as a similar model", similar)):
             rows = [_row(model, seen, prior, noise_px) for prior in _PRIORS]
             yield f"{category}, {title}", rows
 
 
 def _seen(
-    dataset: KeypointNet,
-    category: str,
+    found: Iterable[tuple[int, UnseenObject]],
     shape: cadalign.ShapeModel,
     seed: int,
-    objects: int,
     noise_px: float,
 ) -> Iterator[tuple[Problem, list[int]]]:
+    """The objects through lenses of photos, and the ids of their keypoints."""
     width, height = _UNKNOWN.width, _UNKNOWN.height
-    for place, one in section.unseen_objects(dataset, category, objects, noise_px=noise_px):
+    for place, one in found:
         known = np.isin(one.ids, shape.ids)
         points, ids = one.xyz[one.rows][known], one.ids[known]
         if len(ids) < _LEAST_KEYPOINTS:
             continue
-        rng = instance_rng(seed, f"{category}/{place}")
+        rng = instance_rng(seed, f"{shape.category}/{place}")
         length = _SHORTEST_MM + _MEDIAN_MM * float(np.exp(_SHAPE * rng.normal()))
         focal = width * min(length, _LONGEST_MM) / _FILM_MM
         camera = cadalign.Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
         distance = 0.5 + focal / (0.6 * height)  # of the middle of an object of diagonal 1
         pose = look_at(azimuth=rng.uniform(0, 360), elevation=rng.uniform(5, 40), distance=distance)
-        pixels = camera.project(pose.apply(points))
-        pixels += noise_px * rng.normal(size=pixels.shape)
-        yield Problem(points, pixels, camera, pose, None), ids.tolist()
+        yield section.seen_in(camera, pose, points, noise_px, rng), ids.tolist()
 
 
 def _row(model: Any, seen: Sequence[tuple[Problem, list[int]]], prior: str, noise_px: float) -> Row:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,32 +20,30 @@ from cadalign.datasets import ImageKeypoints
 from cadalign.datasets import open as open_data
 from cadalign.datasets.photos.kitti import KittiLabel, read_labels
 from cadalign.datasets.photos.kitti_keypoints import (
-    HIDDEN,
     SIZE,
     car_bounds,
-    car_box,
     car_keypoints,
     car_shape,
     yaw_of_car,
 )
+from cadalign.evaluation.experiments.tracks import TracksOptions
+from cadalign.evaluation.instances.tracks import pose_of, recorded_videos
 from cadalign.geometry.metrics import rotation_error
-from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.seeding import instance_rng
 
 _LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6
 _WIDTHS = 0.06  # relative standard deviation of cars' widths
 _SIGMA = 3.0  # [px] of the network's keypoints
-_RATE = 10.0  # frames in a second
 
 
-def _yaw_error(rotation: FloatArray, box: cadalign.Box) -> float:
-    """Error of yaw, without a sign [deg]."""
-    turn = yaw_of_car(rotation) - yaw_of_car(box.rotation)
+def _yaw_error(est: FloatArray, gt: FloatArray) -> float:
+    """Error of the yaw of rotations (3, 3), without a sign [deg]."""
+    turn = yaw_of_car(est) - yaw_of_car(gt)
     return float(np.degrees(abs((turn + np.pi) % (2 * np.pi) - np.pi)))
 
 
 def _middle(result: cadalign.Result) -> FloatArray:
-    return result.bounds.mean(axis=0)[None]
+    return result.bounds.mean(axis=0)
 
 
 def _real_cars(folder: Path) -> Iterator[tuple[Any, cadalign.Camera, cadalign.Box, Any]]:
@@ -130,7 +128,7 @@ def _yaw_of_view(
     across = float((forward[[0, 2]] ** 2).sum())
     slope = (moved[:, 0] * forward[2] - moved[:, 2] * forward[0]) / across
     std = float(np.sqrt(slope @ result.covariance[:3, :3] @ slope))
-    error = _yaw_error(result.alignment.rotation, box)
+    error = _yaw_error(result.alignment.rotation, box.rotation)
     return error, bool(np.radians(error) < result.radius(0.95) * std)
 
 
@@ -146,19 +144,12 @@ def real_detections(given: BenchmarkData) -> Tables:
     with tempfile.TemporaryDirectory() as temporary:
         learned: dict[str, Any] = {"shape": Path(temporary, "car.shape"), "sigma": _SIGMA}
         car_shape(folder).save(learned["shape"])
-        robust, cauchy, similar = {"robust": True}, {"loss": "cauchy"}, {"similar": True}
-        ways: dict[str, dict[str, Any]] = {
-            "plain": {},
-            "--robust": robust,
-            "--loss cauchy": cauchy,
-            "--similar": similar,
-            "--similar --robust": similar | robust,
-            "--similar --loss cauchy": similar | cauchy,
-            "--shape --sigma 3": learned,
-            "--shape --sigma 3 --robust": learned | robust,
-            "--shape --sigma 3 --loss cauchy": learned | cauchy,
-        }
-        rows = [_detections_row(name, cars, web, options) for name, options in ways.items()]
+        models = {"": {}, "--similar": {"similar": True}, "--shape --sigma 3": learned}
+        outliers = {"": {}, "--robust": {"robust": True}, "--loss cauchy": {"loss": "cauchy"}}
+        rows = []
+        for model, way in product(models, outliers):
+            name = f"{model} {way}".strip() or "plain"
+            rows.append(_detections_row(name, cars, web, models[model] | outliers[way]))
     yield f"{len(cars)} cars, and web photos", rows
 
 
@@ -174,7 +165,7 @@ def _observed_cars(folder: Path) -> Iterator[_Car]:
             names = tuple(seen.names[k] for k in kept)
             points = known.xyz[[known.names.index(name) for name in names]]
             observed = cadalign.Observation(points, seen.points_2d[kept], camera, names=names)
-            yield observed, box, car_bounds(known.xyz).mean(axis=0)[None]
+            yield observed, box, car_bounds(known.xyz).mean(axis=0)
 
 
 def _detections_row(name: str, cars: list[_Car], web: Path, options: dict[str, Any]) -> Row:
@@ -183,8 +174,8 @@ def _detections_row(name: str, cars: list[_Car], web: Path, options: dict[str, A
     for each, (_, box, middle) in zip(found, cars, strict=True):
         if isinstance(each, cadalign.Result):
             center = _middle(each) if each.method == "align" else middle
-            depth = each.alignment.apply(center)[0, 2]
-            yaw = _yaw_error(each.alignment.rotation, box)
+            depth = pose_of(each.alignment, center)[-1]
+            yaw = _yaw_error(each.alignment.rotation, box.rotation)
             errors.append((yaw, abs(depth / box.center[2] - 1)))
     yaws, depths = np.array(errors).T
     row = {"cadalign fit": name, "cars aligned": f"{len(yaws)} of {len(cars)}"}
@@ -200,47 +191,35 @@ def _detections_row(name: str, cars: list[_Car], web: Path, options: dict[str, A
 
 def car_tracks(folder: Path) -> Iterator[Row]:
     """Yaw, depth and jitter of KITTI's tracks by five ways."""
-    shape = car_shape(folder)
-    table = json.loads((folder / "car_tracks.json").read_text())
+    shape, options = car_shape(folder), TracksOptions(folder, noise_px=_SIGMA)
+    videos, _, _ = recorded_videos(folder, options)
     for way in ("frame by frame", "shape shared", "smooth", "smooth, robust", "online"):
-        errors, jitters = [], []
-        for track in table["tracks"]:
-            frames, size = track["frames"], np.array(track["dims_hwl"])
-            poses = _poses(shape, [_view(each, table["names"], track["K"]) for each in frames], way)
-            boxes = [
-                car_box(size, np.array(each["location_bottom_centre"]), each["rotation_y"])
-                for each in frames[-len(poses) :]
+        yaws, depths, jitters = [], [], []
+        for video in videos:
+            views, truth = video.made(options)
+            poses = _poses(shape, views, way)
+            true = truth[-len(poses) :]
+            own = np.array([yaw_of_car(each[:9].reshape(3, 3)) for each in poses])
+            yaws += [
+                _yaw_error(each[:9].reshape(3, 3), gt[:9].reshape(3, 3))
+                for each, gt in zip(poses, true, strict=True)
             ]
-            for (rotation, center), box in zip(poses, boxes, strict=True):
-                depth = 100 * abs(center[2] / box.center[2] - 1)
-                errors.append((_yaw_error(rotation, box), depth))
-            yaws = np.unwrap([yaw_of_car(rotation) for rotation, _ in poses])
-            jitters.append(np.degrees(np.diff(yaws, 2)))
-        yaw, depth = np.transpose(errors)
+            depths.append(100 * np.abs(poses[:, 11] / true[:, 11] - 1))
+            jitters.append(np.degrees(np.diff(np.unwrap(own), 2)))
         yield {
             "way": way,
-            "frames": len(yaw),
-            "yaw, deg": section.spread(yaw),
-            "depth, %": float(np.median(depth)),
+            "frames": len(yaws),
+            "yaw, deg": section.spread(yaws),
+            "depth, %": float(np.median(np.concatenate(depths))),
             "jitter, deg": float(np.concatenate(jitters).std()),
         }
 
 
-def _view(frame: dict[str, Any], names: list[str], matrix: list[list[float]]) -> cadalign.View:
-    (fx, _, cx), (_, fy, cy), _ = matrix
-    shown = np.flatnonzero(np.array(frame["score"]) >= HIDDEN)
-    camera = cadalign.Camera(*SIZE, fx, fy, cx, cy)
-    pixels, ids = np.array(frame["uv"])[shown], [names[row] for row in shown]
-    return cadalign.View(camera, pixels, ids=ids, sigma=_SIGMA, time=frame["frame"] / _RATE)
-
-
-def _poses(
-    shape: cadalign.ShapeModel, views: list[cadalign.View], way: str
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Rotation and the box's centre in the camera of every frame."""
+def _poses(shape: cadalign.ShapeModel, views: Sequence[cadalign.View], way: str) -> FloatArray:
+    """Poses (P, 12) of the box's axes and centre, of every frame that has one."""
     if way == "frame by frame":
         results = [cadalign.align(shape, view) for view in views]
-        return [(r.alignment.rotation, r.alignment.apply(_middle(r))[0]) for r in results]
+        return np.array([pose_of(each.alignment, _middle(each)) for each in results])
     if way == "online":
         tracker = cadalign.Tracker(shape)
         found = [tracker.update(view).pose for view in views]
@@ -251,7 +230,7 @@ def _poses(
         motion = None if way == "shape shared" else cadalign.Motion()
         result = cadalign.align(shape, views, motion=motion, ransac=ransac)
         middle, known = _middle(result), [view.alignment for view in result.views]
-    return [(each.rotation, each.apply(middle)[0]) for each in known]
+    return np.array([pose_of(each, middle) for each in known])
 
 
 # Scenes -------------------------------------------------------------------------------------------
@@ -259,7 +238,7 @@ def _poses(
 
 def car_scenes(folder: Path, sigma: float) -> list[Row]:
     """Errors of a street's cars, alone and together, whose keypoints are simulated."""
-    mean = np.array(json.loads((folder / "car_tracks.json").read_text())["model_xyz"])
+    mean = car_shape(folder).mean[:-2]
     frames: dict[int, list[KittiLabel]] = defaultdict(list)
     for label in read_labels(folder / "label_02" / "0010.txt", tracking=True):
         if label.kind == "Car" and 5 < label.numbers[12] < 35:
@@ -285,8 +264,7 @@ def _scene_results(
     """Results of the cars of a frame, by every method."""
     camera = cadalign.Camera(*SIZE, 721.5, 721.5, 609.6, 172.9)
     rng = instance_rng(frame, "kitti")
-    pixels = [camera.project(each.apply(mean)) for each in truths]
-    pixels = [each + sigma * rng.normal(size=each.shape) for each in pixels]
+    seen = [section.seen_in(camera, each, mean, sigma, rng) for each in truths]
     model = cadalign.Model(points_3d=mean, stretch_sigma=0.1, up_axis="z")
     size = cadalign.Size(width=float(np.ptp(mean[:, 0])), sigma=_WIDTHS)
     ground = {"up": (0.0, -1.0, 0.0), "camera_height": 1.65, "camera_height_sigma": 0.03}
@@ -297,30 +275,29 @@ def _scene_results(
         ("together, on one ground", ground, ("ground",)),
     ):
         objects = [
-            cadalign.SceneObject(model, cadalign.View(camera, uv, sigma=sigma, **evidence), size)
-            for uv in pixels
+            cadalign.SceneObject(
+                model, cadalign.View(camera, each.points_2d, sigma=sigma, **evidence), size
+            )
+            for each in seen
         ]
         yield name, cadalign.align_scene(objects, share=share).results
 
 
 def _pose_of(label: KittiLabel, mean: FloatArray) -> cadalign.Alignment:
-    """Pose of the mean car stretched to a label's box; x lateral, y to the rear, z up."""
-    height, width, length, *location, rotation_y = label.numbers[7:14]
-    low, high = mean.min(axis=0), mean.max(axis=0)
-    scale = np.array([width, length, height]) / (high - low)
-    yaw = rotation_from_vector(np.array([0.0, rotation_y, 0.0]))
-    in_box = yaw @ np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-    lowest = in_box @ (scale * [(low + high)[0] / 2, (low + high)[1] / 2, low[2]])
-    return cadalign.Alignment(in_box, np.array(location) - lowest, scale)
+    """Pose of the mean car stretched to a label's box."""
+    box = label.box(np.zeros(3))
+    scale, middle = box.extents / np.ptp(mean, axis=0), (mean.min(axis=0) + mean.max(axis=0)) / 2
+    return cadalign.Alignment(box.rotation, box.center - box.rotation @ (scale * middle), scale)
 
 
 def _scene_errors(result: Any, truth: cadalign.Alignment, mean: FloatArray) -> dict[str, float]:
     """Errors of a car; one without result counts as wrong as can be."""
-    names = ("yaw deg", "depth %", "length %")
     if not isinstance(result, cadalign.Result):
-        return dict(zip(names, (180.0, 100.0, 100.0), strict=True))
-    est, center = result.alignment, mean.mean(axis=0)[None]
-    depth = est.apply(center)[0, 2] / truth.apply(center)[0, 2]
-    length = est.scale[1] / truth.scale[1]
-    errors = rotation_error(est=est, gt=truth), 100 * abs(depth - 1), 100 * abs(length - 1)
-    return dict(zip(names, map(float, errors), strict=True))
+        return {"yaw deg": 180.0, "depth %": 100.0, "length %": 100.0}
+    est, center = result.alignment, mean.mean(axis=0)
+    depth = pose_of(est, center)[-1] / pose_of(truth, center)[-1]
+    return {
+        "yaw deg": rotation_error(est=est, gt=truth),
+        "depth %": 100 * abs(depth - 1),
+        "length %": 100 * abs(est.scale[1] / truth.scale[1] - 1),
+    }

@@ -12,14 +12,13 @@ import cv2
 import numpy as np
 
 from benchmarks import section
-from benchmarks.photo import PhotoClicks, bop_cases
+from benchmarks.photo import PhotoClicks, drawn_clicks, real_cases
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Model, View, align
 from cadalign.annotate.candidates import MaskCandidates, best_click
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.metrics import nearest_truth
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval.by_mask import grab_cut
@@ -58,12 +57,11 @@ def clicks(given: BenchmarkData, *, draws: int = 3, most: int = 12, within: floa
         "with box and mask": (_by_box, 0),
     }
     needed: dict[str, list[int]] = defaultdict(list)
-    for number, case in enumerate(bop_cases(given)):
-        for draw in range(draws):
-            rng = np.random.default_rng([given.seed, 4, number, draw])
-            clicks = case.clicked(rng, stretched=False, count=most)
-            for name, (method, least) in methods.items():
-                needed[f"{case.group}, {name}"].append(_needed(clicks, method, least, most, within))
+    cases = ((case, draws) for case in real_cases(given, "bop_samples"))
+    for clicks in drawn_clicks(cases, given.seed, 4, stretched=False, count=most):
+        for name, (method, least) in methods.items():
+            count = _needed(clicks, method, least, most, within)
+            needed[f"{clicks.case.group}, {name}"].append(count)
     rows = [
         {
             "photos": name,
@@ -109,16 +107,14 @@ def outline_methods(given: BenchmarkData, *, draws: int = 5) -> Tables:
         for name in ("Rapid", "OLS", "GOS"):
             methods[name] = partial(_by_tracker, name)
     found: dict[str, list[Row]] = defaultdict(list)
-    for number, case in enumerate(bop_cases(given)):
-        for draw in range(draws):
-            rng = np.random.default_rng([given.seed, 3, number, draw])
-            clicks = case.clicked(rng, stretched=False)
-            first = rotation_error(est=_by_clicks(clicks), gt=clicks.truth)
-            for name, method in methods.items():
-                wall, _, est = section.clocked(partial(method, clicks))
-                error = rotation_error(est=est, gt=clicks.truth)
-                row = {"R": error, "better": error < first, "seconds": wall}
-                found[f"{case.group}, {name}"].append(row)
+    cases = ((case, draws) for case in real_cases(given, "bop_samples"))
+    for clicks in drawn_clicks(cases, given.seed, 3, stretched=False):
+        first = rotation_error(est=_by_clicks(clicks), gt=clicks.truth)
+        for name, method in methods.items():
+            wall, _, est = section.clocked(partial(method, clicks))
+            error = rotation_error(est=est, gt=clicks.truth)
+            row = {"R": error, "better": error < first, "seconds": wall}
+            found[f"{clicks.case.group}, {name}"].append(row)
     rows = [{"photos": name, **section.summary(each)} for name, each in found.items()]
     yield "rough clicks refined, rigid models: medians", rows
 
@@ -192,7 +188,11 @@ def _clicked(
         seen = np.array([places[label] for label in clicked])
         seen += rng.normal(0, _CLICK_PX, seen.shape)
         chances = candidates.probabilities(clicked, np.empty((len(clicked), 3)), seen)
-    right = np.array([_is_right(each.alignment, gt, own) for each in candidates.every])
+    turns = [
+        rotation_error(est=each.alignment, gt=gt, symmetry=own.symmetry)
+        for each in candidates.every
+    ]
+    right = np.array(turns) < _SIMILAR_DEG
     return {
         "first": bool(right[0]),
         "among": bool(right.any()),
@@ -203,11 +203,6 @@ def _clicked(
         "right": bool(right[chances > 0].any() and np.count_nonzero(chances) == 1),
         "seconds": wall,
     }
-
-
-def _is_right(est: Alignment, gt: Alignment, model: AnnotatedModel) -> bool:
-    nearest = nearest_truth(est=est, gt=gt, symmetry=model.symmetry)
-    return bool(rotation_error(est=est, gt=nearest) < _SIMILAR_DEG)
 
 
 def _told(name: str, rows: list[Row]) -> Row:
@@ -278,17 +273,18 @@ def _by_tracker(name: str, clicks: PhotoClicks) -> Alignment:
     mesh, camera, start = clicks.case.mesh, clicks.case.camera, _by_clicks(clicks)
     image = np.ascontiguousarray(clicks.case.pixels[:, :, ::-1])
     points, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32)
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
     turn, shift = cv2.Rodrigues(start.rotation)[0], start.translation.reshape(3, 1).copy()
     lines = image, _RAPID_LINES, _RAPID_REACH
     try:
         if name == "Rapid":
             for _ in range(_RAPID_STEPS):
-                _, turn, shift, _ = cv2.rapid.rapid(*lines, points, faces, matrix, turn, shift)
+                _, turn, shift, _ = cv2.rapid.rapid(
+                    *lines, points, faces, camera.matrix, turn, shift
+                )
         else:
             tracker = getattr(cv2.rapid, f"{name}Tracker").create(points, faces)
             ends = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, _RAPID_STEPS, 1.5)
-            _, turn, shift = tracker.compute(*lines, matrix, turn, shift, termcrit=ends)
+            _, turn, shift = tracker.compute(*lines, camera.matrix, turn, shift, termcrit=ends)
     except cv2.error:
         return start
     if not (np.isfinite(turn).all() and np.isfinite(shift).all()):

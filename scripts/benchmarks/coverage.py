@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtri
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import BenchmarkData, Row, Tables
+from benchmarks.section import BenchmarkData, Row, T, Tables
 from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.metrics.errors import alignment_errors
+from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-from cadalign.shapes.parts import probability_within
+from cadalign.geometry.metrics import rotation_error
 
 _LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25
 _COVERED = 0.95
@@ -61,17 +61,11 @@ def coverage(
 def _regions(seed: int, noise_px: float, region_problems: int) -> Iterator[Row]:
     for kind in _KINDS:
         for points in _REGION_SIZES:
-            reached = []
-            for number in range(region_problems):
-                rng = np.random.default_rng([seed, points, number])
-                found = section.attempt(_estimated, rng, kind, points, noise_px)
-                if found is not None:
-                    reached.append(_regions_reached(*found))
+            draw = partial(_estimated, kind=kind, points=points, noise_px=noise_px)
+            reached = [_levels(*each) for each in _estimates(draw, seed, points, region_problems)]
             row: Row = {"estimate": kind, "keypoints": points, "results": len(reached)}
             if reached:  # not all were refused
-                for name, levels in zip(_REGIONS, np.transpose(reached), strict=True):
-                    shares = (section.percent(levels <= share) for share in (0.68, 0.95))
-                    row[name] = ", ".join(f"{share:.0f}" for share in shares)
+                row |= dict(zip(_REGIONS, map(_within, np.transpose(reached)), strict=True))
             yield row
 
 
@@ -79,14 +73,10 @@ def _similar(seed: int, region_problems: int) -> Iterator[Row]:
     for stretch in ("free", "none"):
         for shape_sigma in _SHAPE_SIGMAS:
             for points in _SIMILAR_SIZES:
-                found = []
-                for number in range(region_problems):
-                    rng = np.random.default_rng([seed, points, number])
-                    similar = section.attempt(_similar_estimate, rng, shape_sigma, stretch, points)
-                    if similar is not None:
-                        found.append(similar)
-                bias, stated, turn, level = np.array(found).T
-                within = ", ".join(f"{section.percent(level <= p):.0f}" for p in (0.68, 0.95))
+                how = {"shape_sigma": shape_sigma, "stretch": stretch, "points": points}
+                draw = partial(_similar_estimate, **how)
+                found = _estimates(draw, seed, points, region_problems)
+                bias, stated, turn, level = np.transpose(found)
                 yield {
                     "stretch": stretch,
                     "shape_sigma": shape_sigma,
@@ -94,22 +84,37 @@ def _similar(seed: int, region_problems: int) -> Iterator[Row]:
                     "log distance": float(bias.mean()),
                     "stated": float(np.sqrt((stated**2).mean())),
                     "R deg": float(np.median(turn)),
-                    "t within 68, 95 %": within,
+                    "t within 68, 95 %": _within(level),
                 }
+
+
+def _estimates(
+    draw: Callable[[np.random.Generator], T], seed: int, points: int, count: int
+) -> list[T]:
+    """What is drawn and estimated, without what is refused."""
+    drawn = (
+        section.attempt(draw, np.random.default_rng([seed, points, number]))
+        for number in range(count)
+    )
+    return [each for each in drawn if each is not None]
+
+
+def _within(levels: FloatArray) -> str:
+    return ", ".join(f"{section.percent(levels <= share):.0f}" for share in (0.68, 0.95))
 
 
 def _coverage(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
     for sigma, loss in ((noise_px, "linear"), (None, "linear"), (None, "cauchy")):
         for points in _CALIBRATED_SIZES[1:]:
             draw = partial(simulate_problem, points=points, noise_px=noise_px)
-            held = [
-                [
-                    _holds(result, problem.alignment, result.fisher_covariance),
-                    _holds(result, problem.alignment, result.covariance),
-                    not result.alternatives,
-                ]
-                for problem, result in _fits(seed, draw, sigma=sigma, loss=loss, problems=problems)
-            ]
+            held = []
+            for problem, result in _fits(seed, draw, sigma=sigma, loss=loss, problems=problems):
+                error = section.deviation(est=result.alignment, gt=problem.alignment)
+                levels = (
+                    probability_level(error, covariance)
+                    for covariance in (result.fisher_covariance, result.covariance)
+                )
+                held.append([*(level < _COVERED for level in levels), not result.alternatives])
             names = ("inverse Fisher %", "stated %", "no alternative %")
             row = {"sigma": str(sigma), "loss": loss, "keypoints": points}
             yield row | dict(zip(names, map(section.percent, np.transpose(held)), strict=True))
@@ -118,7 +123,9 @@ def _coverage(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
 def _warnings(seed: int, problems: int, noise_px: float) -> Iterator[Row]:
     for name, draw, options in _warned_cases(noise_px):
         fits = list(_fits(seed, draw, **options, problems=problems))
-        large = [result for problem, result in fits if _is_large(result, problem.alignment)]
+        large = [
+            result for problem, result in fits if _is_large(result.alignment, problem.alignment)
+        ]
         silent = sum(not result.warnings and not result.alternatives for result in large)
         misfits = sum(result.misfit is not None for _, result in fits)
         yield {
@@ -142,28 +149,27 @@ def _fits(
             yield problem, result
 
 
+def _placed(rng: np.random.Generator, scale: FloatArray) -> Alignment:
+    """A random pose some units before the camera."""
+    turn = Rotation.random(random_state=rng).as_matrix()
+    return Alignment(turn, rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0)), scale)
+
+
 def _estimated(
-    rng: np.random.Generator, kind: str, points: int, noise_px: float
+    rng: np.random.Generator, *, kind: str, points: int, noise_px: float
 ) -> tuple[Result, Alignment]:
     model = rng.uniform(-0.5, 0.5, (points, 3))
-    scale = np.array([1.0, *np.exp(rng.normal(0, 0.2, 2))])
+    scale = np.array([1.0, *np.exp(rng.normal(0, _STRETCH_SIGMA, 2))])
     differs = _SHAPE_SIGMA if kind.startswith("shape_sigma") else 0.0
     object_points = model * scale + rng.normal(0, 1, model.shape) * differs
-    poses = []
-    for _ in range(2):
-        turn = Rotation.random(random_state=rng).as_matrix()
-        place = rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0))
-        poses.append(Alignment(turn, place, np.ones(3)))
-    seen = [
-        KEYPOINT_CAMERA.project(pose.apply(object_points)) + rng.normal(0, noise_px, (points, 2))
-        for pose in poses
-    ]
-    truth = Alignment(poses[0].rotation, poses[0].translation, scale)
+    camera, poses = KEYPOINT_CAMERA, [_placed(rng, np.ones(3)) for _ in range(2)]
+    seen = [section.seen_in(camera, each, object_points, noise_px, rng).points_2d for each in poses]
+    truth = replace(poses[0], scale=scale)
     if kind == "two views" or differs:
-        views = [View(KEYPOINT_CAMERA, each, sigma=noise_px) for each in seen]
+        views = [View(camera, each, sigma=noise_px) for each in seen]
         own = Model(points_3d=model, shape_sigma=differs) if differs else Model(points_3d=model)
         return cadalign.align(own, views[:1] if differs else views), truth
-    camera, options = KEYPOINT_CAMERA, dict[str, Any](sigma=noise_px)
+    options = dict[str, Any](sigma=noise_px)
     if kind == "sigma=None":
         options = {"sigma": None}
     elif kind == "20 % outliers":
@@ -176,7 +182,7 @@ def _estimated(
 
 
 def _similar_estimate(
-    rng: np.random.Generator, shape_sigma: float, stretch: str, points: int
+    rng: np.random.Generator, *, shape_sigma: float, stretch: str, points: int
 ) -> tuple[float, float, float, float]:
     """Error of the log distance and its standard deviation, rotation error, region of t.
 
@@ -184,33 +190,28 @@ def _similar_estimate(
     """
     model = rng.uniform(-0.5, 0.5, (points, 3))
     logs = rng.normal(0, _STRETCH_SIGMA, 2) if stretch == "free" else np.zeros(2)
-    scale = np.array([1.0, *np.exp(logs)])
-    turn = Rotation.random(random_state=rng).as_matrix()
-    truth = Alignment(turn, rng.uniform((-0.3, -0.2, 3.0), (0.3, 0.2, 5.0)), scale)
+    truth = _placed(rng, np.exp([0.0, *logs]))
     moved = model + rng.normal(0, shape_sigma, model.shape)
-    seen = KEYPOINT_CAMERA.project(truth.apply(moved)) + rng.normal(0, 1, (points, 2))
-    prior: dict[str, Any] = {"stretch_sigma": _STRETCH_SIGMA} if stretch == "free" else {}
-    own = Model(
-        points_3d=model, shape_sigma=shape_sigma, stretch=None if prior else "none", **prior
+    seen = section.seen_in(KEYPOINT_CAMERA, truth, moved, 1.0, rng).points_2d
+    prior: dict[str, Any] = (
+        {"stretch_sigma": _STRETCH_SIGMA} if stretch == "free" else {"stretch": "none"}
     )
+    own = Model(points_3d=model, shape_sigma=shape_sigma, **prior)
     result = cadalign.align(own, View(KEYPOINT_CAMERA, seen, sigma=1.0))
     distance = np.linalg.norm(truth.translation)
     along = truth.translation / distance
     error = np.log(np.linalg.norm(result.alignment.translation) / distance)
     stated = np.sqrt(along @ result.covariance[3:6, 3:6] @ along) / distance
-    square = _square(result, truth, result.covariance, [3, 4, 5])
-    level = float(probability_within(square, 3, result.degrees_of_freedom))
-    turned = alignment_errors(est=result.alignment, gt=truth)["rotation_error_deg"]
-    return float(error), float(stated), float(turned), level
+    _, level, _ = _levels(result, truth)
+    return float(error), float(stated), rotation_error(est=result.alignment, gt=truth), level
 
 
-def _regions_reached(result: Result, truth: Alignment) -> list[float]:
-    covariance, found = result.covariance, []
-    for first in (0, 3, 6):
-        rows = [row for row in range(first, first + 3) if covariance[row, row] > 0]
-        square = _square(result, truth, covariance, rows)
-        found.append(float(probability_within(square, len(rows), result.degrees_of_freedom)))
-    return found
+def _levels(result: Result, truth: Alignment) -> list[float | None]:
+    """Levels of the smallest regions of rotation, translation and lengths that hold the truth."""
+    error, covariance = section.deviation(est=result.alignment, gt=truth), result.covariance
+    parts = (slice(first, first + 3) for first in (0, 3, 6))
+    freedom = result.degrees_of_freedom
+    return [probability_level(error[part], covariance[part, part], freedom) for part in parts]
 
 
 def _warned_cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:
@@ -248,23 +249,6 @@ def _warned_cases(noise_px: float) -> list[tuple[str, Draw, dict[str, Any]]]:
     ]
 
 
-def _is_large(result: Result, gt: Alignment) -> bool:
-    errors = alignment_errors(est=result.alignment, gt=gt)
-    return errors["rotation_error_deg"] > _LARGE_ROTATION_DEG or bool(
-        np.abs(result.alignment.scale / gt.scale - 1).max() > _LARGE_SCALE
-    )
-
-
-def _holds(result: Result, gt: Alignment, covariance: FloatArray) -> bool:
-    """True if the truth lies within the 95 % ellipsoid."""
-    free = np.flatnonzero(covariance.diagonal()).tolist()
-    return _square(result, gt, covariance, free) < float(chdtri(len(free), 1 - _COVERED))
-
-
-def _square(result: Result, gt: Alignment, covariance: FloatArray, rows: list[int]) -> float:
-    """Squared Mahalanobis distance of some of the errors, in the order of a covariance's rows."""
-    est = result.alignment
-    turn = Rotation.from_matrix(gt.rotation @ est.rotation.T).as_rotvec()
-    shift, logs = gt.translation - est.translation, np.log(gt.scale / est.scale)
-    kept = np.concatenate([turn, shift, logs])[rows]
-    return float(kept @ np.linalg.solve(covariance[np.ix_(rows, rows)], kept))
+def _is_large(est: Alignment, gt: Alignment) -> bool:
+    is_turned = rotation_error(est=est, gt=gt) > _LARGE_ROTATION_DEG
+    return is_turned or bool(np.abs(est.scale / gt.scale - 1).max() > _LARGE_SCALE)

@@ -178,10 +178,10 @@ def gradient_errors(
     objects = mean + (weights * modes).sum(axis=1)
     poses = [replace(each.alignment, scale=np.ones(3)) for each in drawn]
     pairs = zip(poses, objects, strict=True)
-    seen = np.array([camera.project(pose.apply(own)) for pose, own in pairs])
-    noisy = torch.tensor(seen + rng.standard_normal(seen.shape))
+    noisy = [section.seen_in(camera, pose, own, 1.0, rng).points_2d for pose, own in pairs]
+    seen = torch.tensor(np.array(noisy))
     for name, loss in (("learned shape", "linear"), ("learned shape, cauchy", "cauchy")):
-        rows.append(_row(name, partial(align, shape, camera=camera, loss=loss), noisy, rng, step))
+        rows.append(_row(name, partial(align, shape, camera=camera, loss=loss), seen, rng, step))
     yield "Gradients beside finite differences, relative errors", rows
 
 

@@ -21,8 +21,9 @@ from cadalign.estimation.contours.measured import shift_to
 from cadalign.estimation.contours.view_contour import contour_bound
 from cadalign.evaluation.instances.evidence import DAMAGES, damaged_mask
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.simulation.problems import Problem
 from cadalign.geometry.metrics import nearest_truth
-from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 
@@ -83,14 +84,14 @@ def _measure(cases: list[_Case], kind: str, seed: int) -> Row:
             continue
         alone.append(case.errors(without.alignment))
         joint.append(case.errors(result.alignment))
-        bounds += case.ideal_errors(contour_bound(case.model, view, case.truth), rng)
+        bounds += case.ideal_errors(contour_bound(case.model, view, case.seen.alignment), rng)
         (residuals,) = result.mask_residuals
         further.append((residuals.sigma, not residuals.is_used, wall))
         bottles.append(case.annotated.category.endswith("bottle"))
     row: Row = {"mask": kind}
     for suffix, errors in {"keypoints": alone, "mask": joint, "bound": bounds}.items():
-        for name, median in zip(_ERRORS, np.median(errors, axis=0).tolist(), strict=True):
-            row[f"{name} {suffix}"] = median
+        names = (f"{name} {suffix}" for name in _ERRORS)
+        row |= dict(zip(names, np.median(errors, axis=0).tolist(), strict=True))
     of_bottles = np.array(joint)[bottles, 2]
     sigmas, left_out, walls = np.transpose(further)
     return row | {
@@ -149,7 +150,7 @@ def _alone(cases: list[_Case], kind: str, seed: int) -> Row:
     found = []
     for case, mask, _ in _damaged(cases, kind, seed):
         model = Model(mesh=case.scene.mesh, symmetry=case.annotated.symmetry)
-        view = View(case.camera, mask=mask)
+        view = View(case.seen.camera, mask=mask)
         wall, _, result = section.clocked(partial(section.attempt, align, model, view))
         if result is None:
             print(kind, case.annotated.model_id, "is refused")
@@ -167,27 +168,9 @@ class _Case:
 
     annotated: AnnotatedModel
     scene: Scene
-    camera: Camera
-    truth: Alignment
     ids: list[int]
-    points_2d: FloatArray
+    seen: Problem
     mask: np.ndarray
-
-    @classmethod
-    def drawn(
-        cls,
-        annotated: AnnotatedModel,
-        scene: Scene,
-        camera: Camera,
-        truth: Alignment,
-        ids: list[int],
-        rng: np.random.Generator,
-    ) -> _Case:
-        """Draw the noise of the keypoints, and cast the exact mask."""
-        pixels = camera.project(truth.apply(annotated.keypoints.xyz[ids]))
-        noisy = pixels + rng.normal(0, _NOISE_PX, pixels.shape)
-        mask = cast_geometry(scene, camera, truth).mask
-        return cls(annotated, scene, camera, truth, ids, noisy, mask)
 
     @property
     def model(self) -> Model:
@@ -196,11 +179,12 @@ class _Case:
 
     def view(self, mask: np.ndarray | None) -> View:
         """The keypoints, with or without a mask."""
-        return View(self.camera, self.points_2d, ids=self.ids, sigma=_NOISE_PX, mask=mask)
+        pixels = self.seen.points_2d
+        return View(self.seen.camera, pixels, ids=self.ids, sigma=_NOISE_PX, mask=mask)
 
     def errors(self, est: Alignment) -> list[float]:
         """Rotation [deg], larger stretch error [%], box IoU."""
-        gt = self.truth
+        gt = self.seen.alignment
         iou = alignment_box_iou(est=est, gt=gt, bounds=self.scene.bounds)
         stretch = 100 * float(np.abs(est.scale / gt.scale - 1)[1:].max())
         return [rotation_error(est=est, gt=gt), stretch, iou]
@@ -208,7 +192,7 @@ class _Case:
     def is_right(self, est: Alignment) -> bool:
         """True for an estimate near the truth, or near one that is equal to it."""
         symmetry = self.annotated.symmetry
-        gt = nearest_truth(est=est, gt=self.truth, symmetry=symmetry)
+        gt = nearest_truth(est=est, gt=self.seen.alignment, symmetry=symmetry)
         logs = np.log(est.scale / gt.scale)
         if symmetry.axes:
             logs -= logs.mean()
@@ -217,13 +201,17 @@ class _Case:
 
     def ideal_errors(self, bound: FloatArray, rng: np.random.Generator) -> list[list[float]]:
         """`errors` of an ideal estimator, of every draw."""
-        drawn = rng.multivariate_normal(np.zeros(9), bound, size=section.LIMIT_DRAWS, method="eigh")
-        truth, found = self.truth, []
-        for turn, shift, logs in zip(drawn[:, :3], drawn[:, 3:6], drawn[:, 6:], strict=True):
+        truth, found = self.seen.alignment, []
+        for turn, shift, logs in _drawn_errors(bound, rng).reshape(-1, 3, 3):
             rotation = rotation_from_vector(turn) @ truth.rotation
             est = Alignment(rotation, truth.translation + shift, truth.scale * np.exp(logs))
             found.append(self.errors(est))
         return found
+
+
+def _drawn_errors(bound: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Turns, shifts and log scales (draws, 9) of an ideal estimator."""
+    return rng.multivariate_normal(np.zeros(9), bound, size=section.LIMIT_DRAWS, method="eigh")
 
 
 def _cases_of(given: BenchmarkData, views: int) -> list[_Case]:
@@ -250,15 +238,22 @@ def _drawn(model: _Meshed, rng: np.random.Generator, **how: Any) -> _Case | None
     annotated, scene = model
     scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(_STRETCH))])
     seen = scene, annotated.keypoints.xyz, KEYPOINT_CAMERA
-    view = None
-    for least in (7, _LEAST_KEYPOINTS):
-        view = view or section.attempt(
-            sample_view, *seen, min_visible=least, rng=rng, scale=scale, **how
-        )
+    how |= {"rng": rng, "scale": scale}
+    view = section.attempt(sample_view, *seen, min_visible=7, **how)
+    view = view or section.attempt(sample_view, *seen, min_visible=_LEAST_KEYPOINTS, **how)
     if view is None:
         return None
     ids = np.flatnonzero(view.visible).tolist()
-    return _Case.drawn(annotated, scene, KEYPOINT_CAMERA, view.cam_from_model, ids, rng)
+    return _case_of(model, KEYPOINT_CAMERA, view.cam_from_model, ids, rng)
+
+
+def _case_of(
+    model: _Meshed, camera: Camera, truth: Alignment, ids: list[int], rng: np.random.Generator
+) -> _Case:
+    """Draw the noise of the keypoints, and cast the exact mask."""
+    annotated, scene = model
+    seen = section.seen_in(camera, truth, annotated.keypoints.xyz[ids], _NOISE_PX, rng)
+    return _Case(annotated, scene, ids, seen, cast_geometry(scene, camera, truth).mask)
 
 
 def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed: int) -> Row:
@@ -271,20 +266,15 @@ def _ends_of(models: list[_Meshed], fill: tuple[float, float], count: int, seed:
         if case is None:
             continue
         wall, _, result = section.clocked(partial(align, case.model, case.view(case.mask)))
-        est, truth = result.alignment, case.truth
-        # The logarithm of the distance: it rises with the stretches where the size is open.
-        error = np.concatenate(
-            [
-                vector_from_rotation(truth.rotation @ est.rotation.T),
-                shift_to(est.translation, truth.translation),
-                np.log(truth.scale / est.scale)[1:],
-            ]
-        )
+        est, truth = result.alignment, case.seen.alignment
+        # With the logarithm of the distance: it rises with the stretches where the size is open.
+        error = section.deviation(est=truth, gt=est)[_FREE]
+        error[3:6] = shift_to(est.translation, truth.translation)
         square = error @ np.linalg.solve(result.covariance[np.ix_(_FREE, _FREE)], error)
         lengths = np.linalg.norm([truth.translation, est.translation], axis=1)
         errors = np.abs([*error[6:], np.log(lengths[1] / lengths[0])])
         bound = contour_bound(case.model, case.view(case.mask), truth)
-        drawn = rng.multivariate_normal(np.zeros(9), bound, size=section.LIMIT_DRAWS, method="eigh")
+        drawn = _drawn_errors(bound, rng)
         along = np.log(np.linalg.norm(truth.translation + drawn[:, 3:6], axis=1) / lengths[0])
         ideal = np.maximum(np.abs(drawn[:, 7:]).max(axis=1), np.abs(along)) > _FAR_OFF
         found.append((errors[:2].max(), errors[2], square, wall, ideal.mean()))
@@ -319,12 +309,12 @@ def _cut_by_border(case: _Case, rng: np.random.Generator) -> _Case:
     """The view with a quarter of the object outside the image; enough keypoints stay inside."""
     columns = np.cumsum(case.mask.sum(axis=0)) / case.mask.sum()
     shift = float(np.searchsorted(columns, 0.25))
-    camera = replace(case.camera, cx=case.camera.cx - shift)
-    inside = camera.contains(case.points_2d - [shift, 0.0])
+    camera = replace(case.seen.camera, cx=case.seen.camera.cx - shift)
+    inside = camera.contains(case.seen.points_2d - [shift, 0.0])
     if inside.sum() < _LEAST_KEYPOINTS:
         inside[:] = True
     ids = np.array(case.ids)[inside].tolist()
-    return _Case.drawn(case.annotated, case.scene, camera, case.truth, ids, rng)
+    return _case_of((case.annotated, case.scene), camera, case.seen.alignment, ids, rng)
 
 
 def _beside(other: np.ndarray, own: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:

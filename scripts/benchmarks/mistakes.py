@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.section import BenchmarkData, Row, Tables, percent
+from benchmarks.section import BenchmarkData, Row, Tables, percent, seen_in
 from cadalign import Model, RansacOptions, Result, View, align, fit
 from cadalign.arrays import FloatArray
+from cadalign.datasets import KeypointNet
 from cadalign.errors import CadalignError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.pixels import PIXEL_CENTRE
@@ -81,21 +81,18 @@ def mistakes(
     shape_sigma : float
         Displacement of the keypoints of similar models, in diagonals.
     """
-    own = [_row(given, each, problems) for each in categories]
-    yield f"mistakes, {problems} problems each: %", own
-    if similar:
-        sigma = shape_sigma
-        rows = [_row(given, each, similar, sigma) for each in categories]
-        title = f"of similar models, shape_sigma {sigma:g}, {similar} each: %"
-        yield title, rows
-
-
-def _row(given: BenchmarkData, category: str, problems: int, shape_sigma: float = 0.0) -> Row:
-    path = given.needed() / "annotations" / f"{category}.json"
-    models = json.loads(path.read_text(encoding="utf-8"))
-    points = [np.array([each["xyz"] for each in model["keypoints"]]) for model in models]
-    points = [each for each in points if len(each) >= _FEWEST]
-    return {"category": category, **_shares(points, given.seed, problems, shape_sigma)}
+    dataset, models = KeypointNet(given.needed()), {}
+    for category in categories:
+        points = (each.keypoints.xyz for each in dataset[category])
+        models[category] = [each for each in points if len(each) >= _FEWEST]
+    own = f"mistakes, {problems} problems each: %", problems, 0.0
+    title = f"of similar models, shape_sigma {shape_sigma:g}, {similar} each: %"
+    for name, count, sigma in (own, (title, similar, shape_sigma)):
+        if count:
+            yield (
+                name,
+                [{"category": c} | _shares(models[c], given.seed, count, sigma) for c in models],
+            )
 
 
 def _shares(models: list[FloatArray], seed: int, problems: int, shape_sigma: float) -> Row:
@@ -133,14 +130,13 @@ def _seen(
     models: list[FloatArray], rng: np.random.Generator, count: int | None = None
 ) -> SeenModel:
     points = models[rng.integers(len(models))]
-    most = min(len(points), _MOST)
-    size = count or int(rng.integers(_FEWEST, most + 1))
+    size = count or int(rng.integers(_FEWEST, min(len(points), _MOST) + 1))
     points = points[rng.choice(len(points), size, replace=False)]
     azimuth, elevation = rng.uniform(0, 360), rng.uniform(*_ELEVATION_DEG)
     stretched = points * np.exp([0.0, *rng.normal(0, _STRETCH_SIGMA, 2)])
     pose = look_at(azimuth=azimuth, elevation=elevation, distance=rng.uniform(*_DISTANCE))
-    pixels = KEYPOINT_CAMERA.project(pose.apply(stretched))
-    return SeenModel(points, pixels + rng.normal(0, _NOISE_PX, pixels.shape), pose.rotation)
+    seen = seen_in(KEYPOINT_CAMERA, pose, stretched, _NOISE_PX, rng)
+    return SeenModel(points, seen.points_2d, pose.rotation)
 
 
 def _said(seen: SeenModel, shape_sigma: float) -> tuple[bool, bool, bool, bool]:

@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
-from scipy.stats import chi2
 
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, Mesh, Model, Result, View, align
 from cadalign.arrays import FloatArray
-from cadalign.datasets import AnnotatedModel, load_mesh
+from cadalign.datasets import AnnotatedModel
+from cadalign.datasets import open as open_data
 from cadalign.estimation.contours.line_changes import bins_of, regions_of
+from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.metrics import nearest_truth
-from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.images import read_photo
 from cadalign.metrics import rotation_error
@@ -58,15 +58,13 @@ def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> T
         Draws of the clicks on every real photo.
     """
     cases = [(case, 1) for case in _composites(given, composites)]
-    cases += [(case, draws) for case in bop_cases(given)]
-    cases += [(case, max(draws // 5, 1)) for case in _occluded_cases(given)]
+    cases += [(case, draws) for case in real_cases(given, "bop_samples")]
+    cases += [(case, max(draws // 5, 1)) for case in real_cases(given, "lmo_multiview")]
     for stretched in (False, True):
         rows: dict[str, list[Row]] = defaultdict(list)
-        for number, (case, times) in enumerate(cases):
-            for draw in range(times):
-                rng = np.random.default_rng([given.seed, 3, number, draw])
-                row = _compared(case.clicked(rng, stretched=stretched)) | case.looks
-                rows[f"{case.group} {case.kind}"].append(row)
+        for clicks in drawn_clicks(cases, given.seed, 3, stretched=stretched):
+            case = clicks.case
+            rows[f"{case.group} {case.kind}"].append(_compared(clicks) | case.looks)
         made = [row for name, found in rows.items() if "composite" in name for row in found]
         for look in ("contrast", "texture"):
             thirds = np.array_split(sorted(made, key=lambda row: row[look]), 3)
@@ -137,7 +135,7 @@ class PhotoCase:
     mesh: Mesh
     truth: Alignment
     kind: str = ""
-    symmetry: Symmetry | None = None
+    symmetry: Symmetry = field(default_factory=Symmetry.none)
     looks: Row = field(default_factory=dict)
 
     def clicked(
@@ -184,8 +182,6 @@ class PhotoClicks:
 
     def true_for(self, est: Alignment) -> Alignment:
         """The true alignment, of those that are equal under the symmetry the nearest."""
-        if self.case.symmetry is None:
-            return self.truth
         return nearest_truth(est=est, gt=self.truth, symmetry=self.case.symmetry)
 
     def errors(self, result: Result) -> tuple[float, float, float]:
@@ -198,14 +194,22 @@ class PhotoClicks:
 
     def covered_by(self, result: Result) -> list[bool]:
         """True where the truth lies in the regions of rotation and of translation."""
-        est, gt = result.alignment, self.true_for(result.alignment)
-        turn = vector_from_rotation(gt.rotation @ est.rotation.T)
-        shift = gt.translation - est.translation
-        blocks = result.covariance[:3, :3], result.covariance[3:6, 3:6]
-        return [
-            bool(step @ np.linalg.solve(block, step) < chi2.ppf(_INNER, 3))
-            for step, block in zip((turn, shift), blocks, strict=True)
-        ]
+        error = section.deviation(est=result.alignment, gt=self.true_for(result.alignment))
+        levels = (
+            probability_level(error[rows], result.covariance[rows, rows])
+            for rows in (slice(3), slice(3, 6))
+        )
+        return [level is not None and level < _INNER for level in levels]
+
+
+def drawn_clicks(
+    cases: Iterable[tuple[PhotoCase, int]], seed: int, stream: int, **how: Any
+) -> Iterator[PhotoClicks]:
+    """So many draws of clicks on each of the cases."""
+    for number, (case, draws) in enumerate(cases):
+        for draw in range(draws):
+            rng = np.random.default_rng([seed, stream, number, draw])
+            yield case.clicked(rng, **how)
 
 
 def _spread_places(mask: np.ndarray, rng: np.random.Generator, count: int) -> np.ndarray:
@@ -226,38 +230,13 @@ def _spread_places(mask: np.ndarray, rng: np.random.Generator, count: int) -> np
 # Real photos --------------------------------------------------------------------------------------
 
 
-_mesh = cache(load_mesh)
-
-
-def bop_cases(given: BenchmarkData) -> Iterator[PhotoCase]:
-    """The photos of HANDAL and LINEMOD."""
-    folder = given.real("bop_samples")
-    for name, entry in json.loads((folder / "poses.json").read_text()).items():
-        pose = np.array(entry["cam_from_model"])
-        names = ("width", "height", "fx", "fy", "cx", "cy")
-        camera = Camera(**{key: entry["camera"][key] for key in names})
-        truth = _rigid(pose[:3, :3], pose[:3, 3])
-        mesh, photo = _mesh(folder / entry["model"]), read_photo(folder / name)
-        yield PhotoCase(name.split("/")[0], camera, photo, mesh, truth)
-
-
-def _occluded_cases(given: BenchmarkData) -> Iterator[PhotoCase]:
-    folder = given.real("lmo_multiview")
-    entries = json.loads((folder / "camera.json").read_text())
-    camera = Camera(**{key: value for key, value in entries.items() if key != "depth_scale"})
-    for number, entries in json.loads((folder / "scene_gt.json").read_text()).items():
-        pixels = read_photo(folder / "rgb" / f"{int(number):06d}.png")
-        for entry in entries:
-            path = folder / "models" / f"obj_{entry['obj_id']:06d}.ply"
-            if path.exists():
-                rotation = np.array(entry["cam_R_m2c"]).reshape(3, 3)
-                truth = _rigid(rotation, np.array(entry["cam_t_m2c"]))
-                yield PhotoCase("lmo", camera, pixels, _mesh(path), truth)
-
-
-def _rigid(rotation: FloatArray, translation: FloatArray) -> Alignment:
-    left, _, right = np.linalg.svd(rotation)
-    return Alignment(left @ right, translation, np.ones(3))
+def real_cases(given: BenchmarkData, folder: str) -> Iterator[PhotoCase]:
+    """The objects of real photos: bop_samples (HANDAL, LINEMOD), lmo_multiview (occluded ones)."""
+    for photo in open_data(given.real(folder)):
+        group, pixels = photo.name.rpartition("/")[0] or "lmo", photo.read_image()
+        for each in photo.objects:
+            mesh, truth = each.model.load_mesh(), each.truth.cam_from_model
+            yield PhotoCase(group, photo.known_camera, pixels, mesh, truth)
 
 
 # Composites ---------------------------------------------------------------------------------------
@@ -334,8 +313,7 @@ class _Clip:
 
     def error(self, number: int, est: Alignment) -> float:
         """Rotation [deg] of a frame's pose, up to the model's symmetry."""
-        truth, symmetry = self.truths[number], self.model.symmetry
-        return rotation_error(est=est, gt=nearest_truth(est=est, gt=truth, symmetry=symmetry))
+        return rotation_error(est=est, gt=self.truths[number], symmetry=self.model.symmetry)
 
 
 def _clips(given: BenchmarkData, frames: int) -> Iterator[_Clip]:

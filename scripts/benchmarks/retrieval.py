@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, islice
@@ -25,6 +25,7 @@ from cadalign.evaluation.instances.queries import (
     observe_model,
     same_shapes,
 )
+from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval import LibraryModel, Match
@@ -96,9 +97,8 @@ def _run(path: Path, models: Sequence[LibraryModel], run_queries: int) -> Row:
             query = Observation(points, seen.points_2d, KEYPOINT_CAMERA, ids=ids)
             queries.write(msgspec.json.encode(query.to_dict(states_origins=True)) + b"\n")
     command = ["retrieve", str(file), f"--library={path}", f"--out={path.with_name('run')}"]
-    reference = section.reference_seconds()
-    used = section.used_by_command([*command, "--no-picture", "--workers=2"])
-    reference = min(reference, section.reference_seconds())
+    call = partial(section.used_by_command, [*command, "--no-picture", "--workers=2"])
+    used, reference = section.with_reference(call)
     name = f"run of {run_queries:,} queries, two processes"
     row = section.figure(name, run_queries / used.wall, "1/s", used.processor / reference)
     return row | {"MB": used.megabytes}
@@ -239,26 +239,24 @@ def unseen_retrieval(
     dataset = KeypointNet(given.needed())
     for category in categories:
         shape = section.learned_shape(dataset, category)
+        library = Library.from_models(
+            [LibraryModel.of_annotated(model, with_mesh=False) for model in dataset[category]]
+        )
         for count in keypoints:
-            rows = list(_rankings(dataset, category, count, shape, objects, noise_px))
+            how = {"keypoints": count or None, "noise_px": noise_px}
+            seen = section.unseen_objects(dataset, category, objects, **how)
+            rows = list(_rankings(library, shape, seen, noise_px))
             yield f"{category}, {count or 'all'} keypoints", rows
 
 
 def _rankings(
-    dataset: KeypointNet,
-    category: str,
-    count: int,
+    library: Library,
     shape: ShapeModel,
-    objects: int,
+    objects: Iterable[tuple[int, UnseenObject]],
     noise_px: float,
 ) -> Iterator[Row]:
-    models = dataset.subset(categories=[category])[category]
-    library = Library.from_models(
-        [LibraryModel.of_annotated(model, with_mesh=False) for model in models]
-    )
     found: dict[str, list[tuple[float, float]]] = defaultdict(list)
-    how = {"keypoints": count or None, "noise_px": noise_px}
-    for _, seen in section.unseen_objects(dataset, category, objects, **how):
+    for _, seen in objects:
         known = np.isin(seen.ids, shape.ids)
         gt = Box.from_model(seen.task.hull.bounds, seen.gt)
         if known.sum() < _LEAST_SHARED or gt.volume < _FLAT:
@@ -269,9 +267,9 @@ def _rankings(
             seen.ids[known],
             KEYPOINT_CAMERA,
             top=1,
-            category=category,
+            category=shape.category,
             sigma=noise_px,
-            exclude=same_shapes(library, (category, seen.task.model_id)),
+            exclude=same_shapes(library, (shape.category, seen.task.model_id)),
             workers=1,
         )
         for name, options in _ranking_options(shape).items():

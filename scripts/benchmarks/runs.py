@@ -50,9 +50,9 @@ def _rate_and_memory(
     The rate's ratio is that of processor time to `reference_seconds`, the memory's the longer run's
     over the shorter one's.
     """
-    reference = section.reference_seconds()
-    short, long = (_used(*call, "--workers=2") for call in (shorter, longer))
-    reference = min(reference, section.reference_seconds())
+    (short, long), reference = section.with_reference(
+        lambda: [_used(*call, "--workers=2") for call in (shorter, longer)]
+    )
     busy = (long.processor - short.processor) / count
     name = f"{rate}, two processes"
     yield section.figure(name, count / (long.wall - short.wall), "1/s", 1e3 * busy / reference)
@@ -122,9 +122,7 @@ def _on_annotations(root: Path, method: str, count: int) -> Row:
         for start in range(0, number, _CHUNK):
             experiment.evaluate(tasks[start : min(start + _CHUNK, number)])
 
-    reference = section.reference_seconds()
-    busy = section.processor_seconds(evaluate_all)
-    reference = min(reference, section.reference_seconds())
+    busy, reference = section.with_reference(partial(section.processor_seconds, evaluate_all))
     name = f"evaluation on annotations, {method}"
     return section.figure(name, number / busy, "1/s", 1e3 * busy / number / reference)
 

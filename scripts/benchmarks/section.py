@@ -17,11 +17,13 @@ import tyro
 from common import COMMAND
 
 import cadalign
+from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.errors import CadalignError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
 from cadalign.evaluation.simulation.problems import Problem
+from cadalign.geometry.rotations import vector_from_rotation
 
 LIMIT_DRAWS = 20
 """Draws of an ideal estimator's errors for each problem."""
@@ -120,6 +122,25 @@ def fitted(problem: Problem, **options: Any) -> cadalign.Result | None:
     return attempt(cadalign.fit, *given, **options)
 
 
+def seen_in(
+    camera: cadalign.Camera,
+    pose: cadalign.Alignment,
+    points_3d: FloatArray,
+    noise_px: float,
+    rng: np.random.Generator,
+) -> Problem:
+    """The problem of points (n, 3) of a model in an image, with Gaussian noise."""
+    pixels = camera.project(pose.apply(points_3d))
+    pixels += noise_px * rng.standard_normal(pixels.shape)
+    return Problem(points_3d, pixels, camera, pose, None)
+
+
+def deviation(*, est: cadalign.Alignment, gt: cadalign.Alignment) -> FloatArray:
+    """Errors (9,) in the order of a covariance: turn [rad], shift, logarithms of the scales."""
+    turn = vector_from_rotation(est.rotation @ gt.rotation.T)
+    return np.concatenate([turn, est.translation - gt.translation, np.log(est.scale / gt.scale)])
+
+
 def meshed_models(
     given: BenchmarkData, folder: str, *, per_category: int
 ) -> tuple[list[AnnotatedModel], list[AnnotatedModel]]:
@@ -185,6 +206,13 @@ def reference_seconds() -> float:
     return processor_seconds(lambda: np.linalg.eigvalsh(matrices))
 
 
+def with_reference(call: Callable[[], T]) -> tuple[T, float]:
+    """What a call returns, and the smaller of `reference_seconds` before and after it."""
+    before = reference_seconds()
+    found = call()
+    return found, min(before, reference_seconds())
+
+
 def seconds_of_process(
     command: list[str], *, environment: Mapping[str, str] | None = None
 ) -> tuple[float, float]:
@@ -232,3 +260,11 @@ def medians_in_turns(
         for name, measure in measures.items():
             times[name] += [measure() for _ in range(per_turn)]
     return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def median_and_ratio(
+    own: Callable[[], float], other: Callable[[], float], count: int
+) -> tuple[float, float]:
+    """Median of a measurement, and its ratio to that of another one, taken in turns."""
+    medians = medians_in_turns({"own": own, "other": other}, count)
+    return medians["own"], medians["own"] / medians["other"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,8 +15,10 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
+from cadalign.evaluation.instances.unseen import UnseenObject
+from cadalign.evaluation.simulation.problems import Problem
 from cadalign.geometry.metrics import box_iou, rotation_error
-from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.render import look_at
 from cadalign.seeding import instance_rng
 from cadalign.solvers.projection import projection_jacobian
@@ -28,16 +31,6 @@ _POINTS = 14
 _MODE_LENGTH, _RESIDUAL = 0.06, 0.005
 _ERRORS = ("R", "t", "f", "shape")
 _LEAST_KEYPOINTS = 6
-
-
-class _Seen(NamedTuple):
-    """Keypoints (n, 3) of an object, their noisy places (n, 2) [px], ids, camera, true pose."""
-
-    points_3d: FloatArray
-    points_2d: FloatArray
-    ids: tuple[int, ...]
-    camera: cadalign.Camera
-    gt: cadalign.Alignment
 
 
 # Times --------------------------------------------------------------------------------------------
@@ -73,73 +66,47 @@ def align(
     workers : int
         Threads of the batch.
     """
-    dataset = KeypointNet(given.needed())
-    rows = [
-        _times_of(
-            dataset,
-            category,
-            objects,
-            keypoints,
-            noise_px,
-            repeats,
-            workers,
+    dataset, rows = KeypointNet(given.needed()), []
+    how = {"keypoints": keypoints, "noise_px": noise_px}
+    for category in categories:
+        shape = section.learned_shape(dataset, category)
+        found = section.unseen_objects(dataset, category, objects, **how)
+        pairs = [_two_views(shape, place, seen, noise_px) for place, seen in found]
+        singles = [views[:1] for views in pairs]
+        for views in singles[:2] + pairs[:2]:  # compile
+            cadalign.align(shape, views)
+        one, two = (
+            [
+                1e3 * section.processor_seconds(partial(cadalign.align, shape, views))
+                for views in some
+            ]
+            for some in (singles, pairs)
         )
-        for category in categories
-    ]
+        batch = singles * repeats
+        call = partial(cadalign.align_batch, shape, batch, workers=workers)
+        rows.append(
+            {
+                "category": category,
+                "components": len(shape.components),
+                "one view ms": section.spread(one),
+                "two views ms": float(np.median(two)),
+                "batch 1/s": len(batch) / section.seconds(call),
+            }
+        )
     yield "align with a learned shape", rows
 
 
-def _times_of(
-    dataset: KeypointNet,
-    category: str,
-    objects: int,
-    keypoints: int,
-    noise_px: float,
-    repeats: int,
-    workers: int,
-) -> Row:
-    shape = section.learned_shape(dataset, category)
-    pairs = list(_pairs(dataset, category, shape, objects, keypoints, noise_px))
-    singles = [views[:1] for views in pairs]
-    for views in singles[:2] + pairs[:2]:  # compile
-        cadalign.align(shape, views)
-    one, two = (
-        [
-            1e3 * section.processor_seconds(lambda v=views: cadalign.align(shape, v))
-            for views in some
-        ]
-        for some in (singles, pairs)
-    )
-    batch = singles * repeats
-    rate = len(batch) / section.seconds(lambda: cadalign.align_batch(shape, batch, workers=workers))
-    return {
-        "category": category,
-        "components": len(shape.components),
-        "one view ms": section.spread(one),
-        "two views ms": float(np.median(two)),
-        "batch 1/s": rate,
-    }
-
-
-def _pairs(
-    dataset: KeypointNet,
-    category: str,
-    shape: cadalign.ShapeModel,
-    objects: int,
-    keypoints: int,
-    noise_px: float,
-) -> Iterator[list[cadalign.View]]:
-    how = {"keypoints": keypoints, "noise_px": noise_px}
-    for place, seen in section.unseen_objects(dataset, category, objects, **how):
-        known = np.isin(seen.ids, shape.ids)
-        points, ids = seen.xyz[seen.rows][known], seen.ids[known]
-        turned = cadalign.Alignment(
-            _SECOND_VIEW @ seen.gt.rotation, seen.gt.translation, seen.gt.scale
-        )
-        noise = np.random.default_rng(place).normal(0, noise_px, points[:, :2].shape)
-        second = KEYPOINT_CAMERA.project(turned.apply(points)) + noise
-        pixels = seen.points_2d[known], second
-        yield [cadalign.View(KEYPOINT_CAMERA, each, ids=ids, sigma=noise_px) for each in pixels]
+def _two_views(
+    shape: cadalign.ShapeModel, place: int, seen: UnseenObject, noise_px: float
+) -> list[cadalign.View]:
+    known = np.isin(seen.ids, shape.ids)
+    turned = replace(seen.gt, rotation=_SECOND_VIEW @ seen.gt.rotation)
+    points, rng = seen.xyz[seen.rows][known], np.random.default_rng(place)
+    second = section.seen_in(KEYPOINT_CAMERA, turned, points, noise_px, rng).points_2d
+    return [
+        cadalign.View(KEYPOINT_CAMERA, each, ids=seen.ids[known], sigma=noise_px)
+        for each in (seen.points_2d[known], second)
+    ]
 
 
 # Unknown focal length -----------------------------------------------------------------------------
@@ -173,7 +140,8 @@ def focal_shapes(
         return
     dataset, rows, deviations = KeypointNet(given.keypointnet), [], []
     for category in categories:
-        row, found = _unseen(dataset, category, given.seed, objects, noise_px)
+        shape = section.learned_shape(dataset, category)
+        row, found = _unseen(dataset, shape, given.seed, objects, noise_px)
         rows.append(row)
         deviations += found
     rows.append(dict.fromkeys(rows[0]) | {"category": "all", "f in 95 %": _held(deviations)})
@@ -181,22 +149,21 @@ def focal_shapes(
 
 
 def _unseen(
-    dataset: KeypointNet, category: str, seed: int, objects: int, noise_px: float
+    dataset: KeypointNet, shape: cadalign.ShapeModel, seed: int, objects: int, noise_px: float
 ) -> tuple[Row, list[float]]:
     """Errors with the focal length known and unknown; the latter's in sigmas."""
-    shape = section.learned_shape(dataset, category)
-    held_out = dataset.subset(categories=[category], split="val")
+    held_out = dataset.subset(categories=[shape.category], split="val")
     rows, deviations = [], []
-    for key in sorted(held_out.ids(category))[:objects]:
+    for key in sorted(held_out.ids(shape.category))[:objects]:
         keypoints, rng = held_out[key].keypoints, instance_rng(seed, *key)
-        seen = _see_near(keypoints.xyz, keypoints.ids.tolist(), noise_px, rng)
-        known, found = (_near(shape, seen, noise_px, focal) for focal in ("known", "estimate"))
+        seen, ids = _see_near(keypoints.xyz, noise_px, rng), keypoints.ids.tolist()
+        known, found = (_near(shape, ids, seen, noise_px, focal) for focal in ("known", "estimate"))
         if known is not None and found is not None and found.std is not None:
-            rows.append([*_unseen_errors(known, seen), *_unseen_errors(found, seen)])
+            rows.append([*_unseen_errors(known, ids, seen), *_unseen_errors(found, ids, seen)])
             deviations.append(float(np.log(found.camera.fx / _NEAR.fx) / found.std.focal))
     known_deg, known_iou, deg, iou = np.median(rows, axis=0).tolist()
     return {
-        "category": category,
+        "category": shape.category,
         "objects": len(rows),
         "R known": known_deg,
         "R unknown deg": deg,
@@ -207,19 +174,16 @@ def _unseen(
     }, deviations
 
 
-def _see_near(
-    points_3d: FloatArray, ids: Sequence[int], noise_px: float, rng: np.random.Generator
-) -> _Seen:
+def _see_near(points_3d: FloatArray, noise_px: float, rng: np.random.Generator) -> Problem:
     gt, _ = sample_hull_view(KeypointHull(points_3d), _NEAR, rng=rng, min_visible=0)
-    noise = rng.normal(0, noise_px, (len(points_3d), 2))
-    return _Seen(points_3d, _NEAR.project(gt.apply(points_3d)) + noise, tuple(ids), _NEAR, gt)
+    return section.seen_in(_NEAR, gt, points_3d, noise_px, rng)
 
 
 def _near(
-    shape: cadalign.ShapeModel, seen: _Seen, noise_px: float, focal: str
+    shape: cadalign.ShapeModel, ids: Sequence[int], seen: Problem, noise_px: float, focal: str
 ) -> cadalign.Result | None:
     camera = seen.camera if focal == "known" else _UNKNOWN
-    view = cadalign.View(camera, seen.points_2d, ids=seen.ids, sigma=noise_px)
+    view = cadalign.View(camera, seen.points_2d, ids=ids, sigma=noise_px)
     return section.attempt(cadalign.align, shape, view, focal=focal)
 
 
@@ -235,20 +199,19 @@ def _drawn(rng: np.random.Generator, modes: int, objects: int) -> Row:
         weights = rng.normal(size=modes)
         points = mean + np.tensordot(weights, basis, 1)
         points += rng.normal(0, _RESIDUAL, points.shape)
-        seen = _see_near(points, range(_POINTS), 1.0, rng)
+        seen = _see_near(points, 1.0, rng)
         bound = _posterior_bound(seen, basis, noise_px=1.0)
         limits.append(
             _sizes(rng.multivariate_normal(np.zeros(len(bound)), bound, section.LIMIT_DRAWS))
         )
-        result = _near(shape, seen, 1.0, "estimate")
+        result = _near(shape, range(_POINTS), seen, 1.0, "estimate")
         if result is None:
             errors.append(np.full((1, len(_ERRORS)), np.inf))
             continue
-        turn = vector_from_rotation(result.alignment.rotation @ seen.gt.rotation.T)
-        moved = result.alignment.translation - seen.gt.translation
+        moved = section.deviation(est=result.alignment, gt=seen.alignment)[:6]
         flat = basis.reshape(modes, -1).T
         shares = np.linalg.lstsq(flat, (result.points_3d - mean).ravel(), rcond=None)[0]
-        error = [*turn, *moved, np.log(result.camera.fx / _NEAR.fx), *(shares - weights)]
+        error = [*moved, np.log(result.camera.fx / _NEAR.fx), *(shares - weights)]
         errors.append(_sizes(np.array([error])))
     ratios = np.median(np.concatenate(errors), axis=0) / np.median(np.concatenate(limits), axis=0)
     return {"modes K": modes, **dict(zip(_ERRORS, ratios.tolist(), strict=True))}
@@ -260,14 +223,14 @@ def _sizes(errors: FloatArray) -> FloatArray:
     return np.stack([np.linalg.norm(part, axis=1) for part in parts], axis=1)
 
 
-def _posterior_bound(seen: _Seen, basis: FloatArray, *, noise_px: float) -> FloatArray:
+def _posterior_bound(seen: Problem, basis: FloatArray, *, noise_px: float) -> FloatArray:
     """Least covariance (7 + K, 7 + K) of rotation, translation, log focal length and modes.
 
     Inverse of the keypoints' Fisher information at the truth and that of the modes' prior; what
     the modes leave is noise of the keypoints.
     """
-    jacobian = projection_jacobian(seen.points_3d, _NEAR, seen.gt)
-    by_place = jacobian[:, :, 3:6] @ seen.gt.rotation
+    jacobian = projection_jacobian(seen.points_3d, _NEAR, seen.alignment)
+    by_place = jacobian[:, :, 3:6] @ seen.alignment.rotation
     by_mode = np.einsum("nia,kna->nik", by_place, basis)
     rows = np.concatenate([jacobian[:, :, :6], jacobian[:, :, 9:], by_mode], axis=2)
     noise = noise_px**2 * np.eye(2) + _RESIDUAL**2 * by_place @ by_place.transpose(0, 2, 1)
@@ -276,13 +239,15 @@ def _posterior_bound(seen: _Seen, basis: FloatArray, *, noise_px: float) -> Floa
     return np.linalg.inv(information)
 
 
-def _unseen_errors(result: cadalign.Result, seen: _Seen) -> tuple[float, float]:
+def _unseen_errors(
+    result: cadalign.Result, ids: Sequence[int], seen: Problem
+) -> tuple[float, float]:
     """Rotation error [deg], and intersection over union of the extents up to scale."""
-    _, rows, kept = np.intersect1d(result.ids, seen.ids, return_indices=True)
+    _, rows, kept = np.intersect1d(result.ids, ids, return_indices=True)
     extents = np.ptp(result.points_3d[rows], axis=0), np.ptp(seen.points_3d[kept], axis=0)
     a, b = (each / np.linalg.norm(each) for each in extents)
     overlap = np.prod(np.minimum(a, b)) / np.prod(np.maximum(a, b))
-    return rotation_error(est=result.alignment, gt=seen.gt), float(overlap)
+    return rotation_error(est=result.alignment, gt=seen.alignment), float(overlap)
 
 
 def _held(deviations: Sequence[float]) -> float:
@@ -315,53 +280,38 @@ def similar(
     noise_px : float
         Noise of the keypoints [px].
     """
-    dataset = KeypointNet(given.needed())
-    rows = [
-        _by_prior(category, dataset[category], sigmas, objects, noise_px)
-        for category in dataset.categories
-    ]
+    dataset, rows = KeypointNet(given.needed()), []
+    for category in dataset.categories:
+        usable = [each for each in dataset[category] if len(each.keypoints.xyz) >= _LEAST_KEYPOINTS]
+        pairs = []
+        for each in usable[:: max(1, len(usable) // objects)]:
+            model, seen = _pair(each, [other for other in usable if other is not each], noise_px)
+            if len(model) >= _LEAST_KEYPOINTS:
+                pairs.append((model, seen))
+        row: Row = {"category": category, "objects": len(pairs)}
+        for sigma in sigmas:
+            errors = [_similar_errors(*each, sigma) for each in pairs]
+            name = "none" if np.isinf(sigma) else f"{sigma:g}"
+            row[name] = tuple(np.nanmedian(errors, axis=0).tolist())
+        rows.append(row)
     yield "Median rotation error in degrees (box IoU), by prior", rows
-
-
-def _by_prior(
-    category: str,
-    models: Sequence[AnnotatedModel],
-    sigmas: tuple[float, ...],
-    objects: int,
-    noise_px: float,
-) -> Row:
-    usable = [each for each in models if len(each.keypoints.xyz) >= _LEAST_KEYPOINTS]
-    pairs = []
-    for each in usable[:: max(1, len(usable) // objects)]:
-        model, seen = _pair(each, [other for other in usable if other is not each], noise_px)
-        if len(model) >= _LEAST_KEYPOINTS:
-            pairs.append((model, seen))
-    row: Row = {"category": category, "objects": len(pairs)}
-    for sigma in sigmas:
-        errors = [_similar_errors(*each, sigma) for each in pairs]
-        name = "none" if np.isinf(sigma) else f"{sigma:g}"
-        row[name] = tuple(np.nanmedian(errors, axis=0).tolist())
-    return row
 
 
 def _pair(
     seen: AnnotatedModel, others: Sequence[AnnotatedModel], noise_px: float
-) -> tuple[FloatArray, _Seen]:
+) -> tuple[FloatArray, Problem]:
     rng = instance_rng(0, seen.category, seen.model_id, "similar")
     other = others[int(rng.integers(len(others)))].keypoints
     own = dict(zip(seen.keypoints.ids.tolist(), seen.keypoints.xyz, strict=True))
     kept = [row for row, name in enumerate(other.ids.tolist()) if name in own]
-    ids = tuple(other.ids[kept].tolist())
-    points = np.array([own[name] for name in ids]).reshape(-1, 3)
+    points = np.array([own[name] for name in other.ids[kept].tolist()]).reshape(-1, 3)
     pose = look_at(
         azimuth=rng.uniform(0, 360), elevation=rng.uniform(0, 60), distance=rng.uniform(1.5, 3)
     )
-    pixels = KEYPOINT_CAMERA.project(pose.apply(points))
-    pixels += noise_px * rng.standard_normal(pixels.shape)
-    return other.xyz[kept], _Seen(points, pixels, ids, KEYPOINT_CAMERA, pose)
+    return other.xyz[kept], section.seen_in(KEYPOINT_CAMERA, pose, points, noise_px, rng)
 
 
-def _similar_errors(model: FloatArray, seen: _Seen, sigma: float) -> tuple[float, float]:
+def _similar_errors(model: FloatArray, seen: Problem, sigma: float) -> tuple[float, float]:
     """Rotation error [degrees] and IoU of the keypoints' boxes at equal depths of their centres."""
     prior = None if np.isinf(sigma) else sigma
     result = section.attempt(
@@ -371,10 +321,10 @@ def _similar_errors(model: FloatArray, seen: _Seen, sigma: float) -> tuple[float
         return 180.0, 0.0
     est_box, gt_box = (
         cadalign.Box.from_model([points.min(0), points.max(0)], pose)
-        for points, pose in ((model, result.alignment), (seen.points_3d, seen.gt))
+        for points, pose in ((model, result.alignment), (seen.points_3d, seen.alignment))
     )
     factor = np.linalg.norm(gt_box.center) / np.linalg.norm(est_box.center)
     placed = cadalign.Box(factor * est_box.center, est_box.rotation, factor * est_box.extents)
     thick = min(est_box.extents.min(), gt_box.extents.min()) > 1e-6
     iou = box_iou(est=placed, gt=gt_box) if thick else np.nan
-    return rotation_error(est=result.alignment, gt=seen.gt), iou
+    return rotation_error(est=result.alignment, gt=seen.alignment), iou

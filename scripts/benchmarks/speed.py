@@ -85,10 +85,8 @@ def cold(given: BenchmarkData) -> Tables:
         _, reference = called(_SMALL_FUNCTION, "small")
         rows = []
         for name, code in _FIRST_CALLS.items():
-            wall, processor = called(code, "all" if "doctor" in name else "fit")
-            rows.append(
-                section.figure(name, wall, "s", processor / reference, "a first small call")
-            )
+            wall, busy = called(code, "all" if "doctor" in name else "fit")
+            rows.append(section.figure(name, wall, "s", busy / reference, "a first small call"))
     yield "First calls", rows
 
 
@@ -118,16 +116,12 @@ def _commands(folder: Path, runs: int) -> Iterator[Row]:
     }.items():
         command = [*COMMAND, *given]
         section.seconds_of_process(command)  # compiles what is not yet on disk
-        medians = section.medians_in_turns(
-            {
-                "own": lambda command=command: section.seconds_of_process(command)[1],
-                "other": lambda: section.seconds_of_process([sys.executable, "-c", libraries])[1],
-            },
+        processor, ratio = section.median_and_ratio(
+            lambda command=command: section.seconds_of_process(command)[1],
+            lambda: section.seconds_of_process([sys.executable, "-c", libraries])[1],
             1 if name == "cadalign demo" else runs,
         )
-        yield section.figure(
-            name, medians["own"], "s", medians["own"] / medians["other"], libraries
-        )
+        yield section.figure(name, processor, "s", ratio, libraries)
 
 
 def _fits(calls: int) -> Iterator[Row]:
@@ -151,13 +145,9 @@ def _fits(calls: int) -> Iterator[Row]:
             "OpenCV's ITERATIVE, 10 points",
         ),
     ):
-        both = {
-            "own": partial(section.seconds, ours),
-            "other": partial(section.seconds, theirs),
-        }
-        medians = section.medians_in_turns(both, calls)
-        ratio = medians["own"] / medians["other"]
-        yield section.figure(name, 1e6 * medians["own"], "us", ratio, to)
+        timed = (partial(section.seconds, call) for call in (ours, theirs))
+        median, ratio = section.median_and_ratio(*timed, calls)
+        yield section.figure(name, 1e6 * median, "us", ratio, to)
 
 
 def _observation(folder: Path) -> Path:

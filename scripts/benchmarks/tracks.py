@@ -17,7 +17,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.metrics.errors import rotation_jitter_deg
 from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
-from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.geometry.metrics import rotation_error
 
 _RADIUS_95 = 7.815  # squared, of three degrees of freedom
 _KEYPOINTS = 10
@@ -147,14 +147,10 @@ def _video(rng: np.random.Generator, shape: ShapeModel, *, frames: int) -> Simul
     return simulate_track(rng, _drawn(shape, rng), shape.ids, frames=frames)
 
 
-def _turns(result: Result, video: SimulatedTrack) -> FloatArray:
+def _errors(result: Result, video: SimulatedTrack) -> list[float]:
+    """Rotation errors of all frames [deg]."""
     pairs = zip(result.views, video.poses, strict=True)
-    return np.array([vector_from_rotation(v.alignment.rotation @ p.rotation.T) for v, p in pairs])
-
-
-def _errors(result: Result, video: SimulatedTrack) -> FloatArray:
-    """Rotation errors (P,) of all frames [deg]."""
-    return np.degrees(np.linalg.norm(_turns(result, video), axis=1))
+    return [rotation_error(est=view.alignment, gt=pose) for view, pose in pairs]
 
 
 def _compared(result: Result, video: SimulatedTrack, rng: np.random.Generator) -> FloatArray:
@@ -163,7 +159,8 @@ def _compared(result: Result, video: SimulatedTrack, rng: np.random.Generator) -
     gaps = result.points_3d * result.alignment.scale - video.points_3d
     inverse = np.linalg.pinv(result.points_covariance)
     held = np.einsum("ni,nij,nj->n", gaps, inverse, gaps) < _RADIUS_95
-    for turn, view in zip(_turns(result, video), result.views, strict=True):
+    for view, pose in zip(result.views, video.poses, strict=True):
+        turn = section.deviation(est=view.alignment, gt=pose)[:3]
         own = view.covariance[:3, :3]
         draws = rng.multivariate_normal(np.zeros(3), own, section.LIMIT_DRAWS)
         limit = np.sqrt((draws**2).sum(axis=1).mean())
@@ -183,8 +180,7 @@ def _online() -> Row:
         busy.append(1e3 * own)
         walls.append(1e3 * wall)
         if update.pose is not None:
-            turn = update.pose.alignment.rotation @ pose.rotation.T
-            errors.append(np.degrees(np.linalg.norm(vector_from_rotation(turn))))
+            errors.append(rotation_error(est=update.pose.alignment, gt=pose))
     return {
         "processor, median, ms": float(np.median(busy[20:])),
         "median, ms": float(np.median(walls[20:])),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -19,7 +19,6 @@ from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.geometry.metrics import rotation_error
-from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.seeding import instance_rng
 
 _PAIRS = 200  # of training models, which tell how models of a category differ
@@ -50,6 +49,12 @@ class _Case(NamedTuple):
     points_2d: FloatArray  # (n, 2)
     gt: Alignment
 
+    def of_model(self, model: Model | ShapeModel, ids: Sequence[Any]) -> _Case:
+        """The keypoints that another model has, too."""
+        shared = np.isin(self.ids, ids)
+        kept = [name for name in self.ids if name in ids]
+        return _Case(model, kept, self.points_3d[shared], self.points_2d[shared], self.gt)
+
 
 def warned(
     given: BenchmarkData,
@@ -79,15 +84,8 @@ def warned(
     wrong : bool
         Measure wrong data, too.
     """
-    rows = list(
-        warned_cases(
-            KeypointNet(given.needed()),
-            objects=objects,
-            noise_px=noise_px,
-            categories=categories,
-            wrong=wrong,
-        )
-    )
+    how = {"objects": objects, "noise_px": noise_px, "categories": categories, "wrong": wrong}
+    rows = list(warned_cases(KeypointNet(given.needed()), **how))
     right = [row for row in rows if row["data"] == "right"]
     others = [row for row in rows if row["data"] != "right"]
     yield "Warned of on right data [%]", _by(right, ("model", "category"), _shares)
@@ -126,35 +124,27 @@ def _right(
     if len(points) < _LEAST_KEYPOINTS:
         return
     stretch = np.exp(np.append(0.0, rng.normal(0, _STRETCH_SIGMA, 2)))
-    own = Model(points_3d=points / stretch, ids=ids)
-    yield "own", _Case(own, ids, points, seen.points_2d, seen.gt)
+    model = Model(points_3d=points / stretch, ids=ids)
+    own = _Case(model, ids, points, seen.points_2d, seen.gt)
+    yield "own", own
     by_shape, by_stretch = differ
     how: dict[str, Any] = {"shape_sigma": by_shape, "stretch_sigma": by_stretch}
     stretch = np.exp(np.append(0.0, rng.normal(0, by_stretch, 2)))
     object_points = (points + rng.normal(0, by_shape, points.shape)) * stretch
     gt, noise = seen.gt, rng.normal(0, noise_px, seen.points_2d.shape)
-    while not KEYPOINT_CAMERA.contains(
-        KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
-    ).all():
+    camera = KEYPOINT_CAMERA
+    while not camera.contains(pixels := camera.project(gt.apply(object_points)) + noise).all():
         gt = replace(gt, translation=gt.translation + _FARTHER)
-    pixels = KEYPOINT_CAMERA.project(gt.apply(object_points)) + noise
     drawn = Model(points_3d=points, ids=ids, **how)
     yield "similar, drawn", _Case(drawn, ids, object_points, pixels, gt)
     others = _training_models(dataset, seen.task.category)
     for number in rng.permutation(len(others)).tolist():
         of_other, xyz = others[number]
-        shared = np.isin(ids, of_other)
-        if shared.sum() >= min(6, len(ids)):
+        if np.isin(ids, of_other).sum() >= min(6, len(ids)):
             other = Model(points_3d=xyz, ids=of_other, **how)
-            kept = [name for name in ids if name in of_other]
-            yield (
-                "similar, other",
-                _Case(other, kept, points[shared], seen.points_2d[shared], seen.gt),
-            )
+            yield "similar, other", own.of_model(other, of_other)
             break
-    known = np.isin(ids, shape.ids)
-    kept = [name for name in ids if name in shape.ids]
-    yield "learned", _Case(shape, kept, points[known], seen.points_2d[known], seen.gt)
+    yield "learned", own.of_model(shape, shape.ids)
 
 
 # Data ---------------------------------------------------------------------------------------------
@@ -240,8 +230,7 @@ def _outcome(case: _Case, noise_px: float) -> Row:
 
 
 def _errors(result: Result, gt: Alignment) -> Row:
-    assert result.covariance is not None
-    turn = vector_from_rotation(result.alignment.rotation @ gt.rotation.T)
+    turn = section.deviation(est=result.alignment, gt=gt)[:3]
     level = probability_level(turn, result.covariance[:3, :3], result.degrees_of_freedom)
     is_large = rotation_error(est=result.alignment, gt=gt) > _LARGE_DEG
     return {"large": is_large, "beyond": level is not None and level > _REGION}

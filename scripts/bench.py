@@ -44,7 +44,7 @@ from rich.table import Table
 from cadalign.cli import plain_help
 from cadalign.io.files import write_json
 
-SECTIONS: dict[str, Callable[..., Tables]] = {
+USUAL: dict[str, Callable[..., Tables]] = {
     "solvers": solvers,
     "cold": cold,
     "calls": calls,
@@ -57,6 +57,16 @@ SECTIONS: dict[str, Callable[..., Tables]] = {
     "render": rendering,
     "annotator": annotator,
     "masks": masks,
+    "align": align,
+    "retrieval": retrieval,
+    "evaluation": evaluation,
+    "fits": fits,
+    "ransac": ransac,
+    "torch": torch_layer,
+    "gradients": gradient_errors,
+    "noise": noise_of_detector,
+}
+ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "mask_alone": mask_alone,
     "mistakes": mistakes,
     "photo": photos,
@@ -64,25 +74,14 @@ SECTIONS: dict[str, Callable[..., Tables]] = {
     "clicks": clicks,
     "outlines": outline_methods,
     "proposals": proposal_clicks,
-    "align": align,
-    "retrieval": retrieval,
-    "evaluation": evaluation,
-    "fits": fits,
     "detections": real_detections,
-    "ransac": ransac,
     "unseen_retrieval": unseen_retrieval,
     "mask_retrieval": mask_retrieval,
     "similar": similar,
-    "torch": torch_layer,
-    "gradients": gradient_errors,
-    "noise": noise_of_detector,
     "tracks": tracks,
     "warned": warned,
 }
-ON_REQUEST = (
-    *("mask_alone", "mistakes", "photo", "photo_times", "clicks", "outlines", "proposals"),
-    *("detections", "unseen_retrieval", "mask_retrieval", "similar", "tracks", "warned"),
-)
+SECTIONS = USUAL | ON_REQUEST
 TOLERANCE = 0.2
 
 

@@ -108,8 +108,7 @@ def _sweep_section(plan: PaperPlan, name: str, announce: Announce) -> str:
     keys = list(dict.fromkeys(summary["metric"] for summary in summaries))
     pictures = [f"{name}_{key}" for key in keys[: 1 if kind.is_timed else None]]
     for picture in pictures:
-        for ending in ("png", "pdf"):
-            _copy(folder.figures / f"{picture}.{ending}", plan.out / "figures")
+        _copy_figure(folder.figures / picture, plan.out / "figures" / picture)
     shown = [summary for summary in summaries if summary["metric"] == keys[0]]
     rows = [
         [f"{value:g}", *(f"{s['median']:.3g}" for s in shown if s["value"] == value)]
@@ -143,9 +142,8 @@ def _table_section(plan: PaperPlan, announce: Announce) -> str:
         )
         summaries = KEYPOINTNET.write(Run.open(folder.path))
         for metric in _METRICS:
-            for ending in ("png", "pdf"):
-                source = folder.figures / f"categories_{metric.key}.{ending}"
-                _copy(source, plan.out / "figures", f"{name}_{source.name}")
+            picture = f"categories_{metric.key}"
+            _copy_figure(folder.figures / picture, plan.out / "figures" / f"{name}_{picture}")
         table = _table_rows(summaries)
         rows += [[name, *row] for row in table]
         sections.append(
@@ -190,10 +188,12 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]], *, words: int)
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, marks, *rows))
 
 
-def _copy(source: Path, folder: Path, name: str | None = None) -> None:
-    target = folder / (name or source.name)
-    with writing(target):
-        shutil.copyfile(source, target)
+def _copy_figure(source: Path, target: Path) -> None:
+    """Copy a figure, named without its ending, in both of its formats."""
+    for ending in (".png", ".pdf"):
+        copied = target.with_name(target.name + ending)
+        with writing(copied):
+            shutil.copyfile(source.with_name(source.name + ending), copied)
 
 
 def main() -> int:

@@ -188,19 +188,17 @@ def _clicked(
         seen = np.array([places[label] for label in clicked])
         seen += rng.normal(0, _CLICK_PX, seen.shape)
         chances = candidates.probabilities(clicked, np.empty((len(clicked), 3)), seen)
-    turns = [
-        rotation_error(est=each.alignment, gt=gt, symmetry=own.symmetry)
-        for each in candidates.every
-    ]
-    right = np.array(turns) < _SIMILAR_DEG
+    poses = (each.alignment for each in candidates.every)
+    turns = [rotation_error(est=pose, gt=gt, symmetry=own.symmetry) for pose in poses]
+    right, left = np.array(turns) < _SIMILAR_DEG, np.flatnonzero(chances)
     return {
         "first": bool(right[0]),
         "among": bool(right.any()),
         "candidates": first,
         "clicks": len(clicked),
-        "settled": bool(np.count_nonzero(chances) == 1),
-        "refused": bool(not chances.any()),
-        "right": bool(right[chances > 0].any() and np.count_nonzero(chances) == 1),
+        "settled": len(left) == 1,
+        "refused": len(left) == 0,
+        "right": len(left) == 1 and bool(right[left[0]]),
         "seconds": wall,
     }
 

@@ -14,15 +14,11 @@ import numpy as np
 import tyro
 from common import write_row
 
+from cadalign import Alignment, Box, Camera, Observation, fit
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.model import ClickableModel
 from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
-from cadalign.estimation.fit import fit
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
-from cadalign.geometry.camera import Camera
 from cadalign.io.images import read_image, write_image
-from cadalign.io.observation import Observation
 from cadalign.render import (
     Angles,
     RaycastRenderer,

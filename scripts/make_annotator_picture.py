@@ -18,9 +18,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from support.annotating import IDLE, opened_page, wait
 from support.chromium import chromium
 
+from cadalign import Observation
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
-from cadalign.io.observation import Observation
 
 
 def main(*, out: Path = Path("docs/annotator.png"), files: Path) -> None:

@@ -9,10 +9,9 @@ import numpy as np
 import tyro
 from common import write_row
 
+from cadalign import Box, fit
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.estimation.fit import fit
 from cadalign.evaluation.instances.instance import load_scene, make_instance
-from cadalign.geometry.box import Box
 from cadalign.render import RaycastRenderer, draw_overlay
 
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))

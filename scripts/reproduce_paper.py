@@ -14,8 +14,8 @@ from pathlib import Path
 
 import tyro
 
+from cadalign import CadalignError
 from cadalign.datasets import write_sample_dataset
-from cadalign.errors import CadalignError
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.keypointnet import (
     PAPER_TABLE,

@@ -29,9 +29,9 @@ from rich.table import Table
 import cadalign
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import ImageKeypoints, sample_models
-from cadalign.geometry.metrics import box_iou_up_to_scale
 from cadalign.geometry.rotations import angle_between
 from cadalign.io.files import write_json
+from cadalign.metrics import box_iou_up_to_scale
 from cadalign.torch import PoseBatch, align, fit, posterior_loss, rotation_loss
 from cadalign.torch.detector import KeypointDetector, LossOfKeypoints, train
 from cadalign.torch.renders import RenderedViews, learned_shape, render_views

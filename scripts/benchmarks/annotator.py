@@ -41,7 +41,7 @@ from support.panels import (
 from support.web import axe_script
 
 from benchmarks.section import BenchmarkData, Row, Tables, clocked
-from cadalign import Camera, Mesh
+from cadalign import Alignment, Camera, Material, Mesh
 from cadalign.annotate.actions import perform
 from cadalign.annotate.evidence import encode_runs
 from cadalign.annotate.opening import open_session
@@ -49,11 +49,16 @@ from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.session import Session
 from cadalign.datasets import KeypointNet, load_mesh, write_sample_dataset
 from cadalign.export import AlignedObject, ExportView, export_object
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.mesh import Material
 from cadalign.io.images import read_photo, write_image
-from cadalign.render import RaycastRenderer, Scene, cast_geometry, contact_sheet, visible_keypoints
-from cadalign.render.viewpoints import frame_object, look_at
+from cadalign.render import (
+    RaycastRenderer,
+    Scene,
+    cast_geometry,
+    contact_sheet,
+    frame_object,
+    look_at,
+    visible_keypoints,
+)
 
 SCREENS = {"desktop": (1600, 1000), "laptop": (1366, 768), "phone": (390, 844)}
 SCHEMES = ("light", "dark")

@@ -28,7 +28,7 @@ from cadalign.datasets.photos.kitti_keypoints import (
 )
 from cadalign.evaluation.experiments.tracks import TracksOptions
 from cadalign.evaluation.instances.tracks import pose_of, recorded_videos
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 from cadalign.seeding import instance_rng
 
 _LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6

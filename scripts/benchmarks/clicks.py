@@ -14,11 +14,10 @@ import numpy as np
 from benchmarks import section
 from benchmarks.photo import PhotoClicks, drawn_clicks, real_cases
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign import Model, View, align
+from cadalign import Alignment, Model, View, align
 from cadalign.annotate.candidates import MaskCandidates, best_click
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.geometry.alignment import Alignment
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval.by_mask import grab_cut

@@ -18,7 +18,7 @@ from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 _LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25
 _COVERED = 0.95

@@ -12,9 +12,8 @@ import numpy as np
 
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
+from cadalign import Camera, ShapeModel
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
-from cadalign.geometry.camera import Camera
-from cadalign.shapes.model import ShapeModel
 
 _WELL_KNOWN_DEG = 10.0
 

@@ -8,10 +8,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.section import BenchmarkData, Row, Tables, percent, seen_in
-from cadalign import Model, RansacOptions, Result, View, align, fit
+from cadalign import CadalignError, Model, RansacOptions, Result, View, align, fit
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.errors import CadalignError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import angle_between

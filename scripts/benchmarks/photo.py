@@ -14,18 +14,15 @@ import numpy as np
 
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign import Camera, Mesh, Model, Result, View, align
+from cadalign import Alignment, Camera, Mesh, Model, Result, Symmetry, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel
 from cadalign.datasets import open as open_data
 from cadalign.estimation.contours.line_changes import bins_of, regions_of
 from cadalign.evaluation.metrics.cramer_rao import probability_level
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
-from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.images import read_photo
-from cadalign.metrics import rotation_error
+from cadalign.metrics import nearest_truth, rotation_error
 from cadalign.render import RaycastRenderer, Scene, Studio, cast_geometry, sample_view
 
 _CAMERA = Camera(640, 480, 800.0, 800.0, 319.5, 239.5)

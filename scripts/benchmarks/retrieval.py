@@ -26,7 +26,7 @@ from cadalign.evaluation.instances.queries import (
     same_shapes,
 )
 from cadalign.evaluation.instances.unseen import UnseenObject
-from cadalign.geometry.metrics import box_iou_up_to_scale
+from cadalign.metrics import box_iou_up_to_scale
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval import LibraryModel, Match
 from cadalign.retrieval.by_mask import MOST_ALIGNED

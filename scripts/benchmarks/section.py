@@ -17,9 +17,9 @@ import tyro
 from common import COMMAND
 
 import cadalign
+from cadalign import CadalignError
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
-from cadalign.errors import CadalignError
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
 from cadalign.evaluation.simulation.problems import Problem

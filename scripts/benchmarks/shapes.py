@@ -17,8 +17,8 @@ from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.simulation.problems import Problem
-from cadalign.geometry.metrics import box_iou, rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.metrics import box_iou, rotation_error
 from cadalign.render import look_at
 from cadalign.seeding import instance_rng
 from cadalign.solvers.projection import projection_jacobian

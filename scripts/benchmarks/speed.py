@@ -16,12 +16,11 @@ from common import COMMAND
 import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign import Camera
+from cadalign import Camera, Observation
 from cadalign.datasets import sample_models
 from cadalign.errors import RenderError
 from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.io.images import write_image
-from cadalign.io.observation import Observation
 from cadalign.render import (
     RaycastRenderer,
     Scene,

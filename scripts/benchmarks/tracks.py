@@ -17,7 +17,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.metrics.errors import rotation_jitter_deg
 from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 
 _RADIUS_95 = 7.815  # squared, of three degrees of freedom
 _KEYPOINTS = 10

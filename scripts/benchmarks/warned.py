@@ -18,7 +18,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.metrics.cramer_rao import probability_level
-from cadalign.geometry.metrics import rotation_error
+from cadalign.metrics import rotation_error
 from cadalign.seeding import instance_rng
 
 _PAIRS = 200  # of training models, which tell how models of a category differ

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -21,6 +22,7 @@ from cadalign.datasets import open as open_data
 from cadalign.datasets.photos.kitti import KittiLabel, read_labels
 from cadalign.datasets.photos.kitti_keypoints import (
     SIZE,
+    TRACKS,
     car_bounds,
     car_keypoints,
     car_shape,
@@ -238,7 +240,7 @@ def _poses(shape: cadalign.ShapeModel, views: Sequence[cadalign.View], way: str)
 
 def car_scenes(folder: Path, sigma: float) -> list[Row]:
     """Errors of a street's cars, alone and together, whose keypoints are simulated."""
-    mean = car_shape(folder).mean[:-2]
+    mean = np.array(json.loads((folder / TRACKS).read_text())["model_xyz"])
     frames: dict[int, list[KittiLabel]] = defaultdict(list)
     for label in read_labels(folder / "label_02" / "0010.txt", tracking=True):
         if label.kind == "Car" and 5 < label.numbers[12] < 35:

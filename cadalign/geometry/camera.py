@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.errors import InputError
+from cadalign.geometry.calibration import COLMAP_PARAMS as COLMAP_PARAMS
 from cadalign.geometry.calibration import Calibration
-from cadalign.geometry.camera_form import COLMAP_PARAMS as COLMAP_PARAMS
 from cadalign.geometry.pixels import (
     distort,
     image_of,
@@ -219,10 +219,8 @@ class Camera(Calibration):
         if self.is_wide and not valid.all():
             _check_undone(self.rays_where_valid(points_2d)[1])
             behind = np.flatnonzero(~valid)
-            what = (
-                f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off the"
-            )
-            what += f" z axis, the first is point {behind[0]}"
+            what = f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off the z "
+            what += f"axis, the first is point {behind[0]}"
             fix = "these have no normalised coordinates; use unproject"
             raise InputError(what, where="points_2d", fix=fix)
         _check_undone(valid)

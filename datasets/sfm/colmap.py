@@ -25,8 +25,8 @@ from cadalign.datasets.sfm.correspondences import (
     rigid_pose,
 )
 from cadalign.errors import DataError, InputError, brief, quote
+from cadalign.geometry.calibration import COLMAP_PARAMS
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.camera_form import COLMAP_PARAMS
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from cadalign.io.documents import in_file

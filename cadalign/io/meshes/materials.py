@@ -153,8 +153,7 @@ class Textures:
     What is missing or cannot be read is warned of (logger "cadalign") and becomes None.
     """
 
-    _of_name: dict[tuple[Path, str], Texture | None] = field(default_factory=dict)
-    _of_file: dict[Path, Texture | None] = field(default_factory=dict)
+    _known: dict[Path, Texture | None] = field(default_factory=dict)
     _bytes_left: int = _MOST_BYTES
 
     def read(self, beside: Path, name: str) -> Texture | None:
@@ -162,22 +161,18 @@ class Textures:
 
         One that is not where it is named is looked for beside the file.
         """
-        key = beside, name
-        if key not in self._of_name:
-            self._of_name[key] = self._read(beside, name)
-        return self._of_name[key]
-
-    def _read(self, beside: Path, name: str) -> Texture | None:
-        found = find_file(beside.parent, name) or find_file(beside.parent, PurePosixPath(name).name)
+        folder = beside.parent
+        found = find_file(folder, name) or find_file(folder, PurePosixPath(name).name)
+        path = folder / name if found is None else found.resolve()
+        if path in self._known:
+            return self._known[path]
+        self._known[path] = None
         if found is None:
             logger.warning("%s: the texture %s is missing; drawn grey", beside, brief(name))
             return None
-        path = found.resolve()
-        if path not in self._of_file:
-            self._of_file[path] = None
-            with _left_out(beside, name), open_photo(found) as image:
-                self._of_file[path] = self._pixels(image)
-        return self._of_file[path]
+        with _left_out(beside, name), open_photo(found) as image:
+            self._known[path] = self._pixels(image)
+        return self._known[path]
 
     def decode(self, data: bytes, *, within: Path, name: str) -> Texture | None:
         """Decode a picture that is a part of a file, (h, w, 3 or 4) uint8."""

@@ -219,8 +219,8 @@ class Camera(Calibration):
         if self.is_wide and not valid.all():
             _check_undone(self.rays_where_valid(points_2d)[1])
             behind = np.flatnonzero(~valid)
-            what = f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off the z "
-            what += f"axis, the first is point {behind[0]}"
+            what = f"the rays of {len(behind)} of {len(valid)} pixels are 90 degrees or more off "
+            what += f"the z axis, the first is point {behind[0]}"
             fix = "these have no normalised coordinates; use unproject"
             raise InputError(what, where="points_2d", fix=fix)
         _check_undone(valid)

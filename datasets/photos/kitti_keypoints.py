@@ -181,11 +181,10 @@ def yaw_of_car(rotation: FloatArray) -> float:
     return float(np.arctan2(-forward[2], forward[0]))
 
 
-def list_cars(path: Path, problems: dict[str, DataError] | None = None) -> Iterator[KeypointFrame]:
-    """List the cars of ``cars.json``.
+def list_cars(path: Path, problems: dict[str, DataError]) -> Iterator[KeypointFrame]:
+    """List the cars of ``cars.json``; ``problems`` gets the reasons why others cannot be read.
 
-    ``problems`` gets the reasons why entries cannot be read, by their places; without it, the first
-    is raised. Raises DataError if the file cannot be read.
+    Raises DataError if the file cannot be read.
     """
     for number, raw in enumerate(read_list(path)):
         place = f"[{number}]"
@@ -201,7 +200,10 @@ def list_cars(path: Path, problems: dict[str, DataError] | None = None) -> Itera
 def list_tracks(
     path: Path, problems: dict[str, DataError] | None = None
 ) -> Iterator[KeypointFrame]:
-    """List the frames of ``car_tracks.json``; see `list_cars`."""
+    """List the frames of ``car_tracks.json``; see `list_cars`.
+
+    Without ``problems`` the first of the reasons is raised.
+    """
     table = read_table(path)
     model = _mean_car(path, table)
     for number, entry in enumerate(_part(path, table, "tracks", list[Any])):

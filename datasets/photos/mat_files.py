@@ -270,22 +270,18 @@ class MatStruct:
         return array.reshape(-1, columns)
 
 
-def read_structs(path: Path, name: str | None = None) -> tuple[MatStruct, ...]:
-    """Read the array of structs that a .mat file holds under a name, by default its only variable.
+def read_structs(path: Path, name: str) -> tuple[MatStruct, ...]:
+    """Read the array of structs that a .mat file holds under a name.
 
     Raises DataError if the file cannot be read, is none of MATLAB's up to version 7, or holds no
     such structs.
     """
     data = read_bytes(path)
     try:
-        variables = read_variables(data, None if name is None else (name,))
+        value = np.asarray(read_variables(data, (name,)).get(name), dtype=object)
     except InputError as error:
         raise damaged(f"not a .mat file that can be read ({error.what})", path) from None
-    if name is None and len(variables) == 1:
-        name = next(iter(variables))
-    value = np.asarray(variables.get(str(name)), dtype=object)
     found = [each for each in np.atleast_1d(value).ravel() if isinstance(each, dict)]
     if not found:
-        what = "no structs" if name is None else f"no structs named {name}"
-        raise DataError(f"there are {what} in this file", where=str(path))
+        raise DataError(f"there are no structs named {name} in this file", where=str(path))
     return tuple(MatStruct(each, f"{path}[{number}]") for number, each in enumerate(found))

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from cadalign.arrays import is_whole
 from cadalign.datasets.models.categories import SYNSETS
 from cadalign.datasets.sample.household import bottle, chair
 from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
@@ -141,7 +142,7 @@ def _check_arguments(
     per_category: int, categories: Sequence[str] | None, seed: int
 ) -> tuple[str, ...]:
     for name, value, least in (("per_category", per_category, 1), ("seed", seed, 0)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        if not is_whole(value) or value < least:
             what = f"must be an integer >= {least}, not {value!r}"
             raise InputError(what, where=name, fix=f"give {least} or more")
     if categories is None:

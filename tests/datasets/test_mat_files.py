@@ -112,7 +112,7 @@ def test_files_that_are_none_are_refused(tmp_path: Path, change: Any, reason: st
     path = tmp_path / "a.mat"
     path.write_bytes(change(write(path)))
     with pytest.raises(DataError) as caught:
-        read_structs(path)
+        read_structs(path, "a")
     assert f"a.mat: not a .mat file that can be read ({reason}" in str(caught.value)
 
 

@@ -26,6 +26,7 @@ from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside, no
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prepared_views import (
+    Align,
     align_facing,
     align_without,
     starts_by_one_view,
@@ -156,6 +157,7 @@ def align(
     )
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
+    align_some: Align
     if motion is not None:
         from cadalign.estimation.tracks.motion import Motion
         from cadalign.estimation.tracks.smooth import align_track  # with the kernels of tracks
@@ -163,17 +165,18 @@ def align(
         if principal_sigma is not None:
             what = "a motion takes the principal point as known"
             raise InputError(what, where="principal_sigma", fix="leave one of both away")
-        return align_track(
-            model, given, Motion.of(motion), size=size, inits=inits, options=options, ransac=ransac
-        )
-    if principal_sigma is not None:
+        align_some = partial(align_track, model, Motion.of(motion), size, options, ransac)
+    elif principal_sigma is not None:
         return _align_cropped(model, given, options, size=size, init=init, ransac=ransac)
-    if size is None and init is None and is_plain(model, given):
+    elif size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
-    align_some = partial(_align_all, model, size, options, ransac, start)
+    else:
+        align_some = partial(_align_all, model, size, options, ransac, start)
     if needs_facing([view.camera for view in given]):
-        return align_facing(given, inits, align_some, may_surround=ransac is not None)
+        is_still = motion is not None and given[0].cam_from_rig is None
+        surrounds = ransac is not None
+        return align_facing(given, inits, align_some, may_surround=surrounds, is_still=is_still)
     return align_some(given, inits)
 
 

@@ -250,25 +250,30 @@ def _factor_by_masks(
     return factor if factor > 0 else None
 
 
-def facing_view(view: View) -> View:
+def facing_view(view: View, shown: FloatArray | None = None) -> View:
     """The view in the frame that faces what it shows; ``up`` and the like stay in the lens's.
 
-    It faces the keypoints or, without any, the mask. Depths, along the lens's axis as they are
-    given, become those along the frame's.
+    It faces the pixels (n, 2) that are ``shown``, by default those of `_shown_by`. Depths, along
+    the lens's axis as they are given, become those along the frame's.
     """
     if not needs_facing([view.camera]):
         return view
-    shown = view.pixels
-    if not len(shown) and view.mask is not None:
-        inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
-        shown = inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)
-    camera, rig = faced(view.camera, shown), view.cam_from_rig
+    camera = faced(view.camera, _shown_by(view) if shown is None else shown)
+    rig = view.cam_from_rig
     if rig is not None:
         turn = np.eye(4)
         turn[:3, :3] = camera.lens_from_camera.T
         rig = turn @ np.asarray(rig)
     turned = replace(view, camera=camera, cam_from_rig=rig)
     return turned if view.depth is None else _with_facing_depths(turned, view.camera)
+
+
+def _shown_by(view: View) -> FloatArray:
+    """Pixels (n, 2) where a view shows the object: its keypoints or, without any, its mask."""
+    if len(view.keypoint_ids) or view.mask is None:
+        return view.pixels
+    inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
+    return inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)
 
 
 def _with_facing_depths(turned: View, lens: Camera) -> View:
@@ -302,12 +307,15 @@ def align_facing(
     align_some: Align,
     *,
     may_surround: bool,
+    is_still: bool = False,
 ) -> Result:
     """Align views in the frames of `facing_view`; the result is in those that were given.
 
-    Raises InputError if keypoints lie all around a wide lens, unless they ``may_surround`` it.
+    Where the camera ``is_still``, all of its views have one frame. Raises InputError if keypoints
+    lie all around a wide lens, unless they ``may_surround`` it.
     """
-    views = [facing_view(view) for view in given]
+    shown = np.concatenate([_shown_by(view) for view in given]) if is_still else None
+    views = [facing_view(view, shown) for view in given]
     for view in views:
         if view.camera.is_wide and not may_surround:
             rays_ahead(view.pixels, view.camera)
@@ -334,7 +342,14 @@ def align_facing(
         replace(each, alignment=turned_alignment(each.alignment, turn), camera=given[0].camera)
         for each in result.alternatives
     ]
-    return replace(result, views=tuple(turned), statistics=statistics, alternatives=tuple(others))
+    path = result.trajectory
+    return replace(
+        result,
+        views=tuple(turned),
+        statistics=statistics,
+        alternatives=tuple(others),
+        trajectory=path.turned(turn) if path is not None and is_still else path,
+    )
 
 
 def _turned(statistics: Statistics, turn: FloatArray) -> Stated:

@@ -28,7 +28,6 @@ from cadalign.estimation.prior import ShapePrior, with_known_shape
 from cadalign.estimation.starts import in_rig
 from cadalign.estimation.tracks.motion import moved_by
 from cadalign.estimation.view import View
-from cadalign.geometry.camera import needs_facing
 from cadalign.solvers.joint.evidence import Evidence, State, kept_rows
 from cadalign.solvers.joint.motion import twist_between
 from cadalign.solvers.joint.search import view_starts
@@ -62,11 +61,6 @@ class Frames(NamedTuple):
             fix = "give it for all views, or for none"
             where = f"views[{lacking.index(True)}].time"
             raise InputError("only some views have a time", where=where, fix=fix)
-        for number, view in enumerate(views):
-            if needs_facing([view.camera]):
-                fix = "undistort the photos to a pinhole's"
-                what = "a wide lens cannot be used together with a motion"
-                raise InputError(what, where=f"views[{number}].camera", fix=fix)
         given = [float(n if view.time is None else view.time) for n, view in enumerate(views)]
         times, of_view = np.unique(given, return_inverse=True)
         if len(times) < 2:

@@ -7,7 +7,7 @@ random walk between them is Hermite's cubic, and its covariance that of a Browni
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -189,6 +189,18 @@ class Trajectory:
             covariance = np.block([[covariance, cross], [cross.T, self.frames[ends[1]]]])
         strength = self.motion.strength(np.full(2, np.nan))
         return self._point(time, *_state_at(float(time), known, covariance, strength))
+
+    def turned(self, rotation: FloatArray) -> Trajectory:
+        """The same in a frame to which ``rotation`` (3, 3) leads from that of the poses."""
+        turn = np.eye(12)
+        turn[:3, :3] = turn[3:6, 3:6] = rotation
+        rotations = (rotation @ self.rotations).reshape(-1, 9)
+        return replace(
+            self,
+            poses=np.concatenate([rotations, self.translations @ rotation.T], axis=1),
+            frames=turn @ self.frames @ turn.T,
+            links=turn @ self.links @ turn.T,
+        )
 
     def _point(
         self, time: float, pose: FloatArray, velocity: FloatArray, covariance: FloatArray

@@ -94,13 +94,12 @@ class EstimatedTrack(NamedTuple):
 
 def align_track(
     model: Model | ShapeModel,
-    views: Sequence[View],
     motion: Motion,
-    *,
     size: Size | None,
-    inits: Inits,
     options: FitOptions,
     ransac: RansacOptions | None,
+    views: Sequence[View],
+    inits: Inits,
 ) -> Result:
     """The result of `cadalign.align` with a motion."""
     start = perf_counter()

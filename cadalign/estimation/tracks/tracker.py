@@ -10,6 +10,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, is_whole
 from cadalign.errors import DegenerateError, InputError, NoConsensusError, require_kind
 from cadalign.estimation.align import align
+from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.joint_robust import under_cauchy, whitened_lengths
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -147,7 +148,7 @@ class Tracker:
         Raises
         ------
         InputError
-            If it is no `View`, has no time, or one that is not later than the last.
+            If it is no `View`, of a wide lens, has no time, or one that is not later than the last.
         """
         require_kind(view, View, "view")
         if view.time is None:
@@ -155,6 +156,7 @@ class Tracker:
         if self._views and float(view.time) <= float(self._views[-1].time or 0.0):
             what = f"{view.time} is not later than {self._views[-1].time}, that of the last view"
             raise InputError(what, where="view.time")
+        require_perspective(view.camera, "a tracker")
         for name in ("mask", "image"):
             if getattr(view, name) is not None:
                 what = "a tracker follows keypoints, not outlines"

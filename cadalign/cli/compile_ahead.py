@@ -18,6 +18,8 @@ from cadalign.geometry.metrics import box_iou
 from cadalign.shapes.model import ShapeModel
 
 _CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
+_POSE = Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3))
+_RANSAC = RansacOptions(max_iterations=10)
 
 
 def compile_ahead(*, progress: Callable[[str], object] | None = None) -> None:
@@ -29,6 +31,7 @@ def compile_ahead(*, progress: Callable[[str], object] | None = None) -> None:
         "shapes in several views": (_align_shape, 2),
         "fits": (_fits,),
         "shapes in one view": (_align_shape, 1),
+        "masks": (_align_with_mask,),
         "retrieval and boxes": (_retrieval_and_boxes,),
     }
     context = multiprocessing.get_context("spawn")
@@ -42,7 +45,7 @@ def compile_ahead(*, progress: Callable[[str], object] | None = None) -> None:
 
 def _points() -> tuple[np.ndarray, np.ndarray]:
     points = np.random.default_rng(0).uniform(-0.3, 0.3, (12, 3))
-    return points, _CAMERA.project(points + [0.0, 0.0, 2.0])
+    return points, _CAMERA.project(_POSE.apply(points))
 
 
 def _fits() -> None:
@@ -51,7 +54,7 @@ def _fits() -> None:
     points, pixels = _points()
     for method in METHODS:
         fit(points, pixels, _CAMERA, method=method)
-    fit(points, pixels, _CAMERA, ransac=RansacOptions(max_iterations=10), sigma=1.0)
+    fit(points, pixels, _CAMERA, ransac=_RANSAC, sigma=1.0)
     fit(points, pixels, _CAMERA, focal="estimate")
 
 
@@ -67,6 +70,20 @@ def _align_shape(views: int) -> None:
         align(shape, seen, motion="smooth")
 
 
+def _align_with_mask() -> None:
+    from cadalign.estimation.align import align
+    from cadalign.estimation.model import Model
+    from cadalign.geometry.mesh import Mesh
+    from cadalign.render import Scene, cast_geometry
+
+    points, pixels = _points()
+    corners = 0.3 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    mesh = Mesh(corners, np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]))
+    mask = cast_geometry(Scene(mesh), _CAMERA, _POSE).mask
+    view = View(_CAMERA, pixels, sigma=1.0, mask=mask)
+    align(Model(points_3d=points, mesh=mesh), view, ransac=_RANSAC)
+
+
 def _retrieval_and_boxes() -> None:
     from cadalign.retrieval import Library, LibraryModel
 
@@ -76,5 +93,5 @@ def _retrieval_and_boxes() -> None:
         LibraryModel("box", str(k), points * (1.0 + k), np.arange(12), bounds) for k in range(3)
     ]
     Library.from_models(models).retrieve(pixels, np.arange(12), _CAMERA)
-    box = Box.from_model(bounds, Alignment(np.eye(3), np.array([0.0, 0.0, 2.0]), np.ones(3)))
+    box = Box.from_model(bounds, _POSE)
     box_iou(est=box, gt=box)

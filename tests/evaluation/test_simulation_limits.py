@@ -156,7 +156,7 @@ def assert_at_the_limit(problems: list[Problem], noise_px: float) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("points", "noise_px"),
-    [(6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 2.0), (1024, 10.0)],
+    [(6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 10.0)],
 )
 def test_errors_are_at_the_cramer_rao_bound(points: int, noise_px: float) -> None:
     assert_at_the_limit(simulated_row(points, noise_px), noise_px)

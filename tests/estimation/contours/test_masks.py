@@ -75,8 +75,8 @@ class TestExactMasks:
         found = []
         for category in ("bottle", "mug", "chair"):
             models = [each for each in dataset[category] if each.mesh_path is not None]
-            for number in range(2 * len(models)):
-                case = case_of(models[number // 2], number)
+            for number, model in enumerate(models):
+                case = case_of(model, number)
                 alone = align(case.model, case.view()).alignment
                 result = align(case.model, case.view(mask=case.mask))
                 bound = contour_bound(case.model, case.view(mask=case.mask), case.truth)

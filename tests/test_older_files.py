@@ -384,7 +384,7 @@ def test_annotation_is_continued(tmp_path: Path) -> None:
     second = session.objects[0][1].document
     assert second.name == "second crate"
     assert keypoints_of(second.pairs) == [1, 2, 3, 5]
-    assert session.objects[0][0].history.before
+    assert session.objects[0][0].owner.history.before
     assert [each["state"] for each in worklist_state(session)] == ["done", "begun"]
 
 

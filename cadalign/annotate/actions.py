@@ -51,17 +51,16 @@ def perform(
         if function is None:
             fix = f"known are {', '.join(ACTIONS)}"
             raise InputError(f"{quote(name)} is not an action", where="do", fix=fix)
-        before = {id(each): each.history.document for each in session.states}
+        before = {owner: owner.document for owner in session.owners}
         arguments = msgspec.structs.asdict(convert(action, _arguments_of(function)))
         outcome = function(state, **arguments) or ActionOutcome()
-        owners = [each for each in session.states if each.lead is None]
-        changed = [each for each in owners if before.get(id(each)) is not each.document]
+        changed = [each for each in session.owners if before.get(each) is not each.document]
         for each in changed:
             session.save(each)
         if changed and name not in _DELETING:
             session.just_deleted.discard(number)
         if name in _RENAMING:
-            session.save(state)
+            session.save(state.owner)
         return outcome
 
 
@@ -249,7 +248,7 @@ def undo(state: PhotoState) -> ActionOutcome:
     if deleted is not None:
         return bring_back(deleted)
     before = replace(state.document, further_views=())
-    if not state.history.undo():
+    if not state.owner.history.undo():
         return ActionOutcome(message="There is nothing to undo.")
     return _gone_on(state, before)
 
@@ -257,7 +256,7 @@ def undo(state: PhotoState) -> ActionOutcome:
 def redo(state: PhotoState) -> ActionOutcome:
     """Redo the last undone change."""
     before = replace(state.document, further_views=())
-    is_done = state.history.redo()
+    is_done = state.owner.history.redo()
     if state.owner.document.is_gone:
         state.session.note_deletion(state.owner)
     if not is_done:
@@ -287,7 +286,7 @@ def _gone_on(state: PhotoState, before: AnnotationDocument) -> ActionOutcome:
     """
     if not state.is_shown:
         return ActionOutcome(message="This photo is no longer one of the object's.")
-    if len(state.all_views) > 1 and replace(state.document, further_views=()) == before:
+    if len(state.owner.shown) > 1 and replace(state.document, further_views=()) == before:
         return ActionOutcome(message="That was a change in another photo of this object.")
     return ActionOutcome()
 

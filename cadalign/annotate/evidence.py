@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -13,11 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import DataError, InputError
-from cadalign.geometry.alignment import Alignment
+from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.evidence import LENGTHS, ImageEvidence, ObservedImage, Size
+from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
 from cadalign.io.images import read_mask
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import StartFields
@@ -32,74 +29,6 @@ _LEAST_BOX = 4.0  # [px]
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
 _MOST_UP_SIGMA = 20.0  # [degrees]
-
-
-@dataclass(frozen=True, eq=False)
-class FurtherEvidence:
-    """Evidence of an observation beside the keypoints of the photo that is annotated."""
-
-    image: ImageEvidence = field(default_factory=ImageEvidence)  # the photo's
-    others: tuple[ObservedImage, ...] = ()  # the observation's other images
-    place: int = 0  # the photo's number among all of them
-    size: Size | None = None  # known lengths of the object
-    sigma: float | None = None
-    """Stored standard deviation of all keypoints in place of their own [px]."""
-    symmetry: Symmetry | None = None  # the model's; kept, but without effect while pairs are marked
-    up_axis: str | None = "y"  # the model's
-    photo: bool = False  # the photos themselves count
-    init: Alignment | None = None  # where the search begins
-
-    @classmethod
-    def of(cls, observation: Observation, photo: Path, *, where: Path) -> FurtherEvidence:
-        """The evidence of a file that shows a photo; raises DataError if none of its views does."""
-        views = observation.views
-        place = _place_of(photo, views, where=where)
-        options = observation.fit_options
-        # Beside a prior on the stretch it is the annotator's own, from the pairs of that time.
-        sigma = None if "stretch_sigma" in options else options.get("sigma")
-        return cls(
-            views[place].evidence,
-            views[:place] + views[place + 1 :],
-            place,
-            observation.size,
-            sigma if isinstance(sigma, float) else None,
-            observation.symmetry,
-            observation.up_axis,
-            bool(options.get("image", False)),
-            observation.init,
-        )
-
-    def added_to_image(self, photo: ObservedImage) -> ObservedImage:
-        """The photo's keypoints with what else is known of the photo."""
-        evidence = self.image
-        if photo.depths is None and evidence.depth is None and evidence.depth_sigma is not None:
-            evidence = replace(evidence, depth_sigma=None)  # all keypoints with depths are gone
-        return replace(photo, evidence=evidence)
-
-    def added_to(self, photo: ObservedImage, **of_the_object: object) -> Observation:
-        """The observation of the photo's keypoints and of all that is known beside them.
-
-        ``of_the_object`` are the fields of `Observation` beyond those of an image.
-        """
-        photo = self.added_to_image(photo)
-        views = [*self.others[: self.place], photo, *self.others[self.place :]]
-        kept = {name: getattr(self, name) for name in ("symmetry", "size", "up_axis")}
-        kept["others"] = tuple(views[1:])
-        return Observation(**{**vars(views[0]), **kept, **of_the_object})
-
-
-def _place_of(photo: Path, views: Sequence[ObservedImage], *, where: Path) -> int:
-    """The number of the view that shows a photo; of a single view its own."""
-    if len(views) == 1:
-        return 0
-    for number, view in enumerate(views):
-        if view.image is not None and view.image.exists() and view.image.samefile(photo):
-            return number
-    raise DataError(
-        f"none of its {len(views)} views has the image {photo.name}",
-        where=str(where),
-        fix="annotate the image of one of them, or give another --observation",
-    )
 
 
 @dataclass(frozen=True)
@@ -184,45 +113,47 @@ class MarkedEvidence:
     start: StartFields | None = None
 
     @classmethod
-    def of(cls, further: FurtherEvidence) -> Self:
-        """The marks that stand for an observation's evidence."""
-        image = further.image
+    def of(cls, image: ImageEvidence, observation: Observation | None = None) -> Self:
+        """The marks that stand for the evidence of an image, and for that of its object."""
         x, y, z = (0.0, 0.0, 0.0) if image.up is None else image.up.tolist()
+        start = None if observation is None else observation.init
         return cls(
             mask=None if image.mask is None else MaskDrawing(str(image.mask), image.mask_sigma),
             up=None if image.up is None else (x, y, z),
             up_sigma_deg=image.up_sigma_deg,
-            lengths=MarkedLengths.of(further.size),
-            photo=further.photo,
-            start=None if further.init is None else StartFields.of(further.init),
+            lengths=None if observation is None else MarkedLengths.of(observation.size),
+            photo=observation is not None and bool(observation.fit_options.get("image")),
+            start=None if start is None else StartFields.of(start),
         )
 
     def shared_with(self, other: Self) -> Self:
         """The evidence of another photo, with what is known of the object."""
         return replace(other, lengths=self.lengths, photo=self.photo)
 
-    def added_to(
-        self, further: FurtherEvidence, camera: Camera, drawn: Path | None
-    ) -> FurtherEvidence:
-        """An observation's evidence with this in place of its own.
+    def as_written(self, camera: Camera, drawn: Path | None) -> Self:
+        """The marks as an observation holds them, with an upward direction for vertical edges.
 
         ``drawn`` is the file of a mask with strokes, None if nothing is left of it.
         """
-        mask, sigma = drawn, None
-        if self.mask is not None and not self.mask.strokes:
-            mask, sigma = Path(self.mask.base or ""), self.mask.base_sigma
-        up = None if self.up is None else np.array(self.up)
+        mask = self.mask
+        if mask is not None and mask.strokes:
+            mask = None if drawn is None else MaskDrawing(str(drawn))
         found = find_up(self.verticals, camera)
-        up, up_sigma = (up, self.up_sigma_deg) if found is None else found
-        image = replace(
-            further.image,
-            mask=mask,
-            mask_sigma=sigma,
-            up=up,
-            up_sigma_deg=None if up is None else up_sigma,
+        if found is None:
+            return replace(self, mask=mask, verticals=())
+        (x, y, z), sigma = found[0].tolist(), found[1]
+        return replace(self, mask=mask, verticals=(), up=(x, y, z), up_sigma_deg=sigma)
+
+    def in_place_of(self, image: ImageEvidence) -> ImageEvidence:
+        """The evidence of an image with these marks, as they are written, in place of its own."""
+        mask, up = self.mask, self.up
+        return replace(
+            image,
+            mask=None if mask is None else Path(mask.base or ""),
+            mask_sigma=None if mask is None else mask.base_sigma,
+            up=None if up is None else np.array(up),
+            up_sigma_deg=None if up is None else self.up_sigma_deg,
         )
-        size = None if self.lengths is None else self.lengths.size
-        return replace(further, image=image, size=size)
 
 
 def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray, float] | None:

@@ -20,7 +20,6 @@ import msgspec
 import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Priors
-from cadalign.annotate.evidence import FurtherEvidence
 from cadalign.annotate.models import (
     SAME_PLACE,
     KeypointRegistry,
@@ -53,6 +52,7 @@ from cadalign.io.observation_file import SeenKeypoint
 logger = logging.getLogger("cadalign")
 
 _RENAME = "rename it: the annotator writes a file of this name"
+_NO_KEYPOINTS = np.empty((0, 3)), np.empty((0, 2))
 _EARLIER_FORMAT = "cadalign unfinished pairs"
 # Fields that are not of one image.
 _OF_THE_OBJECT = (
@@ -86,27 +86,47 @@ class _Unfinished(Document):
 
 
 @dataclass(frozen=True, eq=False)
-class Stored:
-    """An earlier session's annotation of a photo; ``camera`` is None without an observation file.
+class StoredView:
+    """An image of an observation; a further photo of the object has its annotation if it exists."""
 
-    ``views`` are those of the object's further photos.
+    seen: ObservedImage
+    document: AnnotationDocument | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """An earlier session's annotation of a photo; ``observation`` is None without such a file."""
+
+    document: AnnotationDocument = field(default_factory=AnnotationDocument)
+    observation: Observation | None = None
+    views: tuple[StoredView | None, ...] = (None,)
+    """The images of the observation, and further ones without anything that counts.
+
+    None stands in the place of the photo itself.
     """
 
-    image: Path
-    document: AnnotationDocument = field(default_factory=AnnotationDocument)
-    camera: Camera | None = None
-    further: FurtherEvidence = field(default_factory=FurtherEvidence)
-    fit_options: Mapping[str, Any] = field(default_factory=dict)
-    views: tuple[Stored, ...] = ()
+    @property
+    def seen(self) -> ObservedImage | None:
+        """What the observation has of the photo."""
+        given = self.observation
+        return None if given is None else given.views[self.views.index(None)]
+
+    @property
+    def sigma(self) -> float | None:
+        """Stored standard deviation of all keypoints in place of their own [px]."""
+        options = {} if self.observation is None else self.observation.fit_options
+        # Beside a prior on the stretch it is the annotator's own, from the pairs of that time.
+        sigma = None if "stretch_sigma" in options else options.get("sigma")
+        return sigma if isinstance(sigma, float) else None
 
     def priors_or(self, likely: Priors) -> Priors:
         """The priors of `cadalign fit` on the stored pairs; the likely ones before there are any.
 
         Where no prior on the focal length is stored, `cadalign fit` takes the likely one, too.
         """
-        options = self.fit_options
-        if self.camera is None or not self.document.complete_pairs:
+        if self.observation is None or not self.document.complete_pairs:
             return likely
+        options = self.observation.fit_options
         stored = options.get("focal_prior", likely.focal)
         focal = FocalPrior(**stored) if isinstance(stored, Mapping) else stored
         return Priors(options.get("stretch_sigma"), focal)
@@ -126,23 +146,23 @@ class AnnotationFiles:
     def read(self, photo: Path, model: OpenedModel, shape: ObjectShape | None = None) -> Stored:
         """Read an earlier session's annotation; new model points are added to the registry."""
         registry, tolerance = model.registry, SAME_PLACE * model.cad.diagonal
-        stored = Stored(photo)
+        stored = Stored()
         parts = []
         if self.observation.exists():
             observation = self._load()
             refuse_other_model(observation.model, model.path, where=self.observation)
-            further = FurtherEvidence.of(observation, photo, where=self.observation)
-            shown = observation.views[further.place]
-            self._warn_of_options(observation, further, shape)
-            document = _document_of(shown, registry, tolerance)
-            document = replace(document, name=observation.object_name or "")
-            views = []
-            for view in further.others:
-                if view.image is not None and view.image.exists():
-                    own = _document_of(view, registry, tolerance), view.camera
-                    views.append(Stored(view.image, *own, FurtherEvidence(view.evidence)))
-            options = observation.fit_options
-            stored = Stored(photo, document, shown.camera, further, options, tuple(views))
+            place = _place_of(photo, observation.views, where=self.observation)
+            shown = _document_of(observation.views[place], registry, tolerance)
+            shown = replace(shown, name=observation.object_name or "")
+            views: list[StoredView | None] = []
+            for seen in observation.views:
+                is_there = seen.image is not None and seen.image.exists()
+                is_other = is_there and len(views) != place
+                own = _document_of(seen, registry, tolerance) if is_other else None
+                views.append(StoredView(seen, own))
+            views[place] = None
+            stored = Stored(shown, observation, tuple(views))
+            self._warn_of_options(stored, shape)
             with in_file(self.observation), within("unfinished"):
                 parts.append(convert(observation.unfinished or {}, _Unfinished))
         earlier = self._earlier_unfinished()
@@ -204,8 +224,12 @@ class AnnotationFiles:
         self, stored: Stored, unfinished: _Unfinished, registry: KeypointRegistry
     ) -> Stored:
         """An annotation with what the keypoints of its observation lack."""
-        document = _with_halves(stored.document, unfinished.pairs, registry)
-        views = {view.image.resolve(): view for view in stored.views}
+        views = list(stored.views)
+        further = {
+            view.seen.image.resolve(): row
+            for row, view in enumerate(views)
+            if view is not None and view.document is not None and view.seen.image is not None
+        }
         for number, each in enumerate(unfinished.views):
             image = path_from(each.image, self.observation.parent)
             if not image.exists():
@@ -215,25 +239,29 @@ class AnnotationFiles:
                 continue
             with in_file(self.observation), within(f"unfinished.views[{number}]"):
                 camera = Camera.from_dict(each.camera)
-            new = Stored(image, camera=camera)
-            view = views.get(image.resolve(), new)
-            own = _with_halves(view.document, each.pairs, registry)
-            views[image.resolve()] = replace(view, document=own)
-        return replace(stored, document=document, views=tuple(views.values()))
+            new = StoredView(ObservedImage(*_NO_KEYPOINTS, camera, image=image))
+            row = further.setdefault(image.resolve(), len(views))
+            if row == len(views):
+                views.append(new)
+            view = views[row] or new
+            before = view.document or AnnotationDocument()
+            views[row] = replace(view, document=_with_halves(before, each.pairs, registry))
+        document = _with_halves(stored.document, unfinished.pairs, registry)
+        return replace(stored, document=document, views=tuple(views))
 
-    def _warn_of_options(
-        self, observation: Observation, further: FurtherEvidence, shape: ObjectShape | None
-    ) -> None:
+    def _warn_of_options(self, stored: Stored, shape: ObjectShape | None) -> None:
         """Warn of stored options of the fit that the page does not use."""
-        ours = {"sigma": further.sigma, "shape_sigma": None if shape is None else shape.sigma}
-        stored = dict(observation.fit_options)
+        observation = stored.observation
+        assert observation is not None
+        ours = {"sigma": stored.sigma, "shape_sigma": None if shape is None else shape.sigma}
+        options = dict(observation.fit_options)
         for name in ("focal_prior", "image"):
-            stored.pop(name, None)
-        if shape is None and stored.pop("stretch_sigma", None) is not None:
-            stored.pop("sigma", None)  # the annotator's own
+            options.pop(name, None)
+        if shape is None and options.pop("stretch_sigma", None) is not None:
+            options.pop("sigma", None)  # the annotator's own
         others = [
             name
-            for name, value in stored.items()
+            for name, value in options.items()
             if value != ours.get(name) and not (name == "sigma" and not isinstance(value, float))
         ]
         if observation.shape is not None and (shape is None or shape.path is None):
@@ -254,6 +282,20 @@ class AnnotationFiles:
             data = read_json(self.fit)
             if not isinstance(data, dict) or "alignment" not in data:
                 raise DataError("not an alignment of cadalign", where=str(self.fit), fix=_RENAME)
+
+
+def _place_of(photo: Path, views: Sequence[ObservedImage], *, where: Path) -> int:
+    """The number of the view that shows a photo; of a single view its own."""
+    if len(views) == 1:
+        return 0
+    for number, view in enumerate(views):
+        if view.image is not None and view.image.exists() and view.image.samefile(photo):
+            return number
+    raise DataError(
+        f"none of its {len(views)} views has the image {photo.name}",
+        where=str(where),
+        fix="annotate the image of one of them, or give another --observation",
+    )
 
 
 def _remove(path: Path) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, FurtherView, History, Pair, Priors
 from cadalign.annotate.evidence import (
-    FurtherEvidence,
     MarkedEvidence,
     MarkedLengths,
     MaskDrawing,
@@ -22,7 +21,7 @@ from cadalign.annotate.evidence import (
 from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.names import object_file, object_number
-from cadalign.annotate.objects import PhotoState, shown_objects
+from cadalign.annotate.objects import AnnotatedObject, PhotoState, shown_objects
 from cadalign.annotate.photos import FocalChoice
 from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.errors import InputError, quote
@@ -56,8 +55,8 @@ def add_object(state: PhotoState, *, name: str = "", model: Index | None = None)
         raise InputError(
             "the shape is that of one category, with one model", where="model", fix=fix
         )
-    first = like.files.observation
-    taken = {object_number(each.files.observation) for each in states if each.lead is None}
+    first = like.owner.files.observation
+    taken = {object_number(each.owner.files.observation) for each in states if each.is_first}
     number = next(
         number
         for number in range(2, len(states) + 3)
@@ -65,15 +64,14 @@ def add_object(state: PhotoState, *, name: str = "", model: Index | None = None)
     )
     stretch = LIKELY_STRETCH if session.shape is None else None
     priors = Priors(stretch, like.intrinsics.likely_focal)
-    document = AnnotationDocument(focal=like.document.focal, priors=priors, name=name)
+    history = History(AnnotationDocument(focal=like.document.focal, priors=priors, name=name))
+    alike = next((each for each in session.owners if each.model is chosen), like.owner)
     files = AnnotationFiles(object_file(first, number))
-    alike = next((each for each in session.states if each.model is chosen), like)
-    further = FurtherEvidence(up_axis=alike.owner.further.up_axis)
-    added = PhotoState(
-        session, like.photo, files, like.intrinsics, History(document), chosen, further
-    )
-    states.append(added)
-    return ActionOutcome(shown=added)
+    owner = AnnotatedObject(session, chosen, files, history, up_axis=alike.up_axis)
+    owner.first = PhotoState(owner, like.photo, like.intrinsics)
+    owner.views.append(owner.first)
+    states.append(owner.first)
+    return ActionOutcome(shown=owner.first)
 
 
 def rename_object(state: PhotoState, *, name: str) -> None:
@@ -86,10 +84,10 @@ def delete_object(state: PhotoState) -> ActionOutcome:
     """Delete the object with its files; it can be brought back while the program runs."""
     label, owner = state.label, state.owner
     kept = owner.document
-    owner.record(
+    owner.history.record(
         AnnotationDocument(focal=kept.focal, priors=kept.priors, name=kept.name, is_deleted=True)
     )
-    for view in (owner, *owner.views):
+    for view in owner.states:
         view.drawn = None
     state.session.note_deletion(owner)
     return ActionOutcome(message=f"Deleted: {label}. Ctrl+Z brings it back.")
@@ -105,7 +103,7 @@ def restore_object(state: PhotoState) -> ActionOutcome:
 
 def bring_back(deleted: PhotoState) -> ActionOutcome:
     """Undo the deletion of an object."""
-    deleted.history.undo()
+    deleted.owner.history.undo()
     return ActionOutcome(shown=deleted, message=f"Brought back: {deleted.label}.")
 
 
@@ -113,18 +111,18 @@ def add_view(state: PhotoState, *, photo: Index) -> ActionOutcome:
     """Add another photo as a further view of the object, or one that was taken from it again."""
     session, owner = state.session, state.owner
     target = session.photo_state(photo)
-    if any(view.key == target.key for view in state.all_views):
+    if any(view.key == target.key for view in owner.shown):
         what = f"{target.photo.path.name} is a photo of this object already"
         raise InputError(what, where="photo", fix="choose another one")
-    stored = (owner.further.image, *(each.evidence for each in owner.further.others))
-    if any(each.cam_from_rig is not None for each in stored):
+    if any(view.evidence.cam_from_rig is not None for view in owner.views):
         what = "the cameras of this object's photos are known, the new one's is not"
         fix = "write its camera pose into the observation"
         raise InputError(what, where="photo", fix=fix)
     like = session.objects[photo][0]
-    view = next((each for each in owner.views if each.key == like.key), None)
+    view = next((each for each in owner.states if each.key == like.key), None)
     if view is None:
-        view = owner.add_view(like.photo, like.intrinsics)
+        view = PhotoState(owner, like.photo, like.intrinsics)
+        owner.views.append(view)
         session.objects[photo].append(view)
     shared = owner.document
     view.record(
@@ -140,12 +138,13 @@ def add_view(state: PhotoState, *, photo: Index) -> ActionOutcome:
 
 def remove_view(state: PhotoState) -> ActionOutcome:
     """Take the photo from the object, with its pairs; undo brings it back."""
-    if state.lead is None:
+    if state.is_first:
         what = "the object's first photo cannot be taken from it"
         fix = "delete the object, or take its other photos from it"
         raise InputError(what, where="photo", fix=fix)
-    state.history.record(state.history.document.without_view(state.key))
-    return ActionOutcome(shown=state.owner, message=f"{state.photo.path.name} is no longer used.")
+    owner = state.owner
+    owner.history.record(owner.document.without_view(state.key))
+    return ActionOutcome(shown=owner.first, message=f"{state.photo.path.name} is no longer used.")
 
 
 def model(state: PhotoState, *, category: Text, model: Text) -> ActionOutcome | None:
@@ -166,10 +165,10 @@ def model(state: PhotoState, *, category: Text, model: Text) -> ActionOutcome | 
         new.prepare(has_shape=session.shape is not None)
     carried = carry_keypoints(old.registry, new.registry, session.choice.ids_on(old.path))
     before = len(state.document.keypoints)
-    history = owner.history.changed(lambda document: _carried(document, carried))
-    for each in (owner, *owner.views):
-        each.model, each.history = new, history
-        each.live = each.alone = None
+    owner.history = owner.history.changed(lambda document: _carried(document, carried))
+    owner.model, owner.alone = new, None
+    for each in owner.states:
+        each.live = None
         each.proposals = tuple(
             replace(proposal, keypoint=carried[proposal.keypoint])
             for proposal in each.proposals
@@ -327,7 +326,7 @@ def use_photo(state: PhotoState, *, on: bool) -> ActionOutcome | None:
         return None
     live, _ = state.session.live(state)
     start = evidence.start
-    if live.result is not None and state.lead is None:
+    if live.result is not None and state.is_first:
         start = StartFields.of(live.alignment)
     state.mark(photo=on, mask=None, start=start)
     return ActionOutcome(message="The photo takes the place of the mask; undo brings it back.")

@@ -9,16 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.annotate.document import (
-    AnnotationDocument,
-    FurtherView,
-    History,
-    Priors,
-    history_path,
-    read_history,
-)
-from cadalign.annotate.evidence import FurtherEvidence, MarkedEvidence, MarkedLengths
-from cadalign.annotate.files import AnnotationFiles, Stored
+from cadalign.annotate.document import History, Priors, history_path, read_history
+from cadalign.annotate.evidence import MarkedEvidence, MarkedLengths, MaskDrawing
+from cadalign.annotate.files import AnnotationFiles, StoredView
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.models import SAME_PLACE, Models, ObjectShape
 from cadalign.annotate.names import (
@@ -29,7 +22,7 @@ from cadalign.annotate.names import (
     observation_file,
     refuse_collisions,
 )
-from cadalign.annotate.objects import PhotoState
+from cadalign.annotate.objects import AnnotatedObject, PhotoState, has_evidence
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.photos import (
     FocalChoice,
@@ -46,6 +39,7 @@ from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
+from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.observation import with_lens
 from cadalign.io.observation_file import SizeFields, read_size
 
@@ -132,7 +126,7 @@ def open_session(
             state.proposals = proposals
     if options.track:
         session.times = times_of(photo.path for photo in files.photos)
-    for view in [view for state in session.states for view in state.views]:
+    for view in [view for owner in session.owners for view in owner.states[1:]]:
         place = next((row for row in session.objects if row[0].key == view.key), None)
         if place is None:  # a photo that is nothing but a further view
             file = observation_file(view.photo.path, folder)
@@ -176,52 +170,52 @@ def _open_object(
     model = session.models.of(mesh)
     files = AnnotationFiles(file)
     stored = files.read(photo.path, model, session.shape)
-    intrinsics, focal = _intrinsics(photo, stored.camera, camera)
+    seen, observation = stored.seen, stored.observation
+    evidence = ImageEvidence() if seen is None else seen.evidence
+    marks = MarkedEvidence.of(evidence, observation)
+    if is_first:
+        marks = _with_options(marks, options)
+    intrinsics, focal = _intrinsics(photo, None if seen is None else seen.camera, camera)
     priors = stored.priors_or(Priors(LIKELY_STRETCH, intrinsics.likely_focal))
     if session.shape is not None:  # which has a prior of its own on the stretch
         priors = replace(priors, stretch=None)
-    further = _with_options(stored.further, options) if is_first else stored.further
-    further = replace(further, up_axis=options.up_axis or further.up_axis)
-    evidence = MarkedEvidence.of(further)
-    document = replace(stored.document, focal=focal, priors=priors, evidence=evidence)
-    state = PhotoState(session, photo, files, intrinsics, History(document), model, further)
-    for each in stored.views:
-        document = _with_view(state, document, each)
-
-    def is_same(drawn: MarkedEvidence, view: str | None) -> bool:
-        return _is_same(drawn, next((each for each in state.views if each.key == view), state))
+    document = replace(stored.document, focal=focal, priors=priors, evidence=marks)
+    owner = AnnotatedObject(session, model, files, History(document), stored.sigma)
+    if observation is not None:
+        owner.symmetry, owner.up_axis = observation.symmetry, observation.up_axis
+    owner.up_axis = options.up_axis or owner.up_axis
+    owner.first = PhotoState(owner, photo, intrinsics, evidence)
+    views = [owner.first if each is None else _further_view(owner, each) for each in stored.views]
+    owner.views = [view for view in views if view is not None]
 
     # Of several photos the views' documents are compared as the object's holds them.
-    own_states = (state, *state.views)
-    for each_state in own_states:
-        each_state.history = History(document)
-    history = read_history(
+    def is_same(drawn: MarkedEvidence, view: str | None) -> bool:
+        further = (each for each in owner.states if not each.is_first and each.key == view)
+        return _is_same(drawn, next(further, owner.first))
+
+    owner.history = read_history(
         history_path(files.observation),
-        document,
+        owner.document,
         model.registry,
         tolerance=SAME_PLACE * model.cad.diagonal,
         same_evidence=is_same,
     )
-    for each_state in own_states:
-        each_state.history = history
-    return state
+    return owner.first
 
 
-def _with_options(further: FurtherEvidence, options: SessionOptions) -> FurtherEvidence:
-    """The evidence with the mask and the lengths that the options give."""
+def _with_options(marks: MarkedEvidence, options: SessionOptions) -> MarkedEvidence:
+    """The marks with the mask and the lengths that the options give."""
     mask, size = options.mask, options.size
-    if mask is None and size is None:
-        return further
-    if options.image.is_dir():
+    if options.image.is_dir() and not (mask is None and size is None):
         where = "--size" if mask is None else "--mask"
         what = "is of a single photo, but a folder is given"
         raise InputError(what, where=where, fix="give one photo")
     if mask is not None:
-        image = replace(further.image, mask=mask.resolve(), mask_sigma=None)
-        further = replace(further, image=image)
-    if size is None:
-        return further
-    return replace(further, size=read_size(convert(size, SizeFields, where="--size")))
+        marks = replace(marks, mask=MaskDrawing(str(mask.resolve())))
+    if size is not None:
+        given = read_size(convert(size, SizeFields, where="--size"))
+        marks = replace(marks, lengths=MarkedLengths.of(given))
+    return marks
 
 
 def _readable(paths: list[Path]) -> list[PhotoFile]:
@@ -248,39 +242,42 @@ def _intrinsics(
     return intrinsics, FocalChoice(known=intrinsics.calibrated)
 
 
-def _with_view(
-    owner: PhotoState, document: AnnotationDocument, stored: Stored
-) -> AnnotationDocument:
-    """The object's document with a further photo, of which the state is added to the owner's."""
+def _further_view(owner: AnnotatedObject, stored: StoredView) -> PhotoState | ObservedImage | None:
+    """A further photo of an object, to whose document its own is added.
+
+    The image as it is where it cannot be annotated, None if it then says nothing.
+    """
+    seen = stored.seen
+    if stored.document is None or seen.image is None:
+        return seen
     try:
-        photo = PhotoFile.open(stored.image)
-        intrinsics, focal = _intrinsics(photo, stored.camera, None)
+        photo = PhotoFile.open(seen.image)
+        intrinsics, focal = _intrinsics(photo, seen.camera, None)
     except CadalignError as error:
         logger.warning("%s: kept, but not opened: %s", owner.files.observation.name, error)
-        return document
-    view = owner.add_view(photo, intrinsics)
-    view.further = stored.further
+        return seen if has_evidence(seen) else None
+    view = PhotoState(owner, photo, intrinsics, seen.evidence)
+    shared = owner.document
     own = replace(
         stored.document,
         focal=focal,
-        priors=Priors(document.priors.stretch, intrinsics.likely_focal),
-        evidence=document.evidence.shared_with(MarkedEvidence.of(view.further)),
+        priors=Priors(shared.priors.stretch, intrinsics.likely_focal),
+        evidence=shared.evidence.shared_with(MarkedEvidence.of(seen.evidence)),
+        name=shared.name,
     )
-    return replace(document, further_views=(*document.further_views, FurtherView(view.key, own)))
+    owner.history = History(shared.with_view(view.key, own))
+    return view
 
 
 def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
-    """True if what was drawn is what an observation file has."""
-    further = state.further
-    mask = None if drawn.mask is None else state.mask_file(drawn.mask.base)
-    ours = drawn.added_to(further, state.camera, mask if further.image.mask is not None else None)
-    if (ours.image.mask, ours.image.mask_sigma) != (further.image.mask, further.image.mask_sigma):
+    """True if what was drawn is what the observation file has of a photo."""
+    stored = state.document.evidence
+    mask = None if drawn.mask is None or stored.mask is None else state.mask_file(drawn.mask.base)
+    written = drawn.as_written(state.camera, mask)
+    if written.mask != stored.mask:
         return False
-    if state.lead is None and drawn.photo != further.photo:
+    if state.is_first and (written.photo, written.lengths) != (stored.photo, stored.lengths):
         return False
-    if state.lead is None and MarkedLengths.of(ours.size) != MarkedLengths.of(further.size):
-        return False
-    one, other = ours.image.up, further.image.up
-    if one is None or other is None:
-        return one is other
-    return bool(np.allclose(one, other, rtol=0, atol=_SAME_DIRECTION))
+    if written.up is None or stored.up is None:
+        return written.up is stored.up
+    return bool(np.allclose(written.up, stored.up, rtol=0, atol=_SAME_DIRECTION))

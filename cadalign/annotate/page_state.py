@@ -40,9 +40,9 @@ def page_state(
         number, slot = state.place
         live, suggestion = session.live(state)
         document, registry, cad = state.document, state.model.registry, state.model.cad
-        history, used = state.history, document.keypoints
+        history, used = state.owner.history, document.keypoints
         deleted = session.last_deleted(number)
-        photos = [_view(view) | {"is_current": view is state} for view in state.all_views]
+        photos = [_view(view) | {"is_current": view is state} for view in state.owner.shown]
         taken = {photo["number"] for photo in photos}
         return {
             "revision": history.revision,
@@ -54,13 +54,13 @@ def page_state(
                 "width": state.photo.width,
                 "height": state.photo.height,
                 "model": state.model.path.name,
-                "up_axis": state.owner.further.up_axis or "y",
+                "up_axis": state.owner.up_axis or "y",
                 "model_number": session.models.number_of(state.model.path),
                 "has_library": session.choice is not None,
                 "state": session.work_state(state),
             },
             "saved": {
-                "path": state.files.observation.name,
+                "path": state.owner.files.observation.name,
                 "at": state.owner.saved_at,
                 "trouble": state.owner.save_error,
             },
@@ -174,7 +174,7 @@ def _priors(state: PhotoState) -> dict[str, Any]:
         "focal": priors.focal is not None,
         "about": f"{likely.focal:.0f} px ± {100 * likely.relative_sigma:.0f} % ({source})",
         "has_stretch": state.session.shape is None,
-        "has_focal": state.lead is None and state.estimates_focal,
+        "has_focal": state.is_first and state.estimates_focal,
     }
 
 
@@ -196,7 +196,7 @@ def _candidates(
 
     ``chosen`` says that the user has decided for one, ``text`` how many clicks leave one.
     """
-    chosen, candidates = state.lead is None and state.begins, live.candidates
+    chosen, candidates = state.is_first and state.begins, live.candidates
     found: dict[str, Any] = {"chosen": chosen, "candidates": [], "text": ""}
     if chosen or candidates is None or not live.frames:
         return found
@@ -230,7 +230,7 @@ def _moved(state: PhotoState) -> str:
         return ""
     return (
         f"{' and '.join(gone)}: moved, renamed or deleted. Go on here, or start anew with the new "
-        f"name and --observation {state.files.observation.name}."
+        f"name and --observation {state.owner.files.observation.name}."
     )
 
 
@@ -334,16 +334,16 @@ def _view(state: PhotoState) -> dict[str, Any]:
         "object": slot,
         "name": state.photo.path.name,
         "pairs": len(state.document.complete_pairs),
-        "is_first": state.lead is None,
+        "is_first": state.is_first,
     }
 
 
 def _rms(state: PhotoState) -> float | None:
     """Residual of the saved alignment, which is not computed anew for a list of many photos."""
-    if not state.document.complete_pairs or not state.files.fit.exists():
+    if not state.document.complete_pairs or not state.owner.files.fit.exists():
         return None
     try:
-        rms = read_json(state.files.fit).get("rms")
+        rms = read_json(state.owner.files.fit).get("rms")
     except CadalignError:
         return None
     return rms if isinstance(rms, float) else None

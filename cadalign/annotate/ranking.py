@@ -25,7 +25,7 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
     with session.lock:
         state = session.photo_state(number, slot)
         live, suggestion = session.live(state)
-        document, revision = state.document, state.history.revision
+        document, revision = state.document, state.owner.history.revision
         pairs = document.complete_pairs
         points_3d = state.model.registry.xyz(
             pair.keypoint for pair in pairs if pair.keypoint is not None
@@ -47,7 +47,7 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
             "kind": each.kind,
             "what": evidence_text(each, name),
             "left": left_text(each),
-            "how": how_text(each, state.files.observation.name),
+            "how": how_text(each, state.owner.files.observation.name),
             "worst": each.worst,
         }
         for each in ranked
@@ -64,7 +64,7 @@ def ranking_state(session: Session, number: int, *, slot: int | None = None) -> 
     """
     with session.lock:
         state, choice = session.photo_state(number, slot), session.choice
-        revision = state.history.revision
+        revision = state.owner.history.revision
         answer: dict[str, Any] = {"revision": revision, "note": "", "none": None, "models": []}
         if choice is None:
             return answer | {"note": "The session has no library: start it with --library."}

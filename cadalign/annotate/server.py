@@ -172,7 +172,8 @@ class _Routes:
     def glb(self, request: Request) -> Response:
         number, slot = _place(request)
         data = glb_of(self._session, number, slot=slot)
-        name = self._session.photo_state(number, slot).files.observation.with_suffix(".glb").name
+        observation = self._session.photo_state(number, slot).owner.files.observation
+        name = observation.with_suffix(".glb").name
         return _as_file(name, data, "model/gltf-binary")
 
     def photo_set(self, request: Request) -> Response:
@@ -192,7 +193,7 @@ class _Routes:
         number, slot = _place(request)
         state = self._session.photo_state(number, slot)
         elsewhere = self._claims.is_elsewhere(number, request.cookies.get(_BROWSER, ""))
-        return JSONResponse({"revision": state.history.revision, "elsewhere": elsewhere})
+        return JSONResponse({"revision": state.owner.history.revision, "elsewhere": elsewhere})
 
     def data(self, answer: Callable[..., dict[str, Any]], request: Request) -> Response:
         """Answer with what a function of `_OF_OBJECT` returns for an object."""
@@ -217,7 +218,7 @@ class _Routes:
         number, slot = _place(request)
         person = "" if request.client is None else request.client.host
         with session.lock:
-            views = session.photo_state(number, slot).all_views
+            views = session.photo_state(number, slot).owner.shown
             photos = {number, *(view.place[0] for view in views)}
             self._claims.take(photos, request.cookies.get(_BROWSER, ""), person)
             outcome = perform(session, number, action, slot=slot)

@@ -20,7 +20,7 @@ from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import known_points, live_alignment, missing_text
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry, Models, ObjectShape
-from cadalign.annotate.objects import PhotoState, shown_objects
+from cadalign.annotate.objects import AnnotatedObject, PhotoState, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.problem import Known
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
@@ -48,7 +48,7 @@ class Session:
     objects: list[list[PhotoState]] = field(default_factory=list)
     """The objects of each photo, its own observation's first."""
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
-    deleted: list[PhotoState] = field(default_factory=list)  # objects, in that order
+    deleted: list[AnnotatedObject] = field(default_factory=list)  # in that order
     just_deleted: set[int] = field(default_factory=set)  # photos where this was the last change
 
     def __post_init__(self) -> None:
@@ -81,6 +81,11 @@ class Session:
         """All objects in all photos."""
         return [state for states in self.objects for state in states]
 
+    @property
+    def owners(self) -> list[AnnotatedObject]:
+        """The objects, each once."""
+        return [state.owner for state in self.states if state.is_first]
+
     def warm_up(self) -> None:
         """Compile or load the solvers, and prepare the models, until the session has ``ended``."""
         try:
@@ -98,9 +103,9 @@ class Session:
         finally:  # an error here occurs again, and is reported, when the user aligns
             self.ready = True
             with self.lock:
-                for state in self.states:
-                    if state.fit_pending and not self.ended.is_set():
-                        self.save(state)
+                for owner in self.owners:
+                    if owner.fit_pending and not self.ended.is_set():
+                        self.save(owner)
 
     def photo_state(self, number: int, slot: int | None = None) -> PhotoState:
         """An object of the photo of a number, both counted from 0; by default the first shown."""
@@ -120,13 +125,13 @@ class Session:
         """
         if at_once and photo not in self.just_deleted:
             return None
-        gone = (each for each in reversed(self.deleted) if each.document.is_gone)
-        return next((o for o in gone if photo in (v.place[0] for v in (o, *o.views))), None)
+        gone = (each.first for each in reversed(self.deleted) if each.document.is_gone)
+        return next((o for o in gone if photo in (v.place[0] for v in o.owner.states)), None)
 
-    def note_deletion(self, owner: PhotoState) -> None:
+    def note_deletion(self, owner: AnnotatedObject) -> None:
         """Remember an object that was deleted."""
         self.deleted.append(owner)
-        self.just_deleted |= {view.place[0] for view in (owner, *owner.views)}
+        self.just_deleted |= {view.place[0] for view in owner.states}
 
     def work_state(self, state: PhotoState) -> State:
         """State of the annotation of a photo."""
@@ -146,7 +151,7 @@ class Session:
         if not self.ready:
             return LiveAlignment(message="Solvers and model are being prepared."), None
         others = self._others_focal(state)
-        key = (state.history.document, others)
+        key = (state.owner.document, others)
         if state.live is not None and state.live[0] == key:
             return state.live[1:]
         suggestion = None
@@ -190,7 +195,7 @@ class Session:
 
     def _alone(self, state: PhotoState) -> LiveAlignment:
         """The estimate from all photos of the object, apart from others; raises a CadalignError."""
-        owner, document = state.owner, state.history.document
+        owner, document = state.owner, state.owner.document
         if owner.alone is None or owner.alone[0] is not document:
             try:
                 found = LiveAlignment.of(self._known(state), state.observation())
@@ -207,7 +212,7 @@ class Session:
 
         Each is of the object alone, so that they depend neither on each other nor on the order.
         """
-        others = state.owner.beside
+        others = state.owner.first.beside
         if not (others and state.estimates_focal):
             return {}
         found = {}
@@ -228,7 +233,7 @@ class Session:
             shape,
             state.model.cad.scene.mesh,
             stretch=state.document.priors.stretch,
-            sigma=owner.further.sigma,
+            sigma=owner.sigma,
             anchors={label: point for label, point in own.items() if label is not None},
             assumed_focal=() if is_estimated else tuple(names),
             estimates_focal=is_estimated,
@@ -237,21 +242,21 @@ class Session:
             by_mask=owner.allowed_by_mask,
         )
 
-    def save(self, state: PhotoState) -> None:
+    def save(self, owner: AnnotatedObject) -> None:
         """Write the files of an object and of its model; an error is kept for the page.
 
         Objects that could not be written before are written too.
         """
-        self._write(state.owner)
-        self._write_others(state.owner)
-        if not state.owner.save_error:
+        self._write(owner)
+        self._write_others(owner)
+        if not owner.save_error:
             for other in self.unsaved:
                 self._write(other)
 
     @property
-    def unsaved(self) -> list[PhotoState]:
+    def unsaved(self) -> list[AnnotatedObject]:
         """Objects whose last change could not be written."""
-        return [state for state in self.states if state.save_error]
+        return [owner for owner in self.owners if owner.save_error]
 
     def save_unsaved(self, folder: Path | None = None) -> None:
         """Write the objects that could not be written, if given into another folder from now on."""
@@ -262,67 +267,66 @@ class Session:
                 self.reserve = lambda paths: None
                 for model in self.models.opened:
                     model.keypoints_path = folder / model.keypoints_path.name
-                for state in unsaved:
-                    path = folder / state.files.observation.name
-                    for each in (state, *state.views):
-                        each.files = AnnotationFiles(path)
-            for state in unsaved:
-                self._write(state)
+                for owner in unsaved:
+                    owner.files = AnnotationFiles(folder / owner.files.observation.name)
+            for owner in unsaved:
+                self._write(owner)
 
-    def _write(self, state: PhotoState) -> None:
-        """Write the files of an object, of which this is the state in its first photo."""
+    def _write(self, owner: AnnotatedObject) -> None:
+        """Write the files of an object."""
         ready = self.ready  # asked first: it may become so at any time
-        state.fit_pending = not ready
+        owner.fit_pending = not ready
         try:
             self.before_saving()
-            self.reserve((state.files.observation, state.model.keypoints_path))
+            self.reserve((owner.files.observation, owner.model.keypoints_path))
             # First what a restart finds the observation's content in, if the process is killed.
-            path = history_path(state.files.observation)
-            write_history(path, state.history, state.model.registry)
-            if state.document.is_gone:
-                state.files.remove()
+            path = history_path(owner.files.observation)
+            write_history(path, owner.history, owner.model.registry)
+            if owner.document.is_gone:
+                owner.files.remove()
             else:
-                self._write_object(state)
+                self._write_object(owner)
                 if ready:
-                    self._write_fit(state)
+                    self._write_fit(owner)
         except CadalignError as error:
-            state.save_error = str(error)
+            owner.save_error = str(error)
         else:
-            state.save_error = ""
-            state.saved_at = time.time()
+            owner.save_error = ""
+            owner.saved_at = time.time()
 
-    def _write_others(self, owner: PhotoState) -> None:
+    def _write_others(self, owner: AnnotatedObject) -> None:
         """Write the alignments of saved objects that share the focal length of a changed one."""
-        for other in (each.owner for view in (owner, *owner.views) for each in view.beside):
-            before = other.live
+        for other in (each.owner for view in owner.states for each in view.beside):
+            before = other.first.live
             if not self.ready or other.saved_at is None or other.save_error:
                 continue
-            self.live(other)
-            if other.live is not before:
+            self.live(other.first)
+            if other.first.live is not before:
                 try:
                     self._write_fit(other)
                 except CadalignError as error:
                     other.save_error = str(error)
 
-    def _write_object(self, state: PhotoState) -> None:
+    def _write_object(self, owner: AnnotatedObject) -> None:
+        state = owner.first
         live, _ = self.live(state)
         used = frozenset[int]().union(
-            *(other.document.keypoints for other in self.states if other.model is state.model)
+            *(other.document.keypoints for other in self.states if other.model is owner.model)
         )
         # First the keypoints, which the observation names.
-        state.model.write_keypoints(used)
-        stored = {} if state.further.sigma is None else {"sigma": state.further.sigma}
+        owner.model.write_keypoints(used)
+        stored = {} if owner.sigma is None else {"sigma": owner.sigma}
         priors = state.document.priors.fit_options(state.intrinsics.likely_focal)
         options = {**stored, **priors, **live.fit_options}
-        state.files.write(state.observation(fit_options=options, to_write=True))
+        owner.files.write(state.observation(fit_options=options, to_write=True))
 
-    def _write_fit(self, state: PhotoState) -> None:
+    def _write_fit(self, owner: AnnotatedObject) -> None:
         """Write the alignment of an object; raises DataError on failure.
 
         An alignment by assumptions is shown but not written: `cadalign fit` would refuse it.
         """
-        live, _ = self.live(state)
-        state.files.write_fit(None if live.provisional else live.result)
+        live, _ = self.live(owner.first)
+        owner.files.write_fit(None if live.provisional else live.result)
 
 
 @cache

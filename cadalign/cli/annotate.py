@@ -179,7 +179,7 @@ def _save_and_say_where(session: Session) -> int:
     if not session.unsaved:
         say(f"Saved in {folder}")
         return 0
-    for trouble in sorted({state.save_error for state in session.unsaved}):
+    for trouble in sorted({owner.save_error for owner in session.unsaved}):
         say(f"Not saved: {trouble}")
     elsewhere = Path(tempfile.mkdtemp(prefix="cadalign-annotate-"))
     session.save_unsaved(elsewhere)

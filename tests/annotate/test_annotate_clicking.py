@@ -209,7 +209,7 @@ def test_undo_and_numbers_survive_a_restart(case: Case) -> None:
     assert [pair.number for pair in again.photos[0].document.pairs] == [1, 2, 3, 4, 5, 6]
     placed = again.registry[again.photos[0].document.pair(6).keypoint or 0]
     assert placed.xyz == session.registry[placed.semantic_id or 0].xyz
-    while again.photos[0].history.before:
+    while again.photos[0].owner.history.before:
         perform(again, 0, {"do": "undo"})
     assert again.photos[0].document.pairs == ()
 

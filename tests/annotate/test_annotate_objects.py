@@ -15,6 +15,7 @@ from support.annotating import Case, fitted, flat
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.document import history_path
+from cadalign.annotate.evidence import MaskDrawing
 from cadalign.annotate.exporting import coco_of, glb_of
 from cadalign.annotate.locks import WriterLocks
 from cadalign.annotate.opening import find_session_files, open_session
@@ -106,7 +107,10 @@ def test_a_mask_that_the_options_give_is_of_the_first_object(two: Session, case:
     mask = case.folder / "given.png"
     cv2.imwrite(str(mask), np.full((480, 640), 255, np.uint8))
     again = case.open(mask=mask, prepared=False)
-    assert [each.further.image.mask for each in again.objects[0]] == [mask.resolve(), None]
+    assert [each.document.evidence.mask for each in again.objects[0]] == [
+        MaskDrawing(str(mask.resolve())),
+        None,
+    ]
 
 
 def test_a_deleted_object_is_brought_back(two: Session, case: Case) -> None:
@@ -153,7 +157,7 @@ def test_a_new_object_does_not_take_a_deleted_ones_place(two: Session) -> None:
     perform(two, 0, {"do": "delete_object"}, slot=1)
     outcome = perform(two, 0, {"do": "add_object"}, slot=0)
     assert outcome.shown is not None
-    assert outcome.shown.files.observation.name == "photo.object-3.json"
+    assert outcome.shown.owner.files.observation.name == "photo.object-3.json"
     assert labels(two) == ["object 1", "object 3"]
 
 
@@ -268,7 +272,7 @@ def test_histories_of_earlier_versions_are_read(case: Case) -> None:
             rest.pop(field)
     path.write_text(json.dumps(data))
     again = case.open()
-    assert len(again.photos[0].history.before) == 4  # type: ignore[union-attr]
+    assert len(again.photos[0].owner.history.before) == 4  # type: ignore[union-attr]
 
 
 def test_the_command_takes_further_photos_and_models(case: Case) -> None:
@@ -284,6 +288,6 @@ def test_the_command_takes_further_photos_and_models(case: Case) -> None:
 def test_a_photo_called_like_an_object_keeps_its_own_file(two: Session, case: Case) -> None:
     shutil.copy(case.photo, case.folder / "photo.object-2.png")
     session = case.open(image=case.folder)
-    names = {state.files.observation.name for state in session.states}
+    names = {state.owner.files.observation.name for state in session.states}
     assert names == {"photo.json", "photo.object-2.json", "photo.object-2.png.json"}
     assert sorted(len(states) for states in session.objects) == [1, 2]

@@ -157,7 +157,7 @@ def test_a_photo_is_taken_from_the_object(page: Page, session: Session) -> None:
     page.get_by_role("button", name="Take right.png from the object").click()
     wait(page, IDLE + " && annotator.state.image.number === 0")
     expect(page.get_by_role("alert")).to_have_text("right.png is no longer used.")
-    assert len(session.objects[0][0].all_views) == 1
+    assert len(session.objects[0][0].owner.shown) == 1
 
 
 def test_another_model_is_shown_for_its_object(page: Page) -> None:

@@ -233,7 +233,7 @@ def check_fit_agrees(session: Session, case: Scripted, capsys: pytest.CaptureFix
     live, _ = session.live(session.photos[0])
     page = live.result
     assert page is not None
-    path = session.photos[0].files.observation
+    path = session.photos[0].owner.files.observation
     assert main(["fit", str(path), "--json", "--out", str(path.parent / "x")]) == 0
     command = json.loads(capsys.readouterr().out)
     assert page.covariance is not None

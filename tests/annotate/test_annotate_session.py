@@ -265,7 +265,7 @@ def test_click_beside_the_model_says_so_and_changes_nothing(case: Case) -> None:
     session = case.open()
     outcome = perform(session, 0, {"do": "pick", "origin": [0, 0, 3], "direction": [0, 0, 1]})
     assert outcome.message == "That click missed the model."
-    assert not session.photos[0].history.before
+    assert not session.photos[0].owner.history.before
 
 
 def test_contradicting_pair_is_marked(case: Case) -> None:

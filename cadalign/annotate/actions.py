@@ -207,7 +207,7 @@ def rename(state: PhotoState, *, pair: Index, name: Text) -> ActionOutcome:
 def identify(state: PhotoState, *, pair: Index, label: Index | Text) -> ActionOutcome:
     """Say which keypoint of the category's shape the model point of a pair is."""
     keypoint, shape = state.document.pair(pair).keypoint, state.session.shape
-    if keypoint is None or shape is None or label not in shape.ids:
+    if keypoint is None or label not in shape.ids:
         what = f"{quote(label)} is no keypoint of the shape"
         raise InputError(what, where="label", fix="choose one")
     registry = state.model.registry

@@ -13,6 +13,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.model import Model
+from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative
 from cadalign.geometry.camera import Camera
@@ -143,11 +144,11 @@ def clicks_needed(
 
 def _spread_of(model: Model | ShapeModel, count: int) -> FloatArray:
     """Standard deviations (count,) of an object's keypoints along an axis [model units]."""
-    if isinstance(model, Model):
-        return np.full(count, float(model.shape_sigma or 0.0))
-    mean = sum(part.weight * part.mean[:count] for part in model.components)
+    prior = prior_of(model)
+    parts = list(zip(prior.weights, prior.components, strict=True))
+    mean = sum(weight * part.mean[:count] for weight, part in parts)
     squares = np.zeros(count)
-    for part in model.components:
-        own = (part.modes[:, :count] ** 2).sum(axis=0) + part.residual_sigma**2
-        squares += part.weight * (own + (part.mean[:count] - mean) ** 2).mean(axis=1)
+    for weight, part in parts:
+        own = (part.modes[:, :count] ** 2).sum(axis=0) + part.spread[:count, None] ** 2
+        squares += weight * (own + (part.mean[:count] - mean) ** 2).mean(axis=1)
     return np.sqrt(squares)

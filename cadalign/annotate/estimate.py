@@ -68,8 +68,8 @@ class LiveAlignment:
             except DegenerateError as error:
                 reason = error
                 continue
-            if known.sigma is not None:
-                sigma, options = known.sigma, {"sigma": known.sigma}
+            if (stored := observation.fit_options.get("sigma")) is not None:
+                sigma, options = stored, {"sigma": stored}
             text = assumed.format(reason="" if reason is None else reason.what)
             found = cls(result, text, attempt, sigma, options)
             if attempt.is_by_mask:  # with the mask's candidates that the pairs leave

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.gravity import vertical_direction
 from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
 from cadalign.io.images import read_mask
 from cadalign.io.observation import Observation
@@ -27,6 +28,7 @@ _SHIFT = 4  # bits of parts of a pixel in OpenCV's drawing
 _LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
 _LEAST_BOX = 4.0  # [px]
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
+_ANY_PITCH = 1e6  # standard deviation of a camera's pitch of which nothing is known [degrees]
 _LEAST_UP_SIGMA = 0.5  # objects stand on floors that are not quite level [degrees]
 _MOST_UP_SIGMA = 20.0  # [degrees]
 
@@ -159,9 +161,8 @@ class MarkedEvidence:
 def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray, float] | None:
     """Direction of vertical edges in the camera, upwards, and its standard deviation [degrees].
 
-    Each edge and the camera's centre span a plane that holds the direction: it is the least
-    singular vector of the planes' normals, weighted by the edges' lengths. None for fewer than two
-    edges, or edges that don't determine it.
+    The deviation is that of the worst direction, larger where the edges disagree by more than the
+    noise of their ends. None for fewer than two edges, or edges that don't determine it.
 
     Examples
     --------
@@ -171,27 +172,16 @@ def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray,
     >>> np.round(up, 6).tolist()
     [0.0, -1.0, 0.0]
     """
-    if len(verticals) < 2:
+    redundancy = len(verticals) - 2
+    if redundancy < 0:
         return None
-    ends = np.array(verticals, dtype=float)
-    rays = np.ones((len(ends), 2, 3))
-    rays[:, :, :2] = camera.normalize(ends.reshape(-1, 2)).reshape(-1, 2, 2)
-    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    normals = np.cross(rays[:, 0], rays[:, 1])
-    angle = np.linalg.norm(normals, axis=1, keepdims=True)
-    # A plane turns about its edge by the noise of both ends over the edge's length.
-    sigma = math.sqrt(2) * _END_SIGMA / camera.fx / np.maximum(angle, 1e-12)
-    _, values, directions = np.linalg.svd(normals / np.maximum(angle, 1e-12) / sigma)
-    redundancy = len(ends) - 2
-    if len(values) < 2 or not values[1] > 0:
+    try:
+        up, covariance, chi_square = vertical_direction(camera, verticals, _END_SIGMA, _ANY_PITCH)
+    except InputError:
         return None
-    least = values[2] if len(values) > 2 else 0.0
-    factor = math.sqrt(max(1.0, least**2 / redundancy)) if redundancy else 1.0
-    up_sigma = max(_LEAST_UP_SIGMA, math.degrees(factor / values[1]))
-    if up_sigma > _MOST_UP_SIGMA:
-        return None
-    up = directions[2] * (-1.0 if directions[2][1] > 0 else 1.0)
-    return up, float(up_sigma)
+    factor = max(1.0, chi_square / redundancy) if redundancy else 1.0
+    sigma = math.sqrt(factor * float(np.linalg.eigvalsh(covariance)[-1]))
+    return None if sigma > _MOST_UP_SIGMA else (up, max(_LEAST_UP_SIGMA, sigma))
 
 
 def draw_mask(drawing: MaskDrawing, width: int, height: int) -> BoolArray:

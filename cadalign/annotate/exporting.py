@@ -116,7 +116,7 @@ def _aligned_object(state: PhotoState) -> AlignedObject | None:
     if live.result is None or live.wireframe is None:
         return None
     lines, cad = live.wireframe, state.model.cad
-    mesh = cad.scene.mesh if state.session.shape is None else lines.scene.mesh
+    mesh = lines.scene.mesh if state.session.shape.is_estimated else cad.scene.mesh
     images = [view.image for view in state.observation().views]
     result = replace(live.result, model=None)  # or the mesh, which is warped, would be once more
     return object_of(result, mesh=mesh, images=images, name=state.model.path.stem)

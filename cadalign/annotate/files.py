@@ -143,7 +143,7 @@ class AnnotationFiles:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
-    def read(self, photo: Path, model: OpenedModel, shape: ObjectShape | None = None) -> Stored:
+    def read(self, photo: Path, model: OpenedModel, shape: ObjectShape) -> Stored:
         """Read an earlier session's annotation; new model points are added to the registry."""
         registry, tolerance = model.registry, SAME_PLACE * model.cad.diagonal
         stored = Stored()
@@ -249,22 +249,22 @@ class AnnotationFiles:
         document = _with_halves(stored.document, unfinished.pairs, registry)
         return replace(stored, document=document, views=tuple(views))
 
-    def _warn_of_options(self, stored: Stored, shape: ObjectShape | None) -> None:
+    def _warn_of_options(self, stored: Stored, shape: ObjectShape) -> None:
         """Warn of stored options of the fit that the page does not use."""
         observation = stored.observation
         assert observation is not None
-        ours = {"sigma": stored.sigma, "shape_sigma": None if shape is None else shape.sigma}
+        ours = {"sigma": stored.sigma, "shape_sigma": shape.sigma}
         options = dict(observation.fit_options)
         for name in ("focal_prior", "image"):
             options.pop(name, None)
-        if shape is None and options.pop("stretch_sigma", None) is not None:
+        if not shape.is_estimated and options.pop("stretch_sigma", None) is not None:
             options.pop("sigma", None)  # the annotator's own
         others = [
             name
             for name, value in options.items()
             if value != ours.get(name) and not (name == "sigma" and not isinstance(value, float))
         ]
-        if observation.shape is not None and (shape is None or shape.path is None):
+        if observation.shape is not None and shape.path is None:
             others.append(f"shape {observation.shape}")
         if others:
             logger.warning(

@@ -15,14 +15,12 @@ from cadalign.annotate.models import KeypointRegistry, ObjectShape
 from cadalign.annotate.problem import LEAST_JOINT_PAIRS, LEAST_PAIRS, Known
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Alternative
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.layers import confidence_regions
-from cadalign.shapes.model import ShapeModel
 
 _LABELS = {
     "mask": "mask",
@@ -54,16 +52,16 @@ def live_alignment(
     result, problem, shape = estimate.result, estimate.problem, known.shape
     assert result is not None
     assert problem is not None
-    counts = known_points(shape, points)
+    counts = shape.known(points)
     free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
-    lines, carried = _warped(wireframe, result, result.ids, problem.model, known, free)
+    lines, carried = _warped(wireframe, result, result.ids, known, free)
     camera = result.cameras[place]
     residuals = np.empty((len(points), 2))
     residuals[counts] = result.views[place].residuals
     residuals[~counts] = camera.project(result.poses[place].apply(carried)) - uv[~counts]
     rows = np.flatnonzero(counts)
     judged = problem if problem.exact else problem.at_focal(result.cameras)
-    prior = known.stretch or np.inf
+    prior = observation.fit_options.get("stretch_sigma") or np.inf
     message = _assumed_text(known.assumed_focal, camera) or estimate.message
     return replace(
         estimate,
@@ -74,34 +72,27 @@ def live_alignment(
         residuals=residuals,
         outliers={int(rows[row]): off for row, off in judged.contradicting(place).items()},
         wireframe=lines,
-        frames=_frames(estimate, known, wireframe, problem.model),
+        frames=_frames(estimate, known, wireframe),
         prior_lengths=(
-            np.array([0.0, prior, prior]) if shape is None else shape.length_sigmas(problem.model)
+            shape.length_sigmas(problem.model)
+            if shape.is_estimated
+            else np.array([0.0, prior, prior])
         ),
         also_used=evidence_labels(observation),
     )
 
 
-def _frames(
-    live: LiveAlignment, known: Known, wireframe: Wireframe, model: Model | ShapeModel
-) -> tuple[Wireframe, ...]:
+def _frames(live: LiveAlignment, known: Known, wireframe: Wireframe) -> tuple[Wireframe, ...]:
     """The model's lines warped to each of the mask's candidates that are left, if several are."""
     candidates, left = live.candidates, np.flatnonzero(live.chances)
     if candidates is None or len(left) < 2:
         return ()
     ids, nothing = candidates.result.ids, np.empty((0, 3))
     every = (candidates.every[number] for number in left)
-    return tuple(_warped(wireframe, each, ids, model, known, nothing)[0] for each in every)
+    return tuple(_warped(wireframe, each, ids, known, nothing)[0] for each in every)
 
 
-def known_points(shape: ObjectShape | None, points: Sequence[ModelKeypoint]) -> BoolArray:
-    """The points (n,) of which pairs count."""
-    return np.array([shape is None or shape.knows(point) for point in points], dtype=bool)
-
-
-def missing_text(
-    counts: BoolArray, shape: ObjectShape | None, *, is_plain: bool, has_others: bool
-) -> str:
+def missing_text(counts: BoolArray, shape: ObjectShape, *, is_plain: bool, has_others: bool) -> str:
     """Say how many more pairs the first alignment needs; empty if none.
 
     ``counts`` (n,) are the complete pairs that count, ``is_plain`` says that nothing else is used.
@@ -110,7 +101,7 @@ def missing_text(
     if missing <= 0:
         return ""
     text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
-    if not counts.all() and shape is not None and shape.learned is not None:
+    if not counts.all() and shape.learned is not None:
         text += f": keypoints that {shape.learned.category} has, marked by rings on the model"
     return f"{text} of this photo" if has_others else text
 
@@ -130,24 +121,19 @@ def _warped(
     wireframe: Wireframe,
     result: Result | Alternative,
     ids: Sequence[Any],
-    model: Model | ShapeModel,
     known: Known,
     free: FloatArray,
 ) -> tuple[Wireframe, FloatArray]:
     """The model warped such that its known keypoints come to the estimated ones, with points."""
-    if known.shape is None:
+    if not known.shape.is_estimated:
         return wireframe, free
-    if isinstance(model, Model):
-        source, target = np.asarray(model.points_3d), result.points_3d
-    else:
-        rows = [row for row, label in enumerate(ids) if label in known.anchors]
-        source = np.array([known.anchors[ids[row]].xyz for row in rows])
-        target = result.points_3d[rows]
-    return wireframe.warped(source, target, result.bounds, carried=free)
+    rows = [row for row, label in enumerate(ids) if label in known.anchors]
+    source = np.array([known.anchors[ids[row]].xyz for row in rows]).reshape(-1, 3)
+    return wireframe.warped(source, result.points_3d[rows], result.bounds, carried=free)
 
 
 def drawing_of(
-    live: LiveAlignment, shape: ObjectShape | None, registry: KeypointRegistry, used: frozenset[int]
+    live: LiveAlignment, shape: ObjectShape, registry: KeypointRegistry, used: frozenset[int]
 ) -> dict[str, Any]:
     """Box and edges of the model and, for an own shape, its keypoints with regions that hold them.
 
@@ -164,7 +150,7 @@ def drawing_of(
         "regions": [],
         "faint_regions": [],
     }
-    if shape is None or live.place or live.frames:
+    if not shape.is_estimated or live.place or live.frames:
         return drawing
     in_camera = result.alignment.apply(result.points_3d)
     names = {shape.id_of(point): (point.name, number in used) for number, point in registry}
@@ -226,12 +212,12 @@ class Fact:
     note: str
 
 
-def facts_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[Fact, ...]:
+def facts_of(live: LiveAlignment, shape: ObjectShape) -> tuple[Fact, ...]:
     """Stretch or lengths, pose and residuals, with standard deviations."""
     result = live.result
     if result is None:
         return ()
-    in_lengths = shape is not None or "x" in result.stretched_axes
+    in_lengths = shape.is_estimated or "x" in result.stretched_axes
     axes = "xyz" if in_lengths else result.stretched_axes
     facts = [_extent(live, axis, shape, in_lengths=in_lengths) for axis in axes]
     if result.std is not None:
@@ -244,14 +230,14 @@ def facts_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[Fac
     return tuple(facts)
 
 
-def notes_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[str, ...]:
+def notes_of(live: LiveAlignment, shape: ObjectShape) -> tuple[str, ...]:
     """Assumptions, pairs that do not count, alternative alignments and warnings."""
     result = live.result
     if result is None:
         return ()
     notes = [live.message] if live.message else []
     carried = int((~live.counts).sum())
-    if carried and shape is not None and shape.learned is not None:
+    if carried and shape.learned is not None:
         notes.append(
             f"{carried} pair{'s do' if carried > 1 else ' does'} not count: the shape of "
             f"{shape.learned.category} has no such keypoint. Shown is where the warped model puts "
@@ -259,15 +245,16 @@ def notes_of(live: LiveAlignment, shape: ObjectShape | None = None) -> tuple[str
         )
     others = len(result.alternatives)
     if others and len(live.counts):  # those of a mask alone are shown
+        how = "nearly as well" if shape.is_estimated else "as well"
         notes.append(
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
-            f"{'as well' if shape is None else 'nearly as well'}: one more pair tells them apart"
+            f"{how}: one more pair tells them apart"
         )
     notes += live.contradictions
     return (*notes, *(warning.replace("+-", "± ") for warning in result.warnings))
 
 
-def _extent(live: LiveAlignment, axis: str, shape: ObjectShape | None, *, in_lengths: bool) -> Fact:
+def _extent(live: LiveAlignment, axis: str, shape: ObjectShape, *, in_lengths: bool) -> Fact:
     """Length of the object along an axis, or its stretch."""
     result, row = live.result, "xyz".index(axis)
     assert result is not None
@@ -280,7 +267,7 @@ def _extent(live: LiveAlignment, axis: str, shape: ObjectShape | None, *, in_len
         value = float(np.ptp(result.bounds, axis=0)[row] * result.alignment.scale[row])
     if not value > 0 or relative > _UNCERTAIN:
         return Fact(label, *_UNDETERMINED)
-    average = "the model" if shape is None else shape.average
+    average = shape.average
     if relative == 0:
         return Fact(label, f"{value:.3g}{unit}", f"{average}'s, taken as known")
     text = f"{value:.3g} ± {short(value * relative)}{unit}"
@@ -305,11 +292,11 @@ def _rotation(sigma: float) -> Fact:
     return Fact("Rotation", f"known to ± {short(sigma)}°", "")
 
 
-def _distance(live: LiveAlignment, shape: ObjectShape | None) -> Fact:
+def _distance(live: LiveAlignment, shape: ObjectShape) -> Fact:
     assert live.result is not None
     translation, covariance = live.result.alignment.translation, live.result.covariance
     distance = float(np.linalg.norm(translation))
-    learned = None if shape is None else shape.learned
+    learned = shape.learned
     units = {"m": "", "diagonal": "diagonals of the object's box"}
     note = "model units" if learned is None else units.get(learned.unit, learned.unit)
     if covariance is None or not distance > 0:
@@ -340,10 +327,9 @@ def _focal(live: LiveAlignment) -> Fact:
     return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", note)
 
 
-def _unit(shape: ObjectShape | None) -> str:
+def _unit(shape: ObjectShape) -> str:
     """Unit of lengths, after a number; empty for the model's own."""
-    learned = None if shape is None else shape.learned
-    return " m" if learned is not None and learned.unit == "m" else ""
+    return " m" if shape.learned is not None and shape.learned.unit == "m" else ""
 
 
 def short(value: float) -> str:

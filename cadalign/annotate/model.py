@@ -17,6 +17,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import FaceArray, RayCaster
+from cadalign.geometry.sampling import farthest_rows, random_points
 from cadalign.geometry.simplify import mesh_edges, simplify
 from cadalign.render.drawing.canvas import bytes_from_linear
 from cadalign.render.raycast.surface import coincident_faces
@@ -120,17 +121,9 @@ class ClickableModel:
         used, first = np.unique(mesh.faces, return_index=True)
         step = -(-len(used) // _SAMPLED_FROM)
         used, first = used[::step], first[::step]
-        points = mesh.vertices[used]
-        gaps = np.linalg.norm(points - self.center, axis=1)
-        chosen: list[int] = []
-        for _ in range(min(_SAMPLES, len(points))):
-            farthest = int(np.argmax(gaps))
-            if chosen and gaps[farthest] <= _NEAREST_SAMPLES * self.diagonal:
-                break
-            own = np.linalg.norm(points - points[farthest], axis=1)
-            gaps = np.minimum(gaps, own) if chosen else own
-            chosen.append(farthest)
-        return tuple(self._on_triangle(int(first[row]) // 3, points[row]) for row in chosen)
+        points, apart = mesh.vertices[used], _NEAREST_SAMPLES * self.diagonal
+        rows = farthest_rows(points, _SAMPLES, center=self.center, apart=apart)
+        return tuple(self._on_triangle(int(first[row]) // 3, points[row]) for row in rows)
 
     @cached_property
     def sample_points(self) -> FloatArray:
@@ -356,25 +349,15 @@ class MirrorPlanes:
     @classmethod
     def of_mesh(cls, mesh: Mesh, center: FloatArray, diagonal: float) -> MirrorPlanes:
         """Compare samples of the surface with their mirror images."""
-        triangles = mesh.triangles
-        a, b, c = triangles.transpose(1, 0, 2)
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        rng = np.random.default_rng(0)
-        if not area.sum() > 0:
-            return cls(triangles, center, diagonal, (), cKDTree(a), np.arange(len(a)))
-        number = rng.choice(len(triangles), _MIRROR_SAMPLES, p=area / area.sum())
-        u, v = rng.random((2, _MIRROR_SAMPLES, 1))
-        flip = u + v > 1
-        u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
-        points = a[number] + u * (b - a)[number] + v * (c - a)[number]
+        number, points = random_points(mesh, _MIRROR_SAMPLES)
         tree = cKDTree(points)
         axes = []
-        for axis in _MIRROR_AXES:
+        for axis in _MIRROR_AXES if len(points) else ():
             image = _reflect(points[:_MIRROR_TESTED], axis, center)
             gaps, _ = tree.query(image, distance_upper_bound=_MIRROR_NEAR * diagonal)
             if np.isfinite(gaps).mean() >= _MIRROR_SHARE:
                 axes.append(axis)
-        return cls(triangles, center, diagonal, tuple(axes), tree, number)
+        return cls(mesh.triangles, center, diagonal, tuple(axes), tree, number)
 
     def image(self, point: Iterable[float]) -> tuple[int, FloatArray] | None:
         """The mirror image of a point: its triangle and place (3,) on the surface.

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.names import keypoints_file
 from cadalign.annotate.options import SessionOptions
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.model import Model
@@ -22,6 +23,9 @@ from cadalign.geometry.mesh import Mesh
 from cadalign.io.meshes.load import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
+
+if TYPE_CHECKING:
+    from cadalign.annotate.document import Pair
 
 SAME_PLACE = 1e-6
 """Largest distance of two points that count as one [diagonals]."""
@@ -138,9 +142,9 @@ class KeypointRegistry:
 
 @dataclass(frozen=True, eq=False)
 class ObjectShape:
-    """A category's learned shape with its file, or else the ``sigma`` of a similar model.
+    """Objects' shape: a category's learned one with its file, a similar model's, or the model's.
 
-    ``sigma`` is the ``shape_sigma`` of `cadalign.Model`.
+    ``sigma`` is the ``shape_sigma`` of `cadalign.Model`, for a similar one.
     """
 
     learned: ShapeModel | None = None
@@ -148,11 +152,9 @@ class ObjectShape:
     sigma: float | None = None
 
     @classmethod
-    def open(cls, options: SessionOptions) -> ObjectShape | None:
-        """Read the shape that the options name; None without one. Raises a CadalignError."""
+    def open(cls, options: SessionOptions) -> ObjectShape:
+        """Read the shape that the options name. Raises a CadalignError."""
         path, sigma = options.shape, options.shape_sigma
-        if path is None and sigma is None:
-            return None
         if path is not None and sigma is not None:
             raise InputError(
                 "--shape has learned how far objects of the category differ",
@@ -161,13 +163,18 @@ class ObjectShape:
             )
         if path is not None:
             return cls(ShapeModel.open(path), path)
-        if not (sigma and 0 < sigma < np.inf):
+        if sigma is not None and not 0 < sigma < np.inf:
             raise InputError(
                 f"{sigma:g} is not a standard deviation",
                 where="--shape-sigma",
                 fix="give a positive number",
             )
         return cls(sigma=sigma)
+
+    @property
+    def is_estimated(self) -> bool:
+        """True if objects have a shape of their own, not that of the stretched model."""
+        return self.learned is not None or self.sigma is not None
 
     @property
     def ids(self) -> tuple[KeypointId, ...]:
@@ -204,9 +211,9 @@ class ObjectShape:
         label: KeypointId | None = point.name if self.is_named else point.semantic_id
         return label if label in self.ids else None
 
-    def knows(self, point: ModelKeypoint) -> bool:
-        """True if pairs of this point count."""
-        return self.id_of(point) is not None
+    def known(self, points: Sequence[ModelKeypoint]) -> BoolArray:
+        """The points (n,) of which pairs count."""
+        return np.array([self.id_of(point) is not None for point in points], dtype=bool)
 
     def model_with(
         self, points: Iterable[ModelKeypoint], mesh: Mesh, *, up_axis: str | None = "y"
@@ -268,6 +275,10 @@ class OpenedModel:
         self.wireframe = Wireframe.of_model(self.cad)
         self._mirrored: dict[int, ModelKeypoint | None] = {}
 
+    def points_of(self, pairs: Iterable[Pair]) -> list[ModelKeypoint]:
+        """The model points of pairs that have one."""
+        return [self.registry[pair.keypoint] for pair in pairs if pair.keypoint is not None]
+
     def mirrored(self, keypoint: int) -> ModelKeypoint | None:
         """The mirror image of a keypoint; found once, since keypoints don't move."""
         if keypoint not in self._mirrored:
@@ -301,14 +312,14 @@ class Models:
         folder: Path,
         *,
         keypoints: Path | None = None,
-        shape: ObjectShape | None = None,
+        shape: ObjectShape,
         choice: ModelChoice | None = None,
     ) -> None:
         self.paths: list[Path] = []
         self._folder = folder
         self._keypoints = keypoints
         self._choice = choice
-        self._reserved = frozenset(() if shape is None else shape.reserved)
+        self._reserved = frozenset(shape.reserved)
         if choice is not None:
             self._reserved |= choice.ids
         self._models: dict[int, OpenedModel] = {}
@@ -323,9 +334,6 @@ class Models:
         if number not in self._models:
             self._models[number] = self._open(self.paths[number])
         return self._models[number]
-
-    def __len__(self) -> int:
-        return len(self.paths)
 
     @property
     def opened(self) -> tuple[OpenedModel, ...]:

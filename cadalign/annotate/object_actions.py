@@ -50,7 +50,7 @@ def add_object(state: PhotoState, *, name: str = "", model: Index | None = None)
     like = states[0]
     name = _free_name(name, states, None)
     chosen = state.model if model is None else session.models[model]
-    if session.shape is not None and session.shape.learned is not None and chosen is not like.model:
+    if session.shape.learned is not None and chosen is not like.model:
         fix = "start without --shape for objects of several models"
         raise InputError(
             "the shape is that of one category, with one model", where="model", fix=fix
@@ -62,7 +62,7 @@ def add_object(state: PhotoState, *, name: str = "", model: Index | None = None)
         for number in range(2, len(states) + 3)
         if number not in taken and not object_file(first, number).exists()
     )
-    stretch = LIKELY_STRETCH if session.shape is None else None
+    stretch = None if session.shape.is_estimated else LIKELY_STRETCH
     priors = Priors(stretch, like.intrinsics.likely_focal)
     history = History(AnnotationDocument(focal=like.document.focal, priors=priors, name=name))
     alike = next((each for each in session.owners if each.model is chosen), like.owner)
@@ -162,7 +162,7 @@ def model(state: PhotoState, *, category: Text, model: Text) -> ActionOutcome | 
     if new is old:
         return None
     if session.ready:
-        new.prepare(has_shape=session.shape is not None)
+        new.prepare(has_shape=session.shape.is_estimated)
     carried = carry_keypoints(old.registry, new.registry, session.choice.ids_on(old.path))
     before = len(state.document.keypoints)
     owner.history = owner.history.changed(lambda document: _carried(document, carried))

@@ -194,12 +194,9 @@ class PhotoState:
     @property
     def known_pairs(self) -> tuple[Pair, ...]:
         """Complete pairs whose keypoints the shape knows; all of them without a shape."""
-        shape, registry = self.session.shape, self.model.registry
-        return tuple(
-            pair
-            for pair in self.document.complete_pairs
-            if shape is None or shape.knows(registry[pair.keypoint or 0])
-        )
+        pairs = self.document.complete_pairs
+        known = self.session.shape.known(self.model.points_of(pairs))
+        return tuple(pair for pair, counts in zip(pairs, known, strict=True) if counts)
 
     @property
     def unfinished_pairs(self) -> list[dict[str, Any]]:
@@ -267,14 +264,16 @@ class PhotoState:
     def observation(
         self, *, fit_options: Mapping[str, Any] | None = None, to_write: bool = False
     ) -> Observation:
-        """The observation of the object.
+        """The observation of the object, with the stored noise and the priors beside options.
 
         Other photos without anything that counts are left out. ``to_write`` leaves out focal
         lengths that are not known, and adds what is unfinished.
         """
         owner, shape, document = self.owner, self.session.shape, self.document
-        marks, options = document.evidence, dict(fit_options or {})
-        if shape is not None and shape.sigma is not None:
+        marks, likely = document.evidence, self.intrinsics.likely_focal
+        options: dict[str, Any] = {} if owner.sigma is None else {"sigma": owner.sigma}
+        options |= {**document.priors.fit_options(likely), **(fit_options or {})}
+        if shape.sigma is not None:
             options["shape_sigma"] = shape.sigma
         if marks.photo:
             options["image"] = True
@@ -293,7 +292,7 @@ class PhotoState:
             model=self.model.path,
             fit_options=options,
             size=None if marks.lengths is None else marks.lengths.size,
-            shape=None if shape is None else shape.path,
+            shape=shape.path,
             symmetry=owner.symmetry,
             init=marks.start.alignment if marks.start is not None and self.begins else None,
             object_name=document.name or None,
@@ -303,8 +302,8 @@ class PhotoState:
 
     def image(self, *, to_write: bool = False) -> ObservedImage:
         """The photo with its pairs that count and what is known beside them."""
-        registry, pairs, document = self.model.registry, self.known_pairs, self.document
-        keypoints = [pair.keypoint for pair in pairs if pair.keypoint is not None]
+        pairs, document = self.known_pairs, self.document
+        points = self.model.points_of(pairs)
         depths = [np.nan if pair.depth is None else pair.depth for pair in pairs]
         has_depths = bool(np.isfinite(depths).any())
         marks = document.evidence.as_written(self.camera, self._drawn_mask())
@@ -312,12 +311,12 @@ class PhotoState:
         if not has_depths and evidence.depth is None:  # all keypoints with depths may be gone
             evidence = replace(evidence, depth_sigma=None)
         return ObservedImage(
-            points_3d=registry.xyz(keypoints),
+            points_3d=np.array([point.xyz for point in points], dtype=float).reshape(-1, 3),
             points_2d=np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2),
             camera=self.intrinsics.to_write(document.focal) if to_write else self.camera,
             sigma=filled(pair.sigma for pair in pairs),
-            ids=np.array(keypoints, dtype=np.int64),
-            names=tuple(registry[keypoint].name for keypoint in keypoints),
+            ids=np.array([point.semantic_id for point in points], dtype=np.int64),
+            names=tuple(point.name for point in points),
             scores=filled(pair.score for pair in pairs),
             image=self.photo.path,
             depths=np.array(depths) if has_depths else None,

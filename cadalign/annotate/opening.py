@@ -177,7 +177,7 @@ def _open_object(
         marks = _with_options(marks, options)
     intrinsics, focal = _intrinsics(photo, None if seen is None else seen.camera, camera)
     priors = stored.priors_or(Priors(LIKELY_STRETCH, intrinsics.likely_focal))
-    if session.shape is not None:  # which has a prior of its own on the stretch
+    if session.shape.is_estimated:  # with a prior of its own on the stretch
         priors = replace(priors, stretch=None)
     document = replace(stored.document, focal=focal, priors=priors, evidence=marks)
     owner = AnnotatedObject(session, model, files, History(document), stored.sigma)

@@ -173,14 +173,14 @@ def _priors(state: PhotoState) -> dict[str, Any]:
         "likely": 100 * LIKELY_STRETCH,
         "focal": priors.focal is not None,
         "about": f"{likely.focal:.0f} px ± {100 * likely.relative_sigma:.0f} % ({source})",
-        "has_stretch": state.session.shape is None,
+        "has_stretch": not state.session.shape.is_estimated,
         "has_focal": state.is_first and state.estimates_focal,
     }
 
 
 def _shape(state: PhotoState) -> dict[str, Any] | None:
     shape = state.session.shape
-    if shape is None:
+    if not shape.is_estimated:
         return None
     known = {shape.id_of(point) for _, point in state.model.registry}
     return {
@@ -257,12 +257,12 @@ def _pairs(state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
                 if gaps.min() > MIRRORED * cad.diagonal:  # or there is a pair already
                     entry["mirrored"] = cad.to_display(image.xyz).tolist()
             in_camera = np.array([point.xyz])
-            if not pair.uv and session.shape is None and live.result is not None:
+            if not pair.uv and not session.shape.is_estimated and live.result is not None:
                 in_camera = live.alignment.apply(in_camera)
                 if in_camera[0, 2] > 0:
                     entry["expected"] = live.camera.project(in_camera)[0].tolist()
             entry["name"], entry["xyz"] = point.name, cad.to_display(point.xyz).tolist()
-            entry["counts"] = session.shape is None or session.shape.knows(point)
+            entry["counts"] = session.shape.id_of(point) is not None
         if pair.complete:
             if live.result is not None:
                 residual = live.residuals[row]
@@ -294,7 +294,7 @@ def _alignment(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
         "eye": cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
         "focal": camera.fx,
         "intrinsics": {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy},
-        "camera_from_page": matrix.ravel().tolist() if session.shape is None else None,
+        "camera_from_page": None if session.shape.is_estimated else matrix.ravel().tolist(),
         "rms": result.rms,
         **drawing_of(live, session.shape, state.model.registry, state.document.keypoints),
     }

@@ -22,12 +22,11 @@ from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.documents import Document, in_file, read_document
 from cadalign.io.files import read_bytes, reading, write_json
-from cadalign.io.images import open_photo, photo_size, read_photo
+from cadalign.io.images import open_photo, photo_size
 
 Pixel = tuple[float, float]
 Mark = Literal["done", "skipped"]
 State = Literal["to do", "begun", "done", "skipped"]
-STATES: tuple[State, ...] = ("to do", "begun", "done", "skipped")
 FILE = "cadalign.worklist.json"
 _FORMAT = "cadalign work list"
 ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
@@ -57,10 +56,6 @@ class PhotoFile:
     def open(cls, path: Path) -> PhotoFile:
         """Read a photo's size; raises DataError if it is missing or no photo."""
         return cls(path, *photo_size(path))
-
-    def pixels(self) -> npt.NDArray[np.uint8]:
-        """The upright photo, (h, w, 3); raises DataError if the file is damaged."""
-        return read_photo(self.path)
 
     def thumbnail(self) -> bytes:
         """Encode the upright photo as a small JPEG; raises DataError if it is damaged."""

@@ -57,29 +57,25 @@ _FOCAL_ASSUMED = "The focal length is assumed: add a pair elsewhere to have it e
 class Known:
     """Knowledge of an object beside its observation."""
 
-    shape: ObjectShape | None  # the object's own shape; None for the stretched model
+    shape: ObjectShape
     mesh: Mesh  # the model's
-    stretch: float | None = None  # standard deviation of a prior on the logarithms of the scales
-    sigma: float | None = None  # stored standard deviation of all pairs [px]
     anchors: Mapping[Any, ModelKeypoint] = field(default_factory=dict)
     """The model's keypoints that the shape knows, by their ids there."""
     assumed_focal: tuple[str, ...] = ()
     """Photos whose focal length is neither known nor estimated, this one by an empty name."""
     estimates_focal: bool = False  # estimate the focal lengths of all photos
     focal_prior: FocalPrior | None = None  # on these
-    uses_photos: bool = False  # as evidence
     by_mask: dict[Camera, MaskCandidates] = field(default_factory=dict)
     """What the mask alone allows, by the camera; kept while nothing but pairs changes."""
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
         """The model that `cadalign fit` aligns to the observation."""
         shape = self.shape
-        if shape is not None and (shape.learned is not None or not observation.others):
+        if shape.learned is not None or (shape.is_estimated and not observation.others):
             points = self.anchors.values()
             return shape.model_with(points, self.mesh, up_axis=observation.up_axis)
-        sigma = None if shape is None else shape.sigma
-        options = FitOptions(stretch_sigma=self.stretch)
-        return model_of(observation, options=options, shape_sigma=sigma, mesh=self.mesh)
+        options = FitOptions(stretch_sigma=observation.fit_options.get("stretch_sigma"))
+        return model_of(observation, options=options, shape_sigma=shape.sigma, mesh=self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,20 +97,21 @@ class LiveProblem:
 
     @classmethod
     def of(cls, known: Known, observation: Observation) -> LiveProblem:
-        """The problem of an observation."""
-        model = known.model_for(observation)
-        views = views_of(observation, model, sigma=known.sigma, with_photos=known.uses_photos)
+        """The problem of an observation, with the options of a fit that it holds."""
+        options, model = observation.fit_options, known.model_for(observation)
+        sigma, has_photos = options.get("sigma"), bool(options.get("image"))
+        views = views_of(observation, model, sigma=sigma, with_photos=has_photos)
         own = any(view.sigma is not None for view in observation.views)
         noise = "given"
-        if known.shape is None and known.sigma is None and any(len(v.keypoint_ids) for v in views):
-            if known.stretch is not None and (observation.is_plain or not own):
+        is_shaped, is_marked = known.shape.is_estimated, any(len(v.keypoint_ids) for v in views)
+        if not is_shaped and sigma is None and is_marked:
+            has_prior = options.get("stretch_sigma") is not None
+            if has_prior and (observation.is_plain or not own):
                 noise = "settled"
-            elif known.stretch is None and observation.is_plain:
+            elif not has_prior and observation.is_plain:
                 noise = "scaled"
-        focal = known.estimates_focal
-        prior = known.focal_prior
-        init, by_mask = observation.init, known.by_mask
-        return cls(model, views, observation.size, noise, focal, prior, init, by_mask)
+        focal = known.estimates_focal, known.focal_prior
+        return cls(model, views, observation.size, noise, *focal, observation.init, known.by_mask)
 
     @property
     def exact(self) -> Model | None:

@@ -122,10 +122,10 @@ def proposals_of(state: PhotoState) -> tuple[Proposal, ...]:
     shape, ids, places = session.shape, [], []
     rows = {label: row for row, label in enumerate(result.ids)}
     for keypoint, point in state.model.registry:
-        label = None if shape is None else shape.id_of(point)
-        if shape is None or label in rows:
+        label = shape.id_of(point)
+        if not shape.is_estimated or label in rows:
             ids.append(keypoint)
-            places.append(point.xyz if shape is None else result.points_3d[rows[label]])
+            places.append(result.points_3d[rows[label]] if shape.is_estimated else point.xyz)
     points = np.array(places, dtype=float).reshape(-1, 3)  # on the object, before its stretch
     camera, pose = view.camera, view.alignment
     uncertain = np.full(len(points), np.inf)  # standard deviations by that of the pose [px]
@@ -134,7 +134,7 @@ def proposals_of(state: PhotoState) -> tuple[Proposal, ...]:
     covariances = predicted_covariances(slopes, view.covariance[:6, :6])
     uncertain[ahead] = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / 2)
     seen = np.flatnonzero(uncertain < _MOST_UNCERTAIN * camera.width)
-    if shape is None:
+    if not shape.is_estimated:
         seen = seen[visible_keypoints(state.model.cad.scene, points[seen], camera, pose)]
     pixels = camera.project(pose.apply(points[seen]))
     inside = camera.contains(pixels)
@@ -150,8 +150,7 @@ def _aligned(frames: Sequence[PhotoState], times: Sequence[float]) -> Result | N
     registry, shape, views = first.model.registry, first.session.shape, []
     for state, time in zip(frames, times, strict=True):
         pairs = state.known_pairs
-        points = [registry[pair.keypoint or 0] for pair in pairs]
-        ids = [each.semantic_id if shape is None else shape.id_of(each) for each in points]
+        ids = [shape.id_of(point) for point in state.model.points_of(pairs)]
         uv = [pair.uv for pair in pairs if pair.uv is not None]
         views.append(View(state.camera, uv, ids=ids, sigma=_CLICK_SIGMA, time=time))
     counts = [len(view.keypoint_ids) for view in views]
@@ -160,7 +159,7 @@ def _aligned(frames: Sequence[PhotoState], times: Sequence[float]) -> Result | N
     used = {label for view in views for label in view.keypoint_ids}
     known = [point for _, point in registry]
     model: Model | ShapeModel
-    if shape is not None:
+    if shape.is_estimated:
         model = shape.model_with(known, first.model.cad.scene.mesh)
     else:
         marked = [point for point in known if point.semantic_id in used]

@@ -27,12 +27,10 @@ def advice_state(session: Session, number: int, *, slot: int | None = None) -> d
         live, suggestion = session.live(state)
         document, revision = state.document, state.owner.history.revision
         pairs = document.complete_pairs
-        points_3d = state.model.registry.xyz(
-            pair.keypoint for pair in pairs if pair.keypoint is not None
-        )
+        points_3d = np.array([point.xyz for point in state.model.points_of(pairs)])
     answer: dict[str, Any] = {"revision": revision, "note": "", "now": "", "pieces": []}
     result = live.result
-    if result is None or live.provisional or live.also_used or session.shape is not None:
+    if result is None or live.provisional or live.also_used or session.shape.is_estimated:
         return answer
     if not document.focal.known:
         return answer | {"note": _FOCAL}

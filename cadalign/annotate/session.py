@@ -17,9 +17,8 @@ from cadalign.annotate.document import AnnotationDocument, history_path, write_h
 from cadalign.annotate.estimate import LiveAlignment, warm_up
 from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.live import known_points, live_alignment, missing_text
-from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.models import KeypointRegistry, Models, ObjectShape
+from cadalign.annotate.live import live_alignment, missing_text
+from cadalign.annotate.models import Models, ObjectShape
 from cadalign.annotate.objects import AnnotatedObject, PhotoState, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.problem import Known
@@ -28,6 +27,7 @@ from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.io.images import read_photo
 
 
 @dataclass(eq=False)
@@ -36,7 +36,7 @@ class Session:
 
     models: Models
     worklist: WorkList
-    shape: ObjectShape | None = None  # the objects', if it is estimated
+    shape: ObjectShape = field(default_factory=ObjectShape)
     choice: ModelChoice | None = None  # the library that objects' models are chosen from
     before_saving: Callable[[], None] = lambda: None
     """Raises a CadalignError where nothing may be written."""
@@ -57,21 +57,6 @@ class Session:
         self._pixels: tuple[Path, npt.NDArray[np.uint8]] | None = None
 
     @property
-    def model(self) -> ClickableModel:
-        """The first model."""
-        return self.models[0].cad
-
-    @property
-    def registry(self) -> KeypointRegistry:
-        """The keypoints of the first model."""
-        return self.models[0].registry
-
-    @property
-    def keypoints_path(self) -> Path:
-        """The file to which the first model's keypoints are written."""
-        return self.models[0].keypoints_path
-
-    @property
     def photos(self) -> list[PhotoState]:
         """The first object of each photo."""
         return [states[0] for states in self.objects]
@@ -90,10 +75,10 @@ class Session:
         """Compile or load the solvers, and prepare the models, until the session has ``ended``."""
         try:
             marked = (state for state in self.states if state.document.complete_pairs)
-            joint = self.shape is not None or not all(
+            joint = self.shape.is_estimated or not all(
                 state.observation().is_plain for state in marked
             )
-            has_shape = self.shape is not None
+            has_shape = self.shape.is_estimated
             steps = [partial(_load_solvers, joint=joint)]
             steps += [partial(model.prepare, has_shape=has_shape) for model in self.models.opened]
             for step in steps:
@@ -143,7 +128,7 @@ class Session:
         """The upright photo (h, w, 3); the last one asked for is kept."""
         path = state.photo.path
         if self._pixels is None or self._pixels[0] != path:
-            self._pixels = (path, state.photo.pixels())
+            self._pixels = (path, read_photo(path))
         return self._pixels[1]
 
     def live(self, state: PhotoState) -> tuple[LiveAlignment, Suggestion | None]:
@@ -172,7 +157,7 @@ class Session:
             return LiveAlignment(message=missing)
         estimate = self._alone(state).beside(state.label, others)
         pairs = state.document.complete_pairs
-        points = [state.model.registry[pair.keypoint or 0] for pair in pairs]
+        points = state.model.points_of(pairs)
         uv = np.array([pair.uv for pair in pairs], dtype=float).reshape(-1, 2)
         known, lines = self._known(state), state.model.wireframe
         return live_alignment(estimate, known, lines, *state.observed(), points, uv)
@@ -183,13 +168,12 @@ class Session:
         is_single = len(observation.views) == 1
         by_photo = observation.init is not None and "image" in observation.fit_options
         is_enough = observation.evidence.mask is not None or by_photo
-        has_mesh = self.shape is None or self.shape.has_mesh
-        if has_mesh and is_single and is_enough:
+        if self.shape.has_mesh and is_single and is_enough:
             return ""
         return missing_text(
-            known_points(self.shape, [state.model.registry[pair.keypoint or 0] for pair in pairs]),
+            self.shape.known(state.model.points_of(pairs)),
             self.shape,
-            is_plain=observation.is_plain and self.shape is None,
+            is_plain=observation.is_plain and not self.shape.is_estimated,
             has_others=not is_single,
         )
 
@@ -225,20 +209,17 @@ class Session:
     def _known(self, state: PhotoState) -> Known:
         shape, owner = self.shape, state.owner
         points = [point for _, point in state.model.registry]
-        own = {} if shape is None else {shape.id_of(point): point for point in points}
+        own = {shape.id_of(point): point for point in points}
         unknown = [view for view in state.used_views if not view.document.focal.known]
         is_estimated = bool(unknown) and state.estimates_focal
         names = ("" if view is state else view.photo.path.name for view in unknown)
         return Known(
             shape,
             state.model.cad.scene.mesh,
-            stretch=state.document.priors.stretch,
-            sigma=owner.sigma,
             anchors={label: point for label, point in own.items() if label is not None},
             assumed_focal=() if is_estimated else tuple(names),
             estimates_focal=is_estimated,
             focal_prior=owner.document.priors.focal,
-            uses_photos=owner.document.evidence.photo,
             by_mask=owner.allowed_by_mask,
         )
 
@@ -315,10 +296,7 @@ class Session:
         )
         # First the keypoints, which the observation names.
         owner.model.write_keypoints(used)
-        stored = {} if owner.sigma is None else {"sigma": owner.sigma}
-        priors = state.document.priors.fit_options(state.intrinsics.likely_focal)
-        options = {**stored, **priors, **live.fit_options}
-        owner.files.write(state.observation(fit_options=options, to_write=True))
+        owner.files.write(state.observation(fit_options=live.fit_options, to_write=True))
 
     def _write_fit(self, owner: AnnotatedObject) -> None:
         """Write the alignment of an object; raises DataError on failure.

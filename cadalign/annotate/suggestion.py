@@ -83,7 +83,7 @@ def suggest(
     model: ClickableModel,
     registry: KeypointRegistry,
     used: Collection[int],
-    shape: ObjectShape | None,
+    shape: ObjectShape,
 ) -> Suggestion | None:
     """Choose among the visible keypoints that are not used; if none is left, among corners.
 
@@ -94,9 +94,9 @@ def suggest(
         return None
     own = [point for number, point in registry if number not in used]
     if live.frames:
-        known = own if shape is None else [point for point in own if shape.knows(point)]
+        known = [point for point in own if shape.id_of(point) is not None]
         return _suggest_among(live, known, shape)
-    if shape is not None:
+    if shape.is_estimated:
         return _suggest_of_shape(live, own, shape)
     if "x" in result.stretched_axes:
         return None
@@ -145,13 +145,13 @@ def _suggest_of_shape(
 
 
 def _suggest_among(
-    live: LiveAlignment, own: Sequence[ModelKeypoint], shape: ObjectShape | None
+    live: LiveAlignment, own: Sequence[ModelKeypoint], shape: ObjectShape
 ) -> Suggestion | None:
     """Choose the keypoint whose click tells the mask's candidates apart best."""
     candidates, chances = live.candidates, live.chances
     if candidates is None or not own:
         return None
-    ids = [point.semantic_id if shape is None else shape.id_of(point) for point in own]
+    ids = [shape.id_of(point) for point in own]
     points = np.array([point.xyz for point in own])
     places, sigmas = candidates.predicted(ids, points)
     seen = np.zeros(sigmas.shape, dtype=bool)

@@ -174,7 +174,7 @@ def _export(options: SessionOptions, to: Path, form: str) -> int:
 
 def _save_and_say_where(session: Session) -> int:
     """Save what could not be saved before, elsewhere if need be; returns the exit code."""
-    folder = session.keypoints_path.parent.absolute()
+    folder = session.models[0].keypoints_path.parent.absolute()
     session.save_unsaved()
     if not session.unsaved:
         say(f"Saved in {folder}")

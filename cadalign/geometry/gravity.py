@@ -155,6 +155,14 @@ def up_from_vertical_edges(
     >>> np.sqrt(covariance.diagonal()).round(1).tolist()
     [0.2, 0.0, 30.0]
     """
+    up, covariance, _ = vertical_direction(camera, edges, sigma, pitch_sigma_deg)
+    return up, covariance
+
+
+def vertical_direction(
+    camera: Camera, edges: npt.ArrayLike, sigma: float, pitch_sigma_deg: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Direction and covariance of `up_from_vertical_edges`, and the chi-square of the edges."""
     as_positive(sigma, name="sigma")
     as_positive(pitch_sigma_deg, name="pitch_sigma_deg")
     shape = (2, 2) if np.ndim(edges) == 2 else (None, 2, 2)
@@ -176,7 +184,8 @@ def up_from_vertical_edges(
         fix = "give edges at different places in the photo"
         raise InputError("the edges have no one direction in common", where="edges", fix=fix)
     across = vectors[:, 1:] / np.sqrt(values[1:])
-    return up + 0.0, np.asarray(np.degrees(np.degrees(across @ across.T)))
+    covariance = np.asarray(np.degrees(np.degrees(across @ across.T)))
+    return up + 0.0, covariance, max(0.0, float(values[0]))
 
 
 def _plane(

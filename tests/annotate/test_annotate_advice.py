@@ -52,15 +52,15 @@ def test_ranking_is_that_of_the_evidence(case: Case) -> None:
     sigma = live.sigma * np.sqrt((stated[raw > 0] / raw[raw > 0]).mean())
     wanted = rank_evidence(
         Model(
-            points_3d=np.vstack([session.registry.xyz(keypoints), suggestion.point.xyz]),
+            points_3d=np.vstack([session.models[0].registry.xyz(keypoints), suggestion.point.xyz]),
             ids=[*keypoints, "next"],
-            mesh=session.model.scene.mesh,
+            mesh=session.models[0].cad.scene.mesh,
             stretch_sigma=LIKELY_STRETCH,
         ),
         View(camera, uv, ids=keypoints, sigma=sigma),
         alignment,
         candidates=["next"],
-        mask=cast_geometry(session.model.scene, camera, alignment).mask,
+        mask=cast_geometry(session.models[0].cad.scene, camera, alignment).mask,
     )
     found = [(each["kind"], each["worst"]) for each in answer["pieces"]]
     assert sorted(kind for kind, _ in found) == ["keypoint", "lengths", "mask", "view"]
@@ -81,7 +81,7 @@ def test_photo_of_any_size_gives_the_same_ranking(case: Case) -> None:
     live, suggestion = session.live(session.photos[0])
     assert isinstance(live, LiveAlignment)
     assert live.result is not None
-    points_3d = session.registry.xyz(keypoint for keypoint, _ in case.clicks[:6])
+    points_3d = session.models[0].registry.xyz(keypoint for keypoint, _ in case.clicks[:6])
     found = []
     for times in (2, 6):
         camera = case.instance.camera
@@ -97,7 +97,7 @@ def test_photo_of_any_size_gives_the_same_ranking(case: Case) -> None:
         marked = (points_3d, points_2d, np.full(6, float(times)))
         (view,) = live.result.views
         result = replace(live.result, views=(replace(view, camera=large),))
-        found.append(rank(session.model, marked, result, suggestion))
+        found.append(rank(session.models[0].cad, marked, result, suggestion))
     assert [each.kind for each in found[0]] == [each.kind for each in found[1]]
     worst = [[each.worst for each in one] for one in found]
     assert worst[0] == pytest.approx(worst[1], rel=1e-6)

@@ -178,7 +178,7 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
     assert stored(case)["mask"] == "m.mask.png"
     assert stored(case)["size"] == whole.size.given
     live, _ = session.live(session.photos[0])
-    points = session.registry.xyz(keypoint for keypoint, _ in case.clicks)
+    points = session.models[0].registry.xyz(keypoint for keypoint, _ in case.clicks)
     view = View(
         case.instance.camera,
         [uv for _, uv in case.clicks],
@@ -193,7 +193,7 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
     model = Model(
         points_3d=points,
         ids=[k for k, _ in case.clicks],
-        mesh=session.model.scene.mesh,
+        mesh=session.models[0].cad.scene.mesh,
         stretch_sigma=LIKELY_STRETCH,
     )
     expected = align(model, view, size=Size(**whole.size.given))

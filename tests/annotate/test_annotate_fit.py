@@ -16,6 +16,7 @@ from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.live import facts_of, live_alignment, missing_text, notes_of
 from cadalign.annotate.model import ClickableModel
+from cadalign.annotate.models import ObjectShape
 from cadalign.annotate.photos import FocalChoice, Intrinsics
 from cadalign.annotate.problem import Known, LiveProblem
 from cadalign.annotate.suggestion import (
@@ -34,6 +35,7 @@ from cadalign.io.observation import Observation
 from cadalign.solvers.projection import projection_jacobian
 
 KNOWN = FocalChoice(known=True)
+STRETCHED = ObjectShape()
 UNKNOWN = FocalChoice(known=False)
 BOX = Mesh(
     [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
@@ -58,10 +60,9 @@ def live_of(
         problem.points_2d if points_2d is None else points_2d,
         intrinsics.with_focal(choice),
         ids=np.arange(count),
+        fit_options={} if stretch is None else {"stretch_sigma": stretch},
     )
-    known = Known(
-        None, BOX, stretch=stretch, estimates_focal=not choice.known, focal_prior=intrinsics.prior
-    )
+    known = Known(STRETCHED, BOX, estimates_focal=not choice.known, focal_prior=intrinsics.prior)
     points = [
         ModelKeypoint(f"point {row}", xyz, row)
         for row, xyz in enumerate(map(tuple, problem.points_3d.tolist()))
@@ -93,9 +94,9 @@ def test_is_what_fit_finds() -> None:
 )
 def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
     counts = np.ones(points, dtype=bool)
-    assert missing_text(counts, None, is_plain=True, has_others=False) == message
-    assert missing_text(np.ones(4, dtype=bool), None, is_plain=True, has_others=False) == ""
-    beside = missing_text(np.ones(2, dtype=bool), None, is_plain=False, has_others=True)
+    assert missing_text(counts, STRETCHED, is_plain=True, has_others=False) == message
+    assert missing_text(np.ones(4, dtype=bool), STRETCHED, is_plain=True, has_others=False) == ""
+    beside = missing_text(np.ones(2, dtype=bool), STRETCHED, is_plain=False, has_others=True)
     assert beside == "1 more pair to the first alignment of this photo"
 
 
@@ -107,10 +108,11 @@ def test_clicks_without_a_stated_noise_have_it_found_beside_other_evidence(
     problem = problem_of(3, points=8, noise_px=2.0)
     upright = ImageEvidence(up=problem.alignment.rotation[:, 1])
     given = problem.points_3d, problem.points_2d, problem.camera
-    known = Known(None, BOX, stretch=stretch)
+    options = {} if stretch is None else {"stretch_sigma": stretch}
     for sigma, expected in ((None, noise), (np.full(8, 2.0), "given")):
-        seen = Observation(*given, sigma=sigma, ids=np.arange(8), evidence=upright)
-        assert LiveProblem.of(known, seen).noise == expected
+        noted = {"sigma": sigma, "ids": np.arange(8), "evidence": upright}
+        seen = Observation(*given, **noted, fit_options=options)
+        assert LiveProblem.of(Known(STRETCHED, BOX), seen).noise == expected
 
 
 def test_standard_deviations_scale_with_the_residuals() -> None:
@@ -339,7 +341,7 @@ def test_projection_jacobian_refuses_what_it_cannot_do() -> None:
 
 def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> None:
     problem = problem_of(7, points=15, noise_px=1.0)
-    facts = {fact.label: fact for fact in facts_of(live_of(problem))}
+    facts = {fact.label: fact for fact in facts_of(live_of(problem), STRETCHED)}
     assert list(facts) == [
         "Stretch along y",
         "Stretch along z",
@@ -357,13 +359,15 @@ def test_facts_give_stretch_pose_and_residuals_with_standard_deviations() -> Non
     assert facts["Focal length"].value == "150 px"
     assert facts["Rotation"].value.startswith("known to ± ")
     assert facts["Pairs agree to"].value.endswith(" px")
-    assert facts_of(LiveAlignment()) == ()
+    assert facts_of(LiveAlignment(), STRETCHED) == ()
 
 
 def test_estimated_focal_length_has_a_standard_deviation() -> None:
     facts = {
         fact.label: fact
-        for fact in facts_of(live_of(problem_of(7, points=15, noise_px=1.0), choice=UNKNOWN))
+        for fact in facts_of(
+            live_of(problem_of(7, points=15, noise_px=1.0), choice=UNKNOWN), STRETCHED
+        )
     }
     assert " ± " in facts["Focal length"].value
     assert facts["Focal length"].note == "estimated"
@@ -371,11 +375,11 @@ def test_estimated_focal_length_has_a_standard_deviation() -> None:
 
 def test_notes_name_alternatives_and_weak_stretches() -> None:
     problem = problem_of(0, points=4, noise_px=0.0)
-    notes = notes_of(live_of(problem))
+    notes = notes_of(live_of(problem), STRETCHED)
     assert any("one more pair tells them apart" in note for note in notes)
     weak = problem_of(7, points=12, noise_px=15.0)
-    assert any("is known only to ± " in note for note in notes_of(live_of(weak)))
-    assert notes_of(LiveAlignment(message="wait")) == ()
+    assert any("is known only to ± " in note for note in notes_of(live_of(weak), STRETCHED))
+    assert notes_of(LiveAlignment(message="wait"), STRETCHED) == ()
 
 
 def test_text_names_point_and_gain() -> None:

@@ -69,7 +69,7 @@ def test_ranking_is_that_of_the_command_on_the_saved_file(
     case: Case, library: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     session = opened(case, library, model=other_chair(library))
-    known = dict(session.registry)
+    known = dict(session.models[0].registry)
     for keypoint, uv in case.clicks:
         if keypoint in known:
             place(session, keypoint, uv)
@@ -139,7 +139,7 @@ def test_switch_keeps_pairs_by_name_and_is_saved(case: Case, library: Path) -> N
     assert starting_model(options, case.photo).samefile(other)
     again = opened(case, library, model=other)
     assert again.photos[0].document.keypoints == session.photos[0].document.keypoints
-    assert again.registry[pairs[1].keypoint or 0].name == "left knee"
+    assert again.models[0].registry[pairs[1].keypoint or 0].name == "left knee"
 
 
 def test_begins_with_the_model_of_the_most_keypoints(case: Case, library: Path) -> None:
@@ -193,7 +193,7 @@ def test_model_is_chosen_by_keys_alone_and_by_a_click(
     browser: Browser, case: Case, library: Path
 ) -> None:
     session = opened(case, library, model=other_chair(library))
-    known = dict(session.registry)
+    known = dict(session.models[0].registry)
     for keypoint, uv in case.clicks:
         if keypoint in known:
             place(session, keypoint, uv)

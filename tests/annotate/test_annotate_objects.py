@@ -180,7 +180,7 @@ def test_objects_have_models_of_their_own(
         number = known if known is not None else add_point(model, xyz)
         perform(session, 0, {"do": "place_uv", "uv": uv}, slot=2)
         perform(session, 0, {"do": "place_keypoint", "keypoint": number}, slot=2)
-    assert model.keypoints_path != session.keypoints_path
+    assert model.keypoints_path != session.models[0].keypoints_path
     assert model.keypoints_path.exists()
     page = session.live(session.objects[0][2])[0].result
     assert page is not None

@@ -49,7 +49,7 @@ def annotated(case: Case) -> Session:
     session = case.open()
     place_all(session, case, count=8)
     pose = case.instance.cam_from_model
-    geometry = cast_geometry(session.model.scene, case.instance.camera, pose)
+    geometry = cast_geometry(session.models[0].cad.scene, case.instance.camera, pose)
     runs = np.flatnonzero(np.diff(np.r_[0, geometry.mask.ravel().astype(int), 0]))
     lengths = np.diff(np.r_[0, runs, geometry.mask.size])
     perform(session, 0, {"do": "mask_load", "runs": [int(each) for each in lengths if each >= 0]})

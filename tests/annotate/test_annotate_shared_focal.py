@@ -29,14 +29,14 @@ def put(
 ) -> None:
     """Place twelve pairs, corners of the model's surface, where a pose has them in the photo."""
     camera, rng = camera or case.instance.camera, np.random.default_rng(slot)
-    samples = session.model.samples
+    samples = session.models[0].cad.samples
     inside = camera.contains(camera.project(pose.apply([point.xyz for point in samples])))
     chosen = [point for point, is_in in zip(samples, inside, strict=True) if is_in][:12]
     pixels = camera.project(pose.apply([point.xyz for point in chosen]))
     with aligned_once(session):
         for point, uv in zip(chosen, pixels + 0.5 * rng.normal(size=pixels.shape), strict=True):
-            known = session.registry.find(point.xyz, tolerance=1e-6)
-            keypoint = session.registry.add(point) if known is None else known
+            known = session.models[0].registry.find(point.xyz, tolerance=1e-6)
+            keypoint = session.models[0].registry.add(point) if known is None else known
             perform(session, 0, {"do": "place_uv", "uv": uv.tolist()}, slot=slot)
             perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)
 

@@ -42,7 +42,7 @@ def test_a_clip_is_marked_by_few_clicks_and_tracked(
 
 def assert_tracked(session: Session, clip: Clip, folder: Path) -> None:
     """`cadalign track` reads what the session exports, and finds the object's motion."""
-    _, known = zip(*session.registry, strict=True)
+    _, known = zip(*session.models[0].registry, strict=True)
     places = np.array([point.xyz for point in known])
     sizes = ShapeModel.from_basis(
         places, 0.01 * places[None], np.ones(1), ids=[point.name for point in known]

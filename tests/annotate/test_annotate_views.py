@@ -55,7 +55,9 @@ def put(
     for keypoint, uv in case.clicks[:count]:
         place: Any = uv
         if photo or off is not None:
-            (seen,) = case.instance.camera.project(pose.apply([session.registry[keypoint].xyz]))
+            (seen,) = case.instance.camera.project(
+                pose.apply([session.models[0].registry[keypoint].xyz])
+            )
             place = (seen + rng.normal(scale=off or 1.0, size=2)).tolist()
         perform(session, photo, {"do": "place_uv", "uv": place}, slot=slot)
         perform(session, photo, {"do": "place_keypoint", "keypoint": keypoint}, slot=slot)

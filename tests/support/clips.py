@@ -55,7 +55,7 @@ class Clip:
         """Pixels of the visible keypoints by their numbers."""
         scene, pose = self.case.instance.scene, self.poses[frame]
         assert scene is not None
-        numbers, points = zip(*session.registry, strict=True)
+        numbers, points = zip(*session.models[0].registry, strict=True)
         xyz = np.array([point.xyz for point in points])
         shown = visible_keypoints(scene, xyz, self.camera, pose)
         pixels = self.camera.project(pose.apply(xyz))

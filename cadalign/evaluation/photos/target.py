@@ -22,7 +22,7 @@ from cadalign.evaluation.runs.work import UNREADABLE, LeftOutError, fingerprint
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.sampling import farthest_rows, random_points
 from cadalign.render.scene import Scene
 
 _KEPT = 16
@@ -129,21 +129,10 @@ def _scene(cad: Cad) -> Scene:
 
 @lru_cache(maxsize=_KEPT)
 def _spread(cad: Cad, count: int) -> NamedPoints:
-    points = np.vstack([cad.scene.used_vertices, _surface_points(cad.scene.mesh)])
+    _, on_surface = random_points(cad.scene.mesh, _ON_SURFACE)
+    points = np.vstack([cad.scene.used_vertices, on_surface])
     xyz = farthest_points(points, count)
     return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
-
-
-def _surface_points(mesh: Mesh) -> FloatArray:
-    """Random points of a mesh, evenly over its surface, the same every time."""
-    first, second, third = np.moveaxis(mesh.triangles, 1, 0)
-    areas = np.linalg.norm(np.cross(second - first, third - first), axis=1)
-    if not areas.sum() > 0:
-        return np.empty((0, 3))
-    rng = np.random.default_rng(0)
-    faces = rng.choice(len(areas), _ON_SURFACE, p=areas / areas.sum())
-    weights = rng.dirichlet(np.ones(3), _ON_SURFACE)
-    return np.asarray(np.einsum("nk,nkd->nd", weights, mesh.triangles[faces]))
 
 
 @lru_cache(maxsize=_KEPT)
@@ -165,20 +154,8 @@ def farthest_points(points: FloatArray, count: int) -> FloatArray:
     """At most so many points (n, 3), each the farthest from those before it.
 
     The first is the farthest from the mean. Points that coincide with an earlier one are left out.
-
-    Examples
-    --------
-    >>> farthest_points(np.array([[0.0, 0, 0], [5, 0, 0], [1, 0, 0], [5, 0, 0]]), 3)[:, 0].tolist()
-    [0.0, 5.0, 1.0]
     """
-    chosen: list[int] = []
-    distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
-    nearest = np.full(len(points), np.inf)
-    while len(chosen) < min(count, len(points)) and distance.max() > 0:
-        chosen.append(int(distance.argmax()))
-        gaps = np.linalg.norm(points - points[chosen[-1]], axis=1)
-        nearest = distance = np.minimum(nearest, gaps)
-    return points[chosen]
+    return np.asarray(points[farthest_rows(points, count, center=points.mean(axis=0))])
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,6 @@ from typing import Any, get_type_hints
 import msgspec
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
-from cadalign.annotate.models import SAME_PLACE
 from cadalign.annotate.object_actions import (
     EVIDENCE_ACTIONS,
     OBJECT_ACTIONS,
@@ -22,7 +21,6 @@ from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.photos import Mark, nearest_corner
 from cadalign.annotate.proposals import proposals_of
 from cadalign.annotate.session import Session
-from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert
 
@@ -136,7 +134,8 @@ def mirrored(state: PhotoState, *, pair: Index) -> ActionOutcome:
     if point is None:
         what = "its model point has no mirror image"
         raise InputError(what, where="pair", fix="choose another pair")
-    return place_keypoint(state, keypoint=_registered(state, point, MIRRORED))
+    near = registry.placed(point, tolerance=MIRRORED * model.diagonal)
+    return place_keypoint(state, keypoint=near)
 
 
 def suggested(
@@ -303,14 +302,7 @@ def _aimed_at(
     if near is not None and model.is_seen(start, state.model.registry[near].xyz):
         return near
     point = model.pick(start, direction, snap=snap)
-    return None if point is None else _registered(state, point, SAME_PLACE)
-
-
-def _registered(state: PhotoState, point: ModelKeypoint, tolerance: float) -> int:
-    """The keypoint within the tolerance [diagonals] of a point, or a new one."""
-    registry = state.model.registry
-    known = registry.find(point.xyz, tolerance=tolerance * state.model.cad.diagonal)
-    return registry.add(point) if known is None else known
+    return None if point is None else state.model.registry.placed(point)
 
 
 def _snapped(uv: Pixel, reach: float, state: PhotoState) -> tuple[Pixel, str]:

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 from platformdirs import user_state_path
 
 from cadalign.annotate.evidence import MarkedEvidence
@@ -325,15 +324,12 @@ def read_history(
     path: Path,
     document: AnnotationDocument,
     registry: KeypointRegistry,
-    *,
-    tolerance: float,
     same_evidence: SameEvidence,
 ) -> History:
     """The history that led to a document; an empty one if there is none of that document.
 
-    Model points of undone pairs are added to the registry. ``tolerance`` is the largest distance of
-    two points that count as one [model units]. Marks with all their strokes and edges are taken
-    from the history where they are the same as the document's.
+    Model points of undone pairs are added to the registry. Marks with all their strokes and edges
+    are taken from the history where they are the same as the document's.
     """
     try:
         file = read_document(path, _File)
@@ -341,7 +337,7 @@ def read_history(
         at = _find(document, documents, file.before, same_evidence)
     except (OSError, CadalignError, msgspec.ValidationError, LookupError):
         return History(document)
-    if at is None or not _add_points(file.points, registry, tolerance):
+    if at is None or not _add_points(file.points, registry):
         return History(document)
     kept = _with_marks(documents[at], document, same_evidence)
     return History(kept, before=documents[:at], after=documents[:at:-1])
@@ -366,18 +362,13 @@ def _find(
     return next(iter(same + places), None)
 
 
-def _add_points(
-    points: Sequence[ModelKeypoint], registry: KeypointRegistry, tolerance: float
-) -> bool:
+def _add_points(points: Sequence[ModelKeypoint], registry: KeypointRegistry) -> bool:
     """Register model points; False, and none is, if one lies elsewhere than that of its id."""
-    for point in points:
-        if point.semantic_id in registry:
-            own = registry[point.semantic_id or 0]
-            if np.linalg.norm(np.subtract(own.xyz, point.xyz)) > tolerance:
-                return False
-    for point in points:
-        if point.semantic_id not in registry:
-            registry.add(point)
+    new = [point for point in points if point.semantic_id not in registry]
+    if any(point not in new and not registry.has(point) for point in points):
+        return False
+    for point in new:
+        registry.add(point)
     return True
 
 

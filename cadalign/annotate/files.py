@@ -21,7 +21,6 @@ import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Priors
 from cadalign.annotate.models import (
-    SAME_PLACE,
     KeypointRegistry,
     ObjectShape,
     OpenedModel,
@@ -145,20 +144,19 @@ class AnnotationFiles:
 
     def read(self, photo: Path, model: OpenedModel, shape: ObjectShape) -> Stored:
         """Read an earlier session's annotation; new model points are added to the registry."""
-        registry, tolerance = model.registry, SAME_PLACE * model.cad.diagonal
-        stored = Stored()
+        registry, stored = model.registry, Stored()
         parts = []
         if self.observation.exists():
             observation = self._load()
             refuse_other_model(observation.model, model.path, where=self.observation)
             place = _place_of(photo, observation.views, where=self.observation)
-            shown = _document_of(observation.views[place], registry, tolerance)
+            shown = _document_of(observation.views[place], registry)
             shown = replace(shown, name=observation.object_name or "")
             views: list[StoredView | None] = []
             for seen in observation.views:
                 is_there = seen.image is not None and seen.image.exists()
                 is_other = is_there and len(views) != place
-                own = _document_of(seen, registry, tolerance) if is_other else None
+                own = _document_of(seen, registry) if is_other else None
                 views.append(StoredView(seen, own))
             views[place] = None
             stored = Stored(shown, observation, tuple(views))
@@ -329,9 +327,7 @@ def _with_halves(
     return document
 
 
-def _document_of(
-    observation: ObservedImage, registry: KeypointRegistry, tolerance: float
-) -> AnnotationDocument:
+def _document_of(observation: ObservedImage, registry: KeypointRegistry) -> AnnotationDocument:
     document = AnnotationDocument()
     ids, names = observation.ids, observation.names
     columns = (observation.sigma, observation.scores, observation.depths)
@@ -340,7 +336,7 @@ def _document_of(
     ):
         number = None if ids is None else int(ids[row])
         point = ModelKeypoint("" if names is None else names[row], tuple(xyz), number)
-        keypoint = _registered(point, registry, tolerance, document.keypoints)
+        keypoint = _registered(point, registry, document.keypoints)
         known = (_entry(values, row) for values in columns)
         document = document.append(Pair(document.next_number, tuple(uv), keypoint, *known))
     return document
@@ -350,16 +346,12 @@ def _entry(values: FloatArray | None, row: int) -> float | None:
     return None if values is None or np.isnan(values[row]) else float(values[row])
 
 
-def _registered(
-    point: ModelKeypoint, registry: KeypointRegistry, tolerance: float, taken: frozenset[int]
-) -> int:
+def _registered(point: ModelKeypoint, registry: KeypointRegistry, taken: frozenset[int]) -> int:
     """Find a point of an observation file in the registry, or add it; returns its id."""
     wanted = point.semantic_id
-    if wanted is not None and wanted in registry and wanted not in taken:
-        gap = np.linalg.norm(np.subtract(registry[wanted].xyz, point.xyz))
-        if gap <= tolerance:
-            return wanted
-    found = registry.find(point.xyz, tolerance=tolerance)
+    if wanted is not None and wanted not in taken and registry.has(point):
+        return wanted
+    found = registry.find(point.xyz)
     if found is not None and found not in taken:
         return found
     free = wanted is not None and wanted >= 0 and wanted not in registry

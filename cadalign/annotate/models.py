@@ -27,8 +27,7 @@ from cadalign.shapes.parts import KeypointId
 if TYPE_CHECKING:
     from cadalign.annotate.document import Pair
 
-SAME_PLACE = 1e-6
-"""Largest distance of two points that count as one [diagonals]."""
+_SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
 _LONGEST_NAME = 80
 
 
@@ -36,12 +35,17 @@ class KeypointRegistry:
     """Keypoints by semantic id; points can be added and renamed, but not moved or removed.
 
     The attribute ``given`` holds the semantic ids of those given with the model. New points don't
-    get ids that are ``reserved``.
+    get ids that are ``reserved``. Points at most ``tolerance`` apart count as one [model units].
     """
 
     def __init__(
-        self, given: Iterable[ModelKeypoint] = (), *, reserved: Iterable[int] = ()
+        self,
+        given: Iterable[ModelKeypoint] = (),
+        *,
+        reserved: Iterable[int] = (),
+        tolerance: float = 0.0,
     ) -> None:
+        self._tolerance = tolerance
         self._points: dict[int, ModelKeypoint] = {}
         self._last_reserved = max(reserved, default=0)
         # Points with an id come first, so that new ids differ from theirs.
@@ -88,26 +92,38 @@ class KeypointRegistry:
             )
         return self.add(replace(point, semantic_id=semantic_id))
 
-    def merge(self, points: Iterable[ModelKeypoint], *, tolerance: float) -> None:
+    def merge(self, points: Iterable[ModelKeypoint]) -> None:
         """Add points of an earlier session, which then count as given.
 
-        A point with the id and, within the tolerance [model units], the position of a registered
-        one renames that one.
+        A point with the id and the position of a registered one renames that one.
         """
         for point in points:
             number = point.semantic_id
             if number is not None and number in self:
-                if np.linalg.norm(np.subtract(self[number].xyz, point.xyz)) <= tolerance:
+                if self.has(point):
                     del self._points[number]  # or its own name would be taken
                     self.add(point)
                     continue
                 point = replace(point, semantic_id=None)
             self.given |= {self.add(point)}
 
-    def find(self, xyz: Iterable[float], *, tolerance: float) -> int | None:
-        """Find the id of the keypoint at a position, within the tolerance [model units]."""
+    def has(self, point: ModelKeypoint) -> bool:
+        """True if the keypoint of the point's id lies where the point does."""
+        own = None if point.semantic_id is None else self._points.get(point.semantic_id)
+        return own is not None and bool(
+            np.linalg.norm(np.subtract(own.xyz, point.xyz)) <= self._tolerance
+        )
+
+    def placed(self, point: ModelKeypoint, *, tolerance: float | None = None) -> int:
+        """The id of the keypoint at a point, which is added if there is none."""
+        known = self.find(point.xyz, tolerance=tolerance)
+        return self.add(point) if known is None else known
+
+    def find(self, xyz: Iterable[float], *, tolerance: float | None = None) -> int | None:
+        """Find the id of the nearest keypoint within the tolerance, by default the registry's."""
         if not self._points:
             return None
+        tolerance = self._tolerance if tolerance is None else tolerance
         numbers = list(self._points)
         gaps = np.linalg.norm(self.xyz(numbers) - np.array(list(xyz)), axis=1)
         nearest = int(np.argmin(gaps))
@@ -366,11 +382,12 @@ class Models:
         given = () if self._choice is None else self._choice.keypoints_of(path)
         if source != own and (source != beside or source.exists()):
             given = ModelKeypoints.load(source, mesh=mesh, model=path).keypoints
-        registry = KeypointRegistry(given, reserved=self._reserved)
+        tolerance = _SAME_PLACE * cad.diagonal
+        registry = KeypointRegistry(given, reserved=self._reserved, tolerance=tolerance)
         if own.exists():
             earlier = ModelKeypoints.load(own, mesh=mesh, model=path)
             refuse_other_model(earlier.model, path, where=own)
-            registry.merge(earlier.keypoints, tolerance=SAME_PLACE * cad.diagonal)
+            registry.merge(earlier.keypoints)
         return OpenedModel(path, cad, registry, own)
 
     def _keypoints_path(self, path: Path) -> Path:

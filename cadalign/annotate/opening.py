@@ -13,7 +13,7 @@ from cadalign.annotate.document import History, Priors, history_path, read_histo
 from cadalign.annotate.evidence import MarkedEvidence, MarkedLengths, MaskDrawing
 from cadalign.annotate.files import AnnotationFiles, StoredView
 from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.models import SAME_PLACE, Models, ObjectShape
+from cadalign.annotate.models import Models, ObjectShape
 from cadalign.annotate.names import (
     file_name,
     keypoints_file,
@@ -197,8 +197,7 @@ def _open_object(
         history_path(files.observation),
         owner.document,
         model.registry,
-        tolerance=SAME_PLACE * model.cad.diagonal,
-        same_evidence=is_same,
+        is_same,
     )
     return owner.first
 

@@ -186,15 +186,14 @@ def test_names_are_checked() -> None:
 
 def test_points_of_an_earlier_session_are_taken_in() -> None:
     registry = KeypointRegistry(
-        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)]
+        [ModelKeypoint("a", (0, 0, 0), 0), ModelKeypoint("b", (1, 0, 0), 1)], tolerance=1e-6
     )
     registry.merge(
         [
             ModelKeypoint("renamed", (1e-9, 0, 0), 0),
             ModelKeypoint("placed", (2, 0, 0), 7),
             ModelKeypoint("elsewhere", (5, 0, 0), 1),
-        ],
-        tolerance=1e-6,
+        ]
     )
     names = {number: point.name for number, point in registry}
     assert names == {0: "renamed", 1: "b", 7: "placed", 8: "elsewhere"}

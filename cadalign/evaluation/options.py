@@ -79,6 +79,13 @@ class ExperimentOptions:
             if value not in known:
                 raise unknown("value", value, known, where=name)
 
+    def check_noise(self, *names: str) -> None:
+        """Check that options are standard deviations, which may be 0."""
+        for name in names:
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise InputError(f"{value} is not a noise level", where=name)
+
     def replace_values(self, **values: Any) -> None:
         """Set options of a new instance to their checked values."""
         for name, value in values.items():
@@ -146,13 +153,64 @@ class NoiseOption(ExperimentOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.noise_px < math.inf:
-            raise InputError(f"{self.noise_px} is not a noise level", where="noise_px")
+        self.check_noise("noise_px")
 
     @property
     def sigma(self) -> float:
         """Standard deviation of the keypoints that methods are given [px]."""
         return self.noise_px or 1.0
+
+
+@dataclass(frozen=True)
+class ViewOptions(ModelOptions, NoiseOption, FunctionOptions):
+    """Views of a dataset's models, in which enough keypoints are seen."""
+
+    _: KW_ONLY
+    split: str | None = None
+    """The dataset's split to take, such as test; all models by default."""
+    min_visible: int = 6
+    """Least number of keypoints that a view must show; of several views, the first."""
+    views_per_model: int = 1
+    """Number of views of each model, an instance each."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(views_per_model=1)
+
+    @property
+    def drawn(self) -> dict[str, Any]:
+        """What random views follow from, as arguments of `make_instance`."""
+        return {name: getattr(self, name) for name in ("noise_px", "min_visible", "seed")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainOptions(ExperimentOptions):
+    """Splits of a dataset: objects of one are aligned by what is learned from the other."""
+
+    split: str = "val"
+    """Split of the objects."""
+    train: str = "train"
+    """Split of the models to learn from."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.split == self.train:
+            what, fix = f"both are {self.split!r}", "objects must not be among the models"
+            raise InputError(what, where="split, train", fix=fix)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoOptions(ExperimentOptions):
+    """Choice of the photos of a data set."""
+
+    max_photos: int | None = None
+    """Number of photos to take, the first ones; all by default."""
+    pictures: int = 100
+    """Number of photos whose pictures the report shows, the first ones."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_least(max_photos=1, pictures=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plots
-from cadalign.evaluation.runs.work import FAILED, SKIPPED, Plan
+from cadalign.evaluation.runs.work import COLUMNS, FAILED, SKIPPED, Plan
 from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
 
@@ -32,20 +32,17 @@ if TYPE_CHECKING:
 
     Summaries = Sequence[Summary]
 
-RESULT_COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
-"""Columns of the result table of every experiment."""
-
-
 Reference = tuple[tuple[Summary, ...], str]
 """Published numbers beside a headline table, and a note on them."""
 
 
-def _count_failures(run: Run, summaries: Summaries) -> Conclusion:
+def count_failures(run: Run, summaries: Summaries, *, apart: str = SKIPPED) -> Conclusion:
+    """Count rows and failures; rows of the status ``apart`` are neither."""
     statuses = run.results["status"].to_pylist()
-    skipped = statuses.count(SKIPPED)
-    note = f"{skipped} more were skipped" if skipped else ""
-    rows = len(statuses) - skipped
-    return Conclusion(rows, statuses.count(FAILED), {"skipped": skipped}, note)
+    others = statuses.count(apart)
+    note = f"{others} more were {apart}" if others else ""
+    rows = len(statuses) - others
+    return Conclusion(rows, statuses.count(FAILED), {apart.replace(" ", "_"): others}, note)
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,7 @@ class Spec:
     """Columns of the headline table; those are left out that no line has a value of."""
     summarize: Callable[[Run], Summaries]
     """Makes summaries of a run, finished or not; see `cadalign.evaluation.summary`."""
-    results: Columns = RESULT_COLUMNS
+    results: Columns = COLUMNS
     """Columns that the result table of a run must have to be summarized."""
     run: type[Run] | None = None
     """The class of its runs; by default `cadalign.evaluation.runs.opened.Run`."""
@@ -75,7 +72,7 @@ class Spec:
     """Makes the plots of a page of runs to be compared."""
     write_more: Callable[[Run, Summaries], object] = lambda run, summaries: None
     """Writes more files of a run and its summaries."""
-    conclude: Callable[[Run, Summaries], Conclusion] = _count_failures
+    conclude: Callable[[Run, Summaries], Conclusion] = count_failures
     """Counts rows and failures of a run."""
     metrics: tuple[Metric, ...] = ()
     """Columns of the result table that a page's gallery shows, for experiments on instances."""

@@ -243,16 +243,21 @@ def summaries_of(
     summarize: Callable[[str, str, Cells], Summary],
     *,
     further: Sequence[Metric] = (),
+    single: bool = False,
 ) -> list[Summary]:
-    """Summaries of cells by category for some methods; see `by_category_and_method`."""
+    """Summaries of cells by category for some methods; see `by_category_and_method`.
+
+    ``single``: also of all cells where there is a single category.
+    """
     categories = sorted(set(cells["category"].tolist()))
     parts = [(name, where(cells, cells["category"] == name)) for name in categories]
-    if len(parts) > 1:
+    if single or len(parts) > 1:
         parts.append((ALL, cells))
     return [
         with_medians(summarize(category, method, found), found, further)
         for category, found in parts
         for method in methods
+        if method in found["method"]
     ]
 
 

@@ -18,7 +18,7 @@ from cadalign.evaluation.experiments.keypointnet import (
     SPEC,
     TABLE,
     KeypointNetOptions,
-    summarize_cells,
+    summarize_method,
 )
 from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.evaluation.instances.pictures import draw_instance
@@ -250,9 +250,8 @@ def row(method: str, error: float | None, *, category: str = "chair") -> dict[st
 
 def summaries_of(rows: list[dict[str, Any]]) -> list[Summary]:
     names = [name for name, _ in COLUMNS]
-    return summarize_cells(
-        "chair", {name: np.array([row.get(name) for row in rows]) for name in names}
-    )
+    cells = {name: np.array([row.get(name) for row in rows]) for name in names}
+    return [summarize_method("chair", method, cells) for method in dict.fromkeys(cells["method"])]
 
 
 def test_failed_rows_count_against_success_and_not_in_medians() -> None:

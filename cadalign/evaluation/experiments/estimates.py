@@ -19,7 +19,7 @@ from cadalign.evaluation.experiments.photos import (
     summarize,
 )
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.options import PhotoOptions
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan, fingerprint
 from cadalign.evaluation.summary import Conclusion, Summary
@@ -37,7 +37,7 @@ _LOGGED = 10  # problems of a file that are logged
 
 
 @dataclass(frozen=True)
-class EstimatesOptions(ExperimentOptions):
+class EstimatesOptions(PhotoOptions):
     """Score poses that other programs estimated, on photos of a data set.
 
     The files are BOP's results (CSV) or ``scene_gt.json``, or JSON in the form of Scan2CAD's
@@ -52,14 +52,9 @@ class EstimatesOptions(ExperimentOptions):
     _: KW_ONLY
     estimates: tuple[Path, ...] = ()
     """Files of estimates."""
-    max_photos: int | None = None
-    """Number of photos to take, the first ones; all by default."""
-    pictures: int = 100
-    """Number of photos whose pictures the report shows, the first ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(max_photos=1, pictures=0)
         if not self.estimates:
             raise InputError("give at least one file", where="estimates")
 

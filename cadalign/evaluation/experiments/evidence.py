@@ -13,7 +13,7 @@ from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
+from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
@@ -56,7 +56,7 @@ _DEFAULT = tuple(name for name in METHODS if name not in _ON_DEMAND)
 
 
 @dataclass(frozen=True)
-class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
+class EvidenceRunOptions(ViewOptions):
     """Evaluate what masks, further views, depth, gravity and lengths add to keypoints.
 
     Each view shows a model with a mesh as it is; methods get its visible keypoints with noise, the
@@ -70,12 +70,6 @@ class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
     visibility: ClassVar[str] = "rays"
 
     _: KW_ONLY
-    split: str | None = None
-    """The dataset's split to take, such as test; all models by default."""
-    views_per_model: int = 1
-    """Number of instances of each model."""
-    min_visible: int = 6
-    """Least number of keypoints that the first view must show."""
     depth_sigma: float = 0.005
     """Relative noise of the depths."""
     up_sigma_deg: float = 1.0
@@ -94,7 +88,7 @@ class EvidenceRunOptions(ModelOptions, NoiseOption, FunctionOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(views_per_model=1, min_visible=4)
+        self.check_least(min_visible=4)
         for name in ("depth_sigma", "up_sigma_deg", "length_sigma", "turn_deg"):
             value = getattr(self, name)
             if not 0 < value < 90:

@@ -15,7 +15,7 @@ from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE, Metric
-from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
+from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
 from cadalign.evaluation.registry import Reference, Spec
 from cadalign.evaluation.runs.work import OK, SKIPPED, Plan
@@ -26,8 +26,7 @@ from cadalign.evaluation.summary import (
     counted,
     mean_of,
     median_of,
-    where,
-    with_medians,
+    summaries_of,
 )
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
+class KeypointNetOptions(ViewOptions):
     """Evaluate methods on views of KeypointNet's models.
 
     Each view shows a model as it is; methods get its visible keypoints, with noise, and the model
@@ -50,12 +49,6 @@ class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
     experiment = "keypointnet"
 
     _: KW_ONLY
-    split: str | None = None
-    """The dataset's split to take, such as test; all models by default."""
-    min_visible: int = 6
-    """Least number of keypoints that a view must show."""
-    views_per_model: int = 1
-    """Number of views of each model."""
     methods: tuple[str, ...] = ("optimal", "aepnp", "aepnp-paper", "epnp", "limit")
     """Methods of `cadalign fit`, optimal-huber, optimal-cauchy, ransac-optimal, ransac-ap4p,
     ransac-aepnp, and limit: the Cramer-Rao bound."""
@@ -72,7 +65,7 @@ class KeypointNetOptions(ModelOptions, NoiseOption, FunctionOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_methods()
-        self.check_least(min_visible=1, views_per_model=1)
+        self.check_least(min_visible=1)
         self.check_known(visibility=("auto", "rays", "hull"), render=("none", "overlay"))
 
 
@@ -99,31 +92,13 @@ _COUNTS = (metrics.INSTANCES, metrics.FAILED, metrics.SKIPPED)
 
 def summarize(run: Run) -> list[Summary]:
     """A summary for every category and method, and for all categories together."""
-    cells = run.cells
-    categories = sorted(set(cells["category"].tolist()))
-    parts = [(name, where(cells, cells["category"] == name)) for name in categories]
-    return [
-        summary
-        for name, found in [*parts, (ALL, cells)]
-        for summary in summarize_cells(name, found, further=run.metrics)
-    ]
+    return summaries_of(run.cells, run.methods, summarize_method, further=run.metrics, single=True)
 
 
-def summarize_cells(
-    category: str, cells: Cells, *, further: Sequence[Metric] = ()
-) -> list[Summary]:
-    """A summary of rows for every method, in the order in which they come."""
-    methods = list(dict.fromkeys(cells["method"].tolist()))
-    of_bound = (cells["method"] == LIMIT) & (cells["status"] == OK)
-    bound = median_of(cells["rotation_error_deg"][of_bound])
-    return [
-        with_medians(_summarize_method(category, method, cells, bound), cells, further)
-        for method in methods
-    ]
-
-
-def _summarize_method(category: str, method: str, cells: Cells, bound: float) -> Summary:
+def summarize_method(category: str, method: str, cells: Cells) -> Summary:
+    """A summary of a method's rows, among those of all methods."""
     counts, skipped, solved = counted(cells, method)
+    bound = median_of(counted(cells, LIMIT)[2]["rotation_error_deg"])
     medians = {each.key: median_of(solved[each.key]) for each in _MEDIANS if each.key in solved}
     values = {
         **counts,

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import numpy.typing as npt
@@ -24,14 +24,13 @@ from cadalign.evaluation.metrics.photos import IOU_3D, KITTI, NINE_DOF, ROTATION
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.sets import medians_of, score_columns, shares_of
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
-from cadalign.evaluation.options import FunctionOptions
+from cadalign.evaluation.options import FunctionOptions, PhotoOptions
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.plots import cumulative_curves
-from cadalign.evaluation.registry import Spec
+from cadalign.evaluation.registry import Spec, count_failures
 from cadalign.evaluation.runs.work import FAILED, LEFT_OUT, OK, UNREADABLE, Plan
 from cadalign.evaluation.summary import (
     ALL,
-    Conclusion,
     ConsoleTable,
     Summary,
     mean_of,
@@ -54,7 +53,7 @@ COLUMNS: Columns = (
 
 
 @dataclass(frozen=True)
-class PhotosOptions(FunctionOptions, protocols.KeypointOptions):
+class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
     The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
@@ -72,8 +71,6 @@ class PhotosOptions(FunctionOptions, protocols.KeypointOptions):
     _: KW_ONLY
     categories: tuple[str, ...] | None = None
     """Categories to take; all by default."""
-    max_photos: int | None = None
-    """Number of photos to take, the first ones; all by default."""
     methods: tuple[str, ...] = ()
     """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
     keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
@@ -87,12 +84,9 @@ class PhotosOptions(FunctionOptions, protocols.KeypointOptions):
     similar_sigma: float = 0.04
     """Standard deviation of the object's keypoints from the model's, for the method similar, in
     diagonals of the model."""
-    pictures: int = 100
-    """Number of photos whose pictures the report shows, the first ones."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check_least(max_photos=1, pictures=0)
         if not 0 < self.similar_sigma < math.inf:
             raise InputError(f"{self.similar_sigma} is not positive", where="similar_sigma")
         self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
@@ -274,14 +268,6 @@ def _describe(run: Run) -> str:
     return f"{text}, {whose} {keypoints}are simulated: projected with the true pose, {noise:g} px"
 
 
-def _conclude(run: Run, summaries: Sequence[Summary]) -> Conclusion:
-    status: Any = run.cells["status"]
-    left_out = int(np.sum(status == LEFT_OUT))
-    note = f"{left_out} more were left out" if left_out else ""
-    rows, failed = len(status) - left_out, int(np.sum(status == FAILED))
-    return Conclusion(rows, failed, {"left_out": left_out}, note)
-
-
 SPEC = Spec(
     options=PhotosOptions,
     plan=plan,
@@ -290,7 +276,7 @@ SPEC = Spec(
     summarize=summarize,
     table=console_table,
     plots=plots,
-    conclude=_conclude,
+    conclude=partial(count_failures, apart=LEFT_OUT),
     topic="alignment to photos",
     describe=_describe,
     metrics=GALLERY,

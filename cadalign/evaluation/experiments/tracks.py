@@ -15,7 +15,7 @@ from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.photos import DEPTH, YAW
-from cadalign.evaluation.options import FunctionOptions, NoiseOption
+from cadalign.evaluation.options import FunctionOptions, NoiseOption, TrainOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
@@ -39,7 +39,7 @@ _SAMPLE = 60  # models of each category of a generated data set
 
 
 @dataclass(frozen=True)
-class TracksOptions(NoiseOption, FunctionOptions):
+class TracksOptions(TrainOptions, NoiseOption, FunctionOptions):
     """Evaluate tracks of objects through videos.
 
     Videos are simulated of the objects of one split of KeypointNet, whose shape is learned from the
@@ -60,10 +60,6 @@ class TracksOptions(NoiseOption, FunctionOptions):
     """Categories to take; all by default."""
     max_models: int | None = None
     """Largest number of models of each category."""
-    split: str = "val"
-    """Split of the objects."""
-    train: str = "train"
-    """Split of the models to learn from."""
     noise_px: float = 2.0
     """Standard deviation of the keypoints' noise, in pixels; of KITTI's what methods are told."""
     frames: int = 40
@@ -88,18 +84,15 @@ class TracksOptions(NoiseOption, FunctionOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_least(max_models=1, frames=3)
-        if self.rate is not None and not 0 < self.rate < np.inf:
-            raise InputError(f"{self.rate:g} is not positive", where="rate")
-        if not self.visible > 0:
-            raise InputError(f"{self.visible:g} is not positive", where="visible")
+        for name in ("rate", "visible"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < np.inf:
+                raise InputError(f"{value:g} is not positive", where=name)
         for name in ("visible", "correlation", "flipped", "outliers"):
             if not 0 <= getattr(self, name) <= 1:
                 what = f"{getattr(self, name):g} is not between 0 and 1"
                 raise InputError(what, where=name)
         self.check_methods(METHODS)
-        if self.split == self.train:
-            what, fix = f"both are {self.split!r}", "objects must not be among the models"
-            raise InputError(what, where="split, train", fix=fix)
 
     @property
     def is_robust(self) -> bool:

@@ -13,7 +13,12 @@ from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods.method import LIMIT, SHAPE
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.options import FunctionOptions, ModelOptions, NoiseOption
+from cadalign.evaluation.options import (
+    FunctionOptions,
+    ModelOptions,
+    NoiseOption,
+    TrainOptions,
+)
 from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
@@ -41,7 +46,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class UnseenOptions(ModelOptions, NoiseOption, FunctionOptions):
+class UnseenOptions(ModelOptions, TrainOptions, NoiseOption, FunctionOptions):
     """Evaluate alignment to objects that are no stretched copy of any model.
 
     Objects of one split of KeypointNet are aligned with models of the other split, by
@@ -55,10 +60,6 @@ class UnseenOptions(ModelOptions, NoiseOption, FunctionOptions):
     visibility: ClassVar[str] = "hull"
 
     _: KW_ONLY
-    split: str = "val"
-    """Split of the objects."""
-    train: str = "train"
-    """Split of the models to learn from."""
     noise_px: float = 2.0
     """Standard deviation of the keypoints' noise, in pixels."""
     keypoints: int | None = None
@@ -81,9 +82,6 @@ class UnseenOptions(ModelOptions, NoiseOption, FunctionOptions):
         if not 0 <= self.outliers < 1:
             raise InputError(f"{self.outliers} is not a share below 1", where="outliers")
         self.check_methods(METHODS)
-        if self.split == self.train:
-            what, fix = f"both are {self.split!r}", "objects must not be among the models"
-            raise InputError(what, where="split, train", fix=fix)
 
 
 COLUMNS: Columns = (

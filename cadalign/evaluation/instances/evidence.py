@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -40,8 +40,8 @@ from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
     KeypointTask,
     example_view,
-    load_scene,
     make_instance,
+    scene_of,
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
@@ -112,9 +112,6 @@ class ObjectScene:
         )
 
 
-_scene_of = lru_cache(maxsize=1)(load_scene)  # views of one model come one after another
-
-
 def make_scene(model: AnnotatedModel, view: int, options: EvidenceRunOptions) -> ObjectScene:
     """Draw a view of a model, its stretch, the other cameras, and the noise of everything.
 
@@ -122,8 +119,7 @@ def make_scene(model: AnnotatedModel, view: int, options: EvidenceRunOptions) ->
     vertical axis of the first one through the centre of the object's box.
     """
     names = (model.category, model.model_id, str(view))
-    how = {name: getattr(options, name) for name in ("noise_px", "min_visible", "seed")}
-    instance = make_instance(model, view_index=view, scene=_scene_of(model), **how)
+    instance = make_instance(model, view_index=view, scene=scene_of(model), **options.drawn)
     shown = instance.scene
     assert shown is not None
     stretch = 1 / instance.gt.scale

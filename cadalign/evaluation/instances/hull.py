@@ -45,7 +45,7 @@ class KeypointHull:
             return np.ones(len(self.xyz), dtype=bool)
         faces, beside = self._faces
         facing = faces[:, :3] @ position + faces[:, 3] > 0
-        return np.asarray((beside & facing).any(axis=1))
+        return np.asarray(beside @ facing)  # of truth values: is any of both
 
     @cached_property
     def _faces(self) -> tuple[FloatArray, BoolArray] | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -135,6 +135,10 @@ def load_scene(model: AnnotatedModel) -> Scene:
     return Scene(mesh)
 
 
+scene_of = lru_cache(maxsize=1)(load_scene)
+"""The mesh that was read last: views of one model come one after another."""
+
+
 def make_instance(
     model: AnnotatedModel,
     *,
@@ -198,8 +202,10 @@ def _stretched(views: Sequence[_Seen], *, noise_px: float, scene: Scene | None) 
     stretches = np.ones((len(views), 3))
     stretches[:, 1:] = low + (high - low) * np.array([view.rng.random(2) for view in views])
     bounds = np.array([view.bounds for view in views])
+    poses = [view.cam_from_model for view in views]  # without a stretch
     in_camera = [
-        view.xyz @ view.cam_from_model.linear.T + view.cam_from_model.translation for view in views
+        view.xyz @ pose.rotation.T + pose.translation
+        for view, pose in zip(views, poses, strict=True)
     ]
     exact = KEYPOINT_CAMERA.pixels_from_normalized(perspective(np.concatenate(in_camera)))
     noise = np.concatenate([view.rng.standard_normal((len(view.xyz), 2)) for view in views])

@@ -28,6 +28,7 @@ _MODEL_DIGITS = 9
 _PIXEL_DIGITS = 4
 _WARP_DIGITS = 6
 _LONGEST_NAME = 200  # bytes
+_CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 # Several times as fast as the standard library's; numbers that are not finite become null.
 _ENCODER = msgspec.json.Encoder(enc_hook=np.generic.item)
 _LIKE_A_VIEW = re.compile(r"_[1-9][0-9]*\Z")
@@ -135,9 +136,8 @@ def record_of(
     """
     if stretch is None:
         stretch = np.ones(3) if gt is None else 1 / gt.scale
-    names = ("width", "height", "fx", "fy", "cx", "cy")
     record = {
-        "camera": {name: getattr(camera, name) for name in names},
+        "camera": {name: getattr(camera, name) for name in _CAMERA},
         "gt": None if gt is None else _pose(gt),
         "stretch": _rounded(stretch),
         "bounds": _rounded(bounds),

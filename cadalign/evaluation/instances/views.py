@@ -28,10 +28,10 @@ from cadalign.evaluation.instances.hull import KeypointHull
 from cadalign.evaluation.instances.instance import (
     Instance,
     KeypointTask,
-    load_scene,
     make_hull_instances,
     make_instance,
     mesh_of,
+    scene_of,
 )
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
@@ -125,33 +125,36 @@ class KeypointViews(Setting):
         return [KeypointTask("warm-up", "", hull=hull, ids=np.arange(12))]
 
     def cases(self, tasks: Sequence[KeypointTask]) -> list[Case]:
-        start, found = time.perf_counter(), []
+        start = time.perf_counter()
         instances = self._instances(tasks)
         share = (time.perf_counter() - start) / max(len(tasks), 1)
-        for task, instance in zip(tasks, instances, strict=True):
-            (case,) = self.failed(task)
-            if isinstance(instance, Exception):
-                found.append(replace(case, error=instance, seconds=share))
-                continue
-            _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
-            facts = {
-                "visibility": instance.visibility,
-                "keypoints": len(instance.points_3d),
-                "stretch_y": stretch_y,
-                "stretch_z": stretch_z,
-                "symmetry": str(task.symmetry),
-            }
-            found.append(replace(case, facts=facts, instance=(task, instance)))
-        return found
+        return [
+            replace(self.failed(task)[0], error=instance, seconds=share)
+            if isinstance(instance, Exception)
+            else self._case(task, instance)
+            for task, instance in zip(tasks, instances, strict=True)
+        ]
+
+    def _case(self, task: KeypointTask, instance: Instance) -> Case:
+        _, stretch_y, stretch_z = (1 / instance.gt.scale).tolist()
+        facts = {
+            "visibility": instance.visibility,
+            "keypoints": len(instance.points_3d),
+            "stretch_y": stretch_y,
+            "stretch_z": stretch_z,
+            "symmetry": str(task.symmetry),
+        }
+        return Case(task.names, facts, (task, instance), without=self._without(task))
 
     def failed(self, task: KeypointTask) -> list[Case]:
         facts = {"visibility": "", "symmetry": "" if task.problem else str(task.symmetry)}
-        has_shape = task.category in dict(self.shapes.paths)
-        return [Case(task.names, facts, without=() if has_shape else (SHAPE,))]
+        return [Case(task.names, facts, without=self._without(task))]
+
+    def _without(self, task: KeypointTask) -> tuple[str, ...]:
+        return () if task.category in dict(self.shapes.paths) else (SHAPE,)
 
     def _instances(self, tasks: Sequence[KeypointTask]) -> list[Instance | Exception]:
-        names = ("noise_px", "min_visible", "seed")
-        how = {name: getattr(self.options, name) for name in names}
+        how = self.options.drawn
         plain = [task for task in tasks if not task.problem and task.model is None]
         of_hulls = iter(make_hull_instances(plain, **how))
         instances: list[Instance | Exception] = []
@@ -243,10 +246,6 @@ def _draw(folder: RunFolder, view: KeypointView, estimate: Any) -> None:
     write_picture(draw_instance, folder, instance, estimate, *task.names.values())
 
 
-# Views of one model come one after another.
-_scene_of = lru_cache(maxsize=1)(load_scene)
-
-
 def _with_mesh(task: KeypointTask, **how: Any) -> Instance:
     assert task.model is not None
-    return make_instance(task.model, scene=_scene_of(task.model), view_index=task.view, **how)
+    return make_instance(task.model, scene=scene_of(task.model), view_index=task.view, **how)

@@ -182,16 +182,16 @@ def _fit(given: MethodInput, *, name: str) -> Result:
 
 
 def _fit_many(inputs: Sequence[MethodInput], *, name: str) -> list[Alignment | CadalignError]:
-    """The alignments of many instances, in batches of one standard deviation."""
+    """The alignments of many instances, in batches of one standard deviation and camera."""
     from cadalign.estimation.fit import fit_batch
 
     found: list[Alignment | CadalignError] = []
-    for sigma, group in groupby(inputs, key=lambda given: given.sigma):
+    for (sigma, camera), group in groupby(inputs, key=lambda given: (given.sigma, given.camera)):
         some = list(group)
         batch = fit_batch(
             [given.points_3d for given in some],
             [given.points_2d for given in some],
-            [given.camera for given in some],
+            camera,
             **fit_options(name, sigma=sigma, ransac=None),
         )
         found += [batch.errors.get(b) or batch.alignment(b) for b in range(len(batch))]

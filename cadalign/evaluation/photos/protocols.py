@@ -126,9 +126,7 @@ class KeypointOptions(ExperimentOptions):
         self.check_least(simulated_points=4, min_keypoints=1)
         if self.sigma is not None and not 0 < self.sigma < math.inf:
             raise InputError(f"{self.sigma} is not positive", where="sigma")
-        if not 0 <= self.simulated_noise_px < math.inf:
-            what = f"{self.simulated_noise_px} is not a noise level"
-            raise InputError(what, where="simulated_noise_px")
+        self.check_noise("simulated_noise_px")
         if not math.isfinite(self.min_score):
             raise InputError(f"{self.min_score} is not a score", where="min_score")
 

@@ -25,12 +25,11 @@ from cadalign.evaluation.runs.tables import (
     read_table,
     uncompressed_bytes,
 )
+from cadalign.evaluation.runs.work import COLUMNS
 from cadalign.io.documents import convert, in_file, read_json
 
 Cells = dict[str, npt.NDArray[Any]]
 """Columns of a table by name."""
-COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
-"""Columns of the result table of every experiment."""
 _SECONDS: Columns = (("seconds", float),)
 _NO_TIMINGS = pa.table({})
 _TIMINGS_FIX = "remove it: the run is shown without times"

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)
 
+COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
+"""Columns of the result table of every experiment."""
 OK = "ok"
 FAILED = "failed"
 LEFT_OUT = "left out"

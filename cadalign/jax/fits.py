@@ -11,6 +11,7 @@ from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.layers import BatchMinima, FitTask, FitValues, fits_of
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
+from cadalign.torch.poses import cameras_of
 
 if TYPE_CHECKING:
     from jax import Array
@@ -63,20 +64,8 @@ def fit(
 
     Parameters
     ----------
-    points_3d : (n, 3) or (B, n, 3) array
-        Keypoints on the models [model units].
-    points_2d : (B, n, 2) array
-        The same keypoints in the images [px]. Its precision is the result's; the search itself is
-        in double precision.
-    camera : Camera or sequence of B Camera
-    sigma : array that broadcasts to (B, n)
-        Standard deviations of the keypoints [px].
-    mask : (B, n) bool array, optional
-        Marks the keypoints that are present. Those that are not finite count as absent.
-    exact : bool
-        Take the cost's Hessian for the gradients, otherwise its Gauss-Newton matrix.
-    workers : int
-        Number of threads that share the problems; -1 for all cores.
+    points_3d, points_2d, camera, sigma, mask, exact, workers
+        As for `cadalign.torch.fit`, arrays in the place of tensors.
     **options
         As for `cadalign.fit`: ``loss``, ``loss_scale``, ``stretch``, ``stretch_sigma``,
         ``known_axis``, ``focal`` and ``focal_prior``.
@@ -108,12 +97,7 @@ def fit(
     pixels = jnp.asarray(points_2d)
     if pixels.ndim != 3 or pixels.shape[2] != 2:
         raise InputError(f"shape {pixels.shape}, expected (B, n, 2)", where="points_2d")
-    count = len(pixels)
-    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
-    if len(cameras) not in (1, count):
-        what = f"{len(cameras)} cameras for {count} problems"
-        raise InputError(what, where="camera", fix="give one, or one for each problem")
-    task = FitTask(cameras, FitOptions(**options), exact, workers)
+    task = FitTask(cameras_of(camera, len(pixels)), FitOptions(**options), exact, workers)
     present = True if mask is None else mask
     given = [
         _expanded(points_3d, (*pixels.shape[:2], 3), "points_3d").astype(pixels.dtype),

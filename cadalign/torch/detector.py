@@ -8,6 +8,7 @@ standard deviation that of the keypoint.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -102,8 +103,6 @@ class KeypointDetector:
 
     def copy(self) -> KeypointDetector:
         """A copy that is trained apart."""
-        from copy import deepcopy
-
         return KeypointDetector(deepcopy(self.network), self.calibration)
 
 

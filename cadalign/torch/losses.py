@@ -84,20 +84,19 @@ def reprojection_loss(
 
     Parameters
     ----------
-    found, truth : PoseBatch
-        For a learned shape, the points of each are its own, where it has ``points_3d``.
+    found, truth, symmetry
+        As for `rotation_loss`, rotations about an axis in steps of 10 degrees or less. For a
+        learned shape, the points of each are its own, where it has ``points_3d``.
     points_3d : (n, 3) or (B, n, 3) tensor
     camera : Camera or sequence of B Camera
         Without distortion.
-    symmetry : Symmetry, optional
-        The model's; rotations about an axis in steps of 10 degrees or less.
     beta : float
         Distance below which the loss is quadratic [px].
 
     Returns
     -------
     (B,) tensor
-        0, without gradient, for estimates that are not valid.
+        As of `rotation_loss`.
 
     Examples
     --------
@@ -126,22 +125,21 @@ def box_loss(
     *,
     symmetry: Symmetry | None = None,
 ) -> Tensor:
-    """Mean distance of the box's corners over the true box's diagonal, (B,) tensor.
+    """Mean distance of the box's corners over the true box's diagonal.
 
     For a learned shape, the estimated box is that of its keypoints.
 
     Parameters
     ----------
-    found, truth : PoseBatch
+    found, truth, symmetry
+        As for `reprojection_loss`.
     bounds : (2, 3) or (B, 2, 3) tensor
         Least and greatest coordinates of the model, before its stretch.
-    symmetry : Symmetry, optional
-        The model's; rotations about an axis in steps of 10 degrees or less.
 
     Returns
     -------
     (B,) tensor
-        0, without gradient, for estimates that are not valid.
+        As of `rotation_loss`.
 
     Examples
     --------

@@ -33,7 +33,7 @@ else:
 
     torch = _LazyLibrary()
 
-__all__ = ["PoseBatch", "as_array", "calibrations", "checked", "expanded", "torch"]
+__all__ = ["PoseBatch", "as_array", "calibrations", "cameras_of", "checked", "expanded", "torch"]
 
 _LEAST_DEPTH = 1e-3  # over the distance; what lies nearer or behind is projected from there
 
@@ -80,8 +80,8 @@ class PoseBatch:
 
     def apply(self, points_3d: Tensor) -> Tensor:
         """Model points (n, 3) or (B, n, 3) in the cameras; (B, n, 3) tensor."""
-        stretched = points_3d * self.scale[:, None]
-        return stretched @ self.rotation.transpose(1, 2) + self.translation[:, None]
+        stretched = points_3d * self.scale[..., None, :]
+        return stretched @ self.rotation.mT + self.translation[..., None, :]
 
     def project(self, points_3d: Tensor, camera: Camera | Sequence[Camera]) -> Tensor:
         """Project model points (n, 3) or (B, n, 3); (B, n, 2) tensor [px].
@@ -93,15 +93,19 @@ class PoseBatch:
         InputError
             If a camera has distortion.
         """
+        calibration = calibrations(camera, len(self.scale)).to(self.scale)
+        ratio = None if self.focal is None else (self.focal / calibration[:, 0])[:, None, None]
+        return self.project_by(calibration[:, None], points_3d, ratio)
+
+    def project_by(
+        self, calibration: Tensor, points_3d: Tensor, ratio: Tensor | None = None
+    ) -> Tensor:
+        """Project by `calibrations` (..., 1, 4), with focal lengths times a ratio."""
         in_camera = self.apply(points_3d)
-        calibration = calibrations(camera, len(self.scale)).to(in_camera)[:, None]
-        if self.focal is not None:
-            ratio = (self.focal / calibration[:, 0, 0])[:, None, None]
-        else:
-            ratio = 1.0
-        least = _LEAST_DEPTH * self.translation.detach().norm(dim=1)[:, None]
+        least = _LEAST_DEPTH * self.translation.detach().norm(dim=-1)[..., None]
         depths = torch.maximum(in_camera[..., 2], least)[..., None]
-        return in_camera[..., :2] / depths * calibration[..., :2] * ratio + calibration[..., 2:]
+        plane = in_camera[..., :2] / depths * calibration[..., :2]
+        return (plane if ratio is None else plane * ratio) + calibration[..., 2:]
 
 
 def calibrations(camera: Camera | Sequence[Camera], count: int) -> Tensor:
@@ -122,11 +126,10 @@ def cameras_of(camera: Camera | Sequence[Camera], count: int) -> tuple[Camera, .
 
     Raises InputError if it is neither one nor as many.
     """
-    if isinstance(camera, Camera):
-        return (camera,)
-    cameras = tuple(camera)
-    if len(cameras) != count:
-        raise InputError(f"{len(cameras)} cameras for {count} problems", where="camera")
+    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
+    if len(cameras) not in (1, count):
+        what = f"{len(cameras)} cameras for {count} problems"
+        raise InputError(what, where="camera", fix="give one, or one for each problem")
     return cameras
 
 

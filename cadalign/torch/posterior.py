@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 _FREEDOM = 5.0  # of the proposals' Student distribution
 _INFLATION = 1.5  # of their covariance
-_LEAST_DEPTH = 1e-3  # over the distance
 _LEAST_SPREAD = 1e-12
 
 
@@ -103,12 +102,8 @@ def posterior_loss(
 
     def costs(rotation: Tensor, translation: Tensor, scale: Tensor) -> Tensor:
         """-2 log likelihood (B, k) with the prior on the scales, normalised over the pixels."""
-        stretched = points[:, None] * scale[:, :, None]
-        in_camera = stretched @ rotation.transpose(-1, -2) + translation[:, :, None]
-        least = _LEAST_DEPTH * translation.norm(dim=-1)[..., None]
-        depths = torch.maximum(in_camera[..., 2], least)[..., None]
-        focals, center = calibration[:, None, None].split(2, dim=-1)
-        projected = in_camera[..., :2] / depths * focals + center
+        poses = PoseBatch(rotation, translation, scale)
+        projected = poses.project_by(calibration[:, None, None], points[:, None])
         each = sigmas[:, None]
         squares = ((projected - pixels[:, None]) ** 2).sum(dim=-1) / each**2
         bent = _bent(squares, loss, loss_scale)

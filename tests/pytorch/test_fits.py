@@ -220,7 +220,10 @@ def test_align_marks_what_has_too_few_keypoints() -> None:
             lambda p, x, c: fit(p[:, :5], x, c),
             "points_3d: shape (3, 5, 3), expected one that expands to (3, 10, 3)",
         ),
-        (lambda p, x, c: fit(p, x, [c, c]), "camera: 2 cameras for 3 problems"),
+        (
+            lambda p, x, c: fit(p, x, [c, c]),
+            "camera: 2 cameras for 3 problems; give one, or one for each problem",
+        ),
         (
             lambda p, x, c: PoseBatch(*fit(p, x, c).__dict__.values()).project(p, LENS),
             "camera: projections in PyTorch know no lens distortion; undistort keypoints and "

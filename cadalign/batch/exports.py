@@ -29,7 +29,7 @@ from cadalign.export.formats import export_object, format_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import join
 from cadalign.io.documents import parse_json
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import made_folder, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model
@@ -107,7 +107,7 @@ def export_run(
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
     left_out: list[CadalignError] = []
     results = _run_results(RunFolder(run), rows)
-    _make_folder(to.parent)
+    made_folder(to.parent)
     if name == DOCUMENTS:
         count = _write_documents(to, results)
     else:
@@ -121,9 +121,11 @@ def export_run(
     return Exported(to, count, tuple(left_out))
 
 
-def _make_folder(path: Path) -> None:
-    with writing(path):
-        path.mkdir(parents=True, exist_ok=True)
+def _made_file(path: Path, name: str) -> Path:
+    """The file ``path``, or ``name`` in a folder ``path``; makes the folder that it is in."""
+    file = path if path.suffix.lower() == Path(name).suffix else path / name
+    made_folder(file.parent)
+    return file
 
 
 def _run_results(folder: RunFolder, rows: Collection[int]) -> Iterator[_Stored]:
@@ -163,8 +165,7 @@ def _write_documents(folder: Path, results: Iterator[_Stored]) -> int:
     """Write each observation and its fit.json, as `cadalign fit` of the single file does."""
     count = 0
     for _, row, seen, result in results:
-        path, fit = folder / f"{row:06d}.json", folder / f"{row:06d}_fit"
-        _make_folder(fit)
+        path, fit = folder / f"{row:06d}.json", made_folder(folder / f"{row:06d}_fit")
         seen.save(path)
         write_json(fit / "fit.json", result.to_dict() | {"observation": f"../{path.name}"})
         count += 1
@@ -199,8 +200,7 @@ def _write_overlays(
     style: OverlayStyle | None = None,
 ) -> int:
     """Draw each model over its photos, grey where there is none."""
-    with writing(folder):
-        folder.mkdir(exist_ok=True)
+    made_folder(folder)
     count = 0
     for each in objects:
         try:
@@ -231,9 +231,7 @@ def _write_coco(path: Path, objects: Iterator[RunObject], left_out: list[Cadalig
             more = replace(known, objects=known.objects + photo.objects)
             photos[photo.name, photo.image] = more
         count += 1
-    file = path if path.suffix.lower() == ".json" else path / "keypoints.json"
-    _make_folder(file.parent)
-    write_coco_keypoints(file, list(photos.values()))
+    write_coco_keypoints(_made_file(path, "keypoints.json"), list(photos.values()))
     return count
 
 
@@ -250,8 +248,7 @@ def _write_bop_results(
     path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]
 ) -> int:
     """Poses of the stretched meshes, which stand beside them as ``obj_<row + 1>.ply``."""
-    file = path if path.suffix.lower() == ".csv" else path / "results.csv"
-    _make_folder(file.parent)
+    file = _made_file(path, "results.csv")
     poses, entries, numbers = [], {}, dict[str, int]()
     for each in objects:
         exported, number = each.exported, each.row + 1
@@ -281,8 +278,14 @@ def _rigid(pose: Alignment, unit: float) -> Alignment:
     return Alignment(pose.rotation, pose.translation * unit, np.ones(3))
 
 
-def _cameras(objects: Iterator[RunObject]) -> list[CameraView]:
-    """The cameras in the frame of the object that each sees [m], with names of their own."""
+def _write_cameras(
+    path: Path,
+    objects: Iterator[RunObject],
+    left_out: list[CadalignError],
+    *,
+    write: Callable[[Path, Sequence[CameraView]], None],
+) -> int:
+    """Write the cameras in the frame of the object that each sees [m], with names of their own."""
     found, names = [], set[str]()
     for each in objects:
         for number, view in enumerate(each.exported.views):
@@ -292,49 +295,33 @@ def _cameras(objects: Iterator[RunObject]) -> list[CameraView]:
             names.add(name)
             placed = _rigid(view.cam_from_model, each.exported.metres)
             found.append(CameraView(view.camera, placed, name))
-    return found
-
-
-_Writer = Callable[[Path, Iterator[RunObject], list[CadalignError]], int]
-
-
-def _write_cameras(write: Callable[[Path, Sequence[CameraView]], None]) -> _Writer:
-    def written(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-        cameras = _cameras(objects)
-        if cameras:
-            write(path, cameras)
-        return len(cameras)
-
-    return written
+    if found:
+        write(path, found)
+    return len(found)
 
 
 def _write_nerf(path: Path, cameras: Sequence[CameraView]) -> None:
-    file = path if path.suffix.lower() == ".json" else path / "transforms.json"
-    _make_folder(file.parent)
-    write_nerf(file, cameras)
+    write_nerf(_made_file(path, "transforms.json"), cameras)
 
 
-def _write_data_set(form: str) -> _Writer:
-    def written(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-        photos = list(_photos(objects))
-        if not photos:
-            return 0
-        problems = write_photos(path, photos, form)
-        left_out.extend(problems)
-        return len(photos) - len(problems)
-
-    return written
+def _write_data_set(
+    path: Path, objects: Iterator[RunObject], left_out: list[CadalignError], *, form: str
+) -> int:
+    photos = list(_photos(objects))
+    problems = write_photos(path, photos, form) if photos else ()
+    left_out.extend(problems)
+    return len(photos) - len(problems)
 
 
 DOCUMENTS = "json"
 """The format that needs no mesh, nor anything else that a file must be read for."""
-RUN_FORMATS: dict[str, _Writer] = {
+RUN_FORMATS: dict[str, Callable[[Path, Iterator[RunObject], list[CadalignError]], int]] = {
     "overlay": _write_overlays,
     "glb": _write_glb,
     "coco": _write_coco,
-    "colmap": _write_cameras(write_colmap),
-    "nerfstudio": _write_cameras(_write_nerf),
+    "colmap": partial(_write_cameras, write=write_colmap),
+    "nerfstudio": partial(_write_cameras, write=_write_nerf),
     "bop-results": _write_bop_results,
-    **{form: _write_data_set(form) for form in FORMS},
+    **{form: partial(_write_data_set, form=form) for form in FORMS},
 }
 """The other formats by name."""

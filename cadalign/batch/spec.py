@@ -31,6 +31,7 @@ from cadalign.evaluation.summary import (
     median_of,
 )
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import extent
 from cadalign.geometry.camera import Camera
 
 Statistics = Mapping[str, Callable[[Cells], float]]
@@ -139,10 +140,8 @@ def _pose(data: Row) -> Row:
 
 
 def _extent(points: Sequence[Sequence[float]]) -> list[list[float]]:
-    placed = np.array(points).reshape(-1, 3)
-    if not len(placed):
-        return [[0.0] * 3, [0.0] * 3]
-    return [placed.min(axis=0).tolist(), placed.max(axis=0).tolist()]
+    found: list[list[float]] = extent(np.array(points or [[0.0] * 3])).tolist()
+    return found
 
 
 _STATISTICS = {

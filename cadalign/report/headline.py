@@ -203,14 +203,12 @@ def table_text(headline: Headline, names: Sequence[str], *, format: str) -> str:
 
 
 def _csv(headline: Headline, names: Sequence[str]) -> str:
-    runs = ["run"] if len(names) > 1 else []
-    head = [*runs, headline.group, "method", *(column.heading for column in headline.columns)]
     lines: list[list[object]] = []
-    for row, name in _rows(headline, names):
-        labels = [*([name] if runs else []), row.category, row.method]
+    for row, names_of_row in _rows(headline, names):
         # A cell that is None is empty.
-        lines.append([*labels, *(row.cells[column.key] for column in headline.columns)])
-    return csv_text([head, *lines])
+        cells = (row.cells[column.key] for column in headline.columns)
+        lines.append([*names_of_row, row.method, *cells])
+    return csv_text([_head(headline, names), *lines])
 
 
 def _markdown(headline: Headline, names: Sequence[str]) -> str:
@@ -246,11 +244,9 @@ def _latex(headline: Headline, names: Sequence[str]) -> str:
 def _table(
     headline: Headline, names: Sequence[str], escapes: dict[int, str], best: str
 ) -> tuple[list[str], list[list[str]]]:
-    runs = ["run"] if len(names) > 1 else []
-    head = [*runs, headline.group, "method", *(c.heading for c in headline.columns)]
     rows = []
-    for row, name in _rows(headline, names):
-        labels = [*([name] if runs else []), row.category, look_of(row.method).label]
+    for row, names_of_row in _rows(headline, names):
+        labels = [*names_of_row, look_of(row.method).label]
         cells = [label.translate(escapes) for label in labels]
         for column in headline.columns:
             value = row.cells[column.key]
@@ -258,12 +254,18 @@ def _table(
             text = text.translate(escapes)
             cells.append(best.format(text) if column.key in row.best else text)
         rows.append(cells)
-    return [text.translate(escapes) for text in head], rows
+    return [text.translate(escapes) for text in _head(headline, names)], rows
 
 
-def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, str]]:
+def _head(headline: Headline, names: Sequence[str]) -> list[str]:
+    headings = (column.heading for column in headline.columns)
+    return [*(["run"] if len(names) > 1 else []), headline.group, "method", *headings]
+
+
+def _rows(headline: Headline, names: Sequence[str]) -> list[tuple[HeadlineRow, list[str]]]:
+    """The rows with run, where there are several, and category."""
     rows = [(row, names[row.run]) for row in headline.rows]
     for stated in headline.paper:
         place = max(k for k, (row, _) in enumerate(rows) if row.category == stated.category)
         rows.insert(place + 1, (stated, ""))
-    return rows
+    return [(row, [*([name] if len(names) > 1 else []), row.category]) for row, name in rows]

@@ -36,7 +36,6 @@ from cadalign.estimation.contours.view_contour import cost_of_contour
 from cadalign.estimation.model import Model
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.render import Geometry, Scene, cast_geometry, silhouette_iou
@@ -196,22 +195,18 @@ def _match(
     silhouette = cast_geometry(Scene(cast(Mesh, aligned.given.mesh)), camera, alignment).mask
     found = aligned.residuals[np.isfinite(aligned.residuals)]
     none: FloatArray = np.empty((0, 3))
-    return Match(
-        category=model.category,
-        model_id=model.model_id,
-        alignment=alignment,
+    return Match.of(
+        model,
+        alignment,
         rms=float(np.sqrt((found**2).mean())) if len(found) else float("nan"),
         log_likelihood=log_likelihood,
         score=score,
-        box=Box.from_model(model.bounds, alignment),
-        bounds=model.bounds,
         ids=np.empty(0, dtype=np.int64),
         points_3d=none,
         points_2d=none[:, :2],
         residuals=none[:, :2],
         missing_ids=(),
         mirrored=False,
-        mesh_path=model.mesh_path,
         silhouette_iou=silhouette_iou(est=silhouette, gt=inside),
         camera=camera,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,18 +15,18 @@ from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
+from cadalign.io.files import as_path, checksum
 from cadalign.names import renamed
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_by_category
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import (
+    SEAL,
     LibraryModel,
     ModelKey,
     ModelTable,
-    fingerprint,
     read_annotated,
     read_library,
-    write_library,
 )
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
@@ -133,7 +134,7 @@ class Library:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the library to a file atomically; raises DataError on failure."""
-        write_library(path, self._table)
+        SEAL.write(as_path(path), self._table.payload())
 
     def __len__(self) -> int:
         return len(self._table)
@@ -143,8 +144,9 @@ class Library:
 
     def __getitem__(self, key: ModelKey) -> LibraryModel:
         """Find a model, as ``library["chair", model_id]``; raises InputError if there is none."""
-        row = self._table.find(key)
-        if row is None:
+        keys = self._table.keys
+        row = bisect_left(keys, key)
+        if keys[row : row + 1] != [key]:
             raise InputError(f"no model {key[1]!r} of {key[0]!r}", where="library")
         return self._table.model(row)
 
@@ -169,7 +171,7 @@ class Library:
     @property
     def fingerprint(self) -> str:
         """Hash of the library's content, as text."""
-        return fingerprint(self._table)
+        return checksum(self._table.payload()).hex()
 
     @renamed(semantic_ids="ids")
     def retrieve(

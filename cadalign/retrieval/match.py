@@ -25,6 +25,8 @@ from cadalign.notebook import card, draw_picture
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+    from cadalign.retrieval.models import LibraryModel
+
 METHOD = "retrieve"
 """Method of a match's result."""
 
@@ -71,6 +73,19 @@ class Match:
     takes the object for none of them."""
     camera: Camera | None = field(default=None, repr=False)
     """The camera of the image."""
+
+    @classmethod
+    def of(cls, model: LibraryModel, alignment: Alignment, **fit: Any) -> Match:
+        """A match of a library's model, with the other fields but box and bounds."""
+        return cls(
+            category=model.category,
+            model_id=model.model_id,
+            alignment=alignment,
+            box=Box.from_model(model.bounds, alignment),
+            bounds=model.bounds,
+            mesh_path=model.mesh_path,
+            **fit,
+        )
 
     @property
     def shared(self) -> int:

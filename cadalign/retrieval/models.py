@@ -26,8 +26,9 @@ import pyarrow.compute as pc
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.datasets import AnnotatedModel, Circle, RotationalSymmetry, Symmetries, load_mesh
 from cadalign.errors import DataError, InputError
+from cadalign.geometry.box import extent
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.files import Seal, as_path, checksum
+from cadalign.io.files import Seal, as_path
 from cadalign.names import renamed
 
 ModelKey = tuple[str, str]
@@ -91,7 +92,7 @@ class LibraryModel:
         """
         xyz, path = model.keypoints.xyz, model.mesh_path if with_mesh else None
         if path is None:
-            bounds = np.array([xyz.min(axis=0), xyz.max(axis=0)])
+            bounds = extent(xyz)
         else:
             bounds, path = load_mesh(path).bounds, path.absolute()
         own = model.category, model.model_id, xyz, model.keypoints.ids, bounds
@@ -231,11 +232,6 @@ class ModelTable:
         points[np.repeat(np.arange(len(points)), np.diff(offsets)), column] = self.xyz[own]
         return ids, points
 
-    def find(self, key: ModelKey) -> int | None:
-        """Row of a model; None if there is none."""
-        row = bisect_left(self.keys, key)
-        return row if row < len(self) and self.keys[row] == key else None
-
     def model(self, row: int) -> LibraryModel:
         """Make the model of a row."""
         own = slice(int(self.offsets[row]), int(self.offsets[row + 1]))
@@ -244,6 +240,13 @@ class ModelTable:
         category, model_id = self.keys[row]
         xyz, ids, bounds = self.xyz[own], self.ids[own], self.bounds[row]
         return LibraryModel(category, model_id, xyz, ids, bounds, symmetries, path and Path(path))
+
+    def payload(self) -> pa.Buffer:
+        """All content, as the file of a library has it."""
+        sink = pa.BufferOutputStream()
+        with pa.ipc.new_file(sink, SCHEMA) as writer:
+            writer.write_table(self.table)
+        return sink.getvalue()
 
     def _column(self, name: str) -> Any:
         column = self.table[name]
@@ -347,11 +350,6 @@ def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) 
     return list(unique.values())[1:]
 
 
-def write_library(path: str | os.PathLike[str], models: ModelTable) -> None:
-    """Write a library's file atomically."""
-    SEAL.write(as_path(path), _payload(models))
-
-
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
     """Map a library's file into memory and check it."""
     where = str(path)
@@ -403,15 +401,3 @@ def _check_table(table: pa.Table) -> None:
     keys = list(zip(table["category"].to_pylist(), table["model_id"].to_pylist(), strict=True))
     if keys != sorted(set(keys)):
         raise ValueError("models are not sorted by category and id")
-
-
-def fingerprint(models: ModelTable) -> str:
-    """Hash of all content of a library, as text."""
-    return checksum(_payload(models)).hex()
-
-
-def _payload(models: ModelTable) -> pa.Buffer:
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_file(sink, SCHEMA) as writer:
-        writer.write_table(models.table)
-    return sink.getvalue()

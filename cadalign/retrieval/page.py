@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import write_json, write_text, writing
+from cadalign.io.files import made_folder, write_json, write_text, writing
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
@@ -46,11 +46,8 @@ def write_retrieval(
     for rank, match in enumerate(matches, start=1):
         write_image(folder / overlay_name(rank), draw_match(image, camera, match))
         if query is not None:
-            observation, fit = folder / f"match_{rank:02d}.json", folder / f"match_{rank:02d}_fit"
-            match.observation(query).save(observation)
-            with writing(fit):
-                fit.mkdir(exist_ok=True)
-            match.result.save(fit / "fit.json")
+            match.observation(query).save(folder / f"match_{rank:02d}.json")
+            match.result.save(made_folder(folder / f"match_{rank:02d}_fit") / "fit.json")
     write_json(folder / "matches.json", [match.to_dict() for match in matches])
     none = none_text(matches)
     html = fill(

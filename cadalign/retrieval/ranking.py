@@ -32,7 +32,6 @@ from cadalign.estimation.options import LOSSES, Sigma
 from cadalign.estimation.problems import rays_of, whitening_of
 from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
 from cadalign.retrieval.kernels import LEAST_SHARED, Candidates, Query, bound_all, search_all
@@ -382,22 +381,18 @@ def make_matches(
         found = Alignment.from_packed(ranking.poses[place])
         alignment = turned_alignment(found, observed.facing.lens_from_camera)
         residuals = observed.camera.project(alignment.apply(points_3d)) - observed.points_2d[rows]
-        match = Match(
-            category=model.category,
-            model_id=model.model_id,
-            alignment=alignment,
+        match = Match.of(
+            model,
+            alignment,
             rms=float(np.sqrt((residuals**2).sum(axis=1).mean())),
             log_likelihood=float(ranking.log_likelihoods[place]),
             score=float(ranking.scores[place]),
-            box=Box.from_model(model.bounds, alignment),
-            bounds=model.bounds,
             ids=observed.query.ids[rows],
             points_3d=points_3d,
             points_2d=observed.points_2d[rows],
             residuals=residuals,
             missing_ids=tuple(np.delete(observed.query.ids, rows).tolist()),
             mirrored=bool(candidates.mirrored[candidate]),
-            mesh_path=model.mesh_path,
             none_probability=none_probability,
             camera=observed.camera,
         )

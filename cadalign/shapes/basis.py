@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats
 from cadalign.errors import InputError
+from cadalign.geometry.box import extent
 from cadalign.shapes.parts import (
     AXES,
     BOX_ROWS,
@@ -39,8 +40,7 @@ def component_of_basis(
     if (sigmas < 0).any():
         row = int(np.flatnonzero(sigmas < 0)[0])
         raise InputError(f"deviations[{row}] is negative ({sigmas[row]:g})", where="deviations")
-    spanned = np.array([points.min(axis=0), points.max(axis=0)])
-    rows = np.vstack([points, spanned if box is None else checked_box(box, "box")])
+    rows = np.vstack([points, extent(points) if box is None else checked_box(box, "box")])
     scaled = sigmas[:, None, None] * directions
     extended = [np.vstack([mode, _corners(points, mode, rows[-BOX_ROWS:])]) for mode in scaled]
     extended += _size_modes(rows, size_sigma)

@@ -12,10 +12,13 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, as_points, read_only
 from cadalign.errors import DataError, InputError, quote, require_kind
+from cadalign.geometry.box import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids, checked_box
 
 logger = logging.getLogger("cadalign")
+
+LEAST_MODELS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,7 @@ def examples_of(
 
 
 def tabulated(
-    examples: Sequence[Example], *, least: int
+    examples: Sequence[Example],
 ) -> tuple[tuple[KeypointId, ...], FloatArray, TrainingShapes]:
     """Models as rows of one array: all ids that a model has, sorted, and the rows.
 
@@ -106,12 +109,9 @@ def tabulated(
     for number, each in enumerate(examples):
         fix = "`cadalign shape learn` takes the folder of a data set"
         require_kind(each, Example, f"models[{number}]", fix=fix)
-    if len(examples) < least:
-        raise InputError(
-            f"{len(examples)} models are too few to learn a shape from",
-            where="models",
-            fix=f"give at least {least}",
-        )
+    if len(examples) < LEAST_MODELS:
+        what = f"{len(examples)} models are too few to learn a shape from"
+        raise InputError(what, where="models", fix=f"give at least {LEAST_MODELS}")
     _check_names(examples)
     ids = tuple(sorted({label for each in examples for label in each.ids}))
     column = {label: row for row, label in enumerate(ids)}
@@ -120,7 +120,7 @@ def tabulated(
     for row, each in zip(rows, examples, strict=True):
         row[[column[label] for label in each.ids]] = each.points_3d
         if not measured:
-            row[-BOX_ROWS:] = each.points_3d.min(axis=0), each.points_3d.max(axis=0)
+            row[-BOX_ROWS:] = extent(each.points_3d)
         elif each.bounds is not None:
             row[-BOX_ROWS:] = each.bounds
     shapes = TrainingShapes(
@@ -132,21 +132,16 @@ def tabulated(
 
 
 def _check_names(examples: Sequence[Example]) -> None:
-    kind = type(examples[0].ids[0])
     words = {int: "numbers", str: "names"}
-    for each in examples:
-        if type(each.ids[0]) is not kind:
-            raise InputError(
-                f"its keypoints have {words[type(each.ids[0])]} as ids, those of model "
-                f"{examples[0].model_id} have {words[kind]}",
-                where=f"model {each.model_id}",
-                fix="use one kind in all models",
-            )
+    first, *_ = kinds = [words[type(each.ids[0])] for each in examples]
     seen: set[str] = set()
-    for each in examples:
+    for each, kind in zip(examples, kinds, strict=True):
+        if kind != first:
+            what = f"its keypoints have {kind} as ids, those of model {examples[0].model_id} have "
+            where, fix = f"model {each.model_id}", "use one kind in all models"
+            raise InputError(what + first, where=where, fix=fix)
         if each.model_id in seen:
             raise InputError("occurs twice", where=f"model {quote(each.model_id)}")
         seen.add(each.model_id)
-    sizes = {each.model_id: float(np.ptp(each.points_3d, axis=0).max()) for each in examples}
-    if max(sizes.values()) == 0:
+    if not any(np.ptp(each.points_3d, axis=0).any() for each in examples):
         raise InputError("in every model all keypoints coincide", where="models")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -30,7 +30,6 @@ from cadalign.shapes.gaussians import (
 )
 from cadalign.shapes.parts import BoxMargins, KeypointId, Reflection, ShapeComponent
 
-LEAST_MODELS = 4
 # Lengths relative to the models' median diagonal.
 _FLOOR = 1e-3
 _RESOLUTION = 5e-3  # 2 px where an object's diagonal has 400
@@ -48,13 +47,6 @@ _CLUSTER_MODES = 10
 _CLUSTERINGS = 5
 _STEPS = _FOLDS * (len(_STRENGTHS) + 3 + _MOST_COMPONENTS) + 1
 _MODES = (5, 10, 15, 20, 30, 40, 50, 60, 80, 100)
-
-
-def check_count(value: object, name: str) -> None:
-    """Refuse what is no whole number of at least 1; None is not given."""
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    if value is not None and (not whole or cast(int, value) < 1):
-        raise InputError(f"{value!r} is not a whole number >= 1", where=name)
 
 
 @dataclass(frozen=True)
@@ -233,6 +225,9 @@ def learn_components(
 
     Options are those of `cadalign.ShapeModel.learn`.
     """
+    for name, count in (("components", components), ("modes", modes)):
+        if count is not None and (type(count) is not int or count < 1):
+            raise InputError(f"{count!r} is not a whole number >= 1", where=name)
     if (components or 1) > len(rows):
         what = f"{components} are more than the {len(rows)} models"
         raise InputError(what, where="components")

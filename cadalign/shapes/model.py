@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +14,9 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
 from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
-from cadalign.shapes.examples import Dataset, Example, examples_of, tabulated
+from cadalign.shapes.examples import LEAST_MODELS, Dataset, Example, examples_of, tabulated
 from cadalign.shapes.gaussians import Gaussians
-from cadalign.shapes.learning import LEAST_MODELS, check_count, learn_components
+from cadalign.shapes.learning import learn_components
 from cadalign.shapes.parts import (
     BOX_ROWS,
     BoxMargins,
@@ -28,6 +28,8 @@ from cadalign.shapes.parts import (
     TrainingShapes,
     check_axis,
     check_ids,
+    check_mixture,
+    given_ids,
 )
 from cadalign.shapes.shape_file import read_shape, write_shape
 
@@ -95,18 +97,7 @@ class ShapeModel:
 
     def __post_init__(self) -> None:
         ids = check_ids(self.ids, "ids")
-        if not self.components:
-            raise InputError("there are none", where="components")
-        for row, component in enumerate(self.components):
-            if len(component.mean) != len(ids) + BOX_ROWS:
-                what = (
-                    f"{len(component.mean)} rows, expected {len(ids) + BOX_ROWS}: "
-                    f"{len(ids)} keypoints and {BOX_ROWS} box corners"
-                )
-                raise InputError(what, where=f"components[{row}]")
-        total = sum(component.weight for component in self.components)
-        if abs(total - 1) > 1e-6:
-            raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
+        check_mixture(self.components, len(ids))
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
         if self.reflection is not None:
@@ -117,11 +108,11 @@ class ShapeModel:
         if not is_number(self.inflation) or self.inflation <= 0:
             raise InputError(f"{self.inflation!r} is not a positive number", where="inflation")
         freedom = self.degrees_of_freedom
-        if freedom is not None:
-            if not is_number(freedom) or freedom <= 2:
-                what = f"{freedom!r} is not a number above 2, nor None"
-                raise InputError(what, where="degrees_of_freedom")
-            object.__setattr__(self, "degrees_of_freedom", float(freedom))
+        if freedom is not None and (not is_number(freedom) or freedom <= 2):
+            what = f"{freedom!r} is not a number above 2, nor None"
+            raise InputError(what, where="degrees_of_freedom")
+        freedom = None if freedom is None else float(freedom)
+        object.__setattr__(self, "degrees_of_freedom", freedom)
         object.__setattr__(self, "inflation", float(self.inflation))
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "components", tuple(self.components))
@@ -167,15 +158,10 @@ class ShapeModel:
             If there are too few models, a model id occurs twice, the models' ids are partly numbers
             and partly names, or an option is out of range.
         """
-        check_count(components, "components")
-        check_count(modes, "modes")
-        given, rows, training = tabulated(list(models), least=LEAST_MODELS)
-        wanted: dict[str, Any] = {
-            "components": components,
-            "modes": modes,
-            "reflection": reflection,
-        }
-        learned, choice = learn_components(given, rows, on_progress, **wanted)
+        given, rows, training = tabulated(list(models))
+        learned, choice = learn_components(
+            given, rows, on_progress, components=components, modes=modes, reflection=reflection
+        )
         return cls(
             category=category,
             ids=given,
@@ -213,10 +199,8 @@ class ShapeModel:
         meshes : bool
             Whether to read the meshes for the bounding boxes, where at least half of the models
             have one; otherwise the boxes are those of the keypoints.
-        components, modes, reflection
-            See `ShapeModel.learn`.
-        on_progress : callable
-            Called with the number of steps done and of all, first of reading, then of learning.
+        components, modes, reflection, on_progress
+            See `ShapeModel.learn`; the first steps are those of reading.
 
         Raises
         ------
@@ -224,13 +208,10 @@ class ShapeModel:
             If category or split is unknown, or the category has too few models.
         """
         models = dataset.subset(categories=[category], split=split)[category]
-        where = f"{category}, split {split}" if split else category
         if len(models) < LEAST_MODELS:
-            raise InputError(
-                f"{len(models)} models are too few to learn a shape from",
-                where=where,
-                fix=f"at least {LEAST_MODELS} are needed",
-            )
+            where = f"{category}, split {split}" if split else category
+            what = f"{len(models)} models are too few to learn a shape from"
+            raise InputError(what, where=where, fix=f"at least {LEAST_MODELS} are needed")
         examples = examples_of(models, meshes=meshes, on_progress=on_progress)
         return cls.learn(
             examples,
@@ -307,7 +288,7 @@ class ShapeModel:
         component = component_of_basis(
             mean, modes, deviations, box=box, residual_sigma=residual_sigma, size_sigma=size_sigma
         )
-        labels = _given_ids(ids, names, len(component.mean) - BOX_ROWS)
+        labels = given_ids(ids, names, len(component.mean) - BOX_ROWS)
         if reflection is not None:
             component = symmetric_component(component, labels, reflection)
         return cls(
@@ -356,7 +337,7 @@ class ShapeModel:
         """
         rows = as_floats(mean, name="mean", shape=(None, 3))
         component = component_of_covariance(rows, covariance, modes=modes)
-        labels = _given_ids(ids, names, len(rows) - BOX_ROWS)
+        labels = given_ids(ids, names, len(rows) - BOX_ROWS)
         return cls(category, labels, (component,), up_axis=up_axis, unit=unit)
 
     @classmethod
@@ -393,11 +374,8 @@ class ShapeModel:
     @cached_property
     def gaussians(self) -> Gaussians:
         """The components as arrays: means (G, m + 2, 3), covariances of the stacked rows."""
-        return Gaussians(
-            np.array([each.weight for each in self.components]),
-            np.array([each.mean for each in self.components]),
-            np.array([each.covariance for each in self.components]),
-        )
+        parts = [(each.weight, each.mean, each.covariance) for each in self.components]
+        return Gaussians(*map(np.array, zip(*parts, strict=True)))
 
     def rows(self, ids: Iterable[KeypointId], *, where: str = "ids") -> IntArray:
         """Rows of the keypoints that have these ids, (n,) int.
@@ -442,28 +420,4 @@ class ShapeModel:
         points = as_floats(points_3d, name="points_3d", shape=(len(rows), 3))
         if not len(rows):
             raise InputError("no keypoints", where="points_3d")
-        known = self.training.points_3d[:, rows].astype(np.float64)
-        squares = ((known - points) ** 2).sum(axis=2)
-        # Two objects of the category are this far apart in a keypoint on average.
-        expected = 2 * np.nanvar(self.training.points_3d[:, rows], axis=0).sum(axis=1)
-        distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
-        best = int(np.argmin(distances))
-        return NearestShape(
-            self.training.model_ids[best],
-            self.training.points_3d[best].astype(np.float64),
-            self.training.mesh_paths[best],
-            float(np.sqrt(distances[best])),
-        )
-
-
-def _given_ids(
-    ids: Sequence[KeypointId] | None, names: Sequence[str] | None, count: int
-) -> tuple[KeypointId, ...]:
-    if ids is not None and names is not None:
-        raise InputError("both ids and names are given", where="names", fix="give one of them")
-    where = "ids" if names is None else "names"
-    given = ids if names is None else names
-    labels = check_ids(range(count) if given is None else list(given), where)
-    if len(labels) != count:
-        raise InputError(f"{len(labels)} for {count} keypoints", where=where)
-    return labels
+        return self.training.nearest(points, rows)

@@ -75,6 +75,22 @@ class ShapeComponent:
         return np.asarray((self.modes**2).sum(axis=(1, 2)))
 
 
+def check_mixture(components: Sequence[ShapeComponent], keypoints: int) -> None:
+    """Check that components are of so many keypoints, and that their weights sum to 1."""
+    if not components:
+        raise InputError("there are none", where="components")
+    for row, component in enumerate(components):
+        if len(component.mean) != keypoints + BOX_ROWS:
+            what = (
+                f"{len(component.mean)} rows, expected {keypoints + BOX_ROWS}: "
+                f"{keypoints} keypoints and {BOX_ROWS} box corners"
+            )
+            raise InputError(what, where=f"components[{row}]")
+    total = sum(component.weight for component in components)
+    if abs(total - 1) > 1e-6:
+        raise InputError(f"weights sum to {total:.6g}, not to 1", where="components")
+
+
 @dataclass(frozen=True)
 class Reflection:
     """A category's mirror symmetry: mirrored objects are as likely as the objects themselves."""
@@ -111,6 +127,20 @@ class Reflection:
 
 
 @dataclass(frozen=True, eq=False)
+class NearestShape:
+    """The training model whose keypoints are nearest to given ones."""
+
+    model_id: str
+    points_3d: FloatArray
+    """(m, 3), its keypoints in the order of the shape model's ids [model units]; NaN where it lacks
+    one."""
+    mesh_path: Path | None
+    distance: float
+    """Root of the mean squared distance of the keypoints [model units]; for those that the model
+    lacks the distance expected in the category."""
+
+
+@dataclass(frozen=True, eq=False)
 class TrainingShapes:
     """The keypoints of the models that a shape model was learned from.
 
@@ -144,19 +174,17 @@ class TrainingShapes:
         """Rows of the models that have a mesh."""
         return [row for row, path in enumerate(self.mesh_paths) if path is not None]
 
-
-@dataclass(frozen=True, eq=False)
-class NearestShape:
-    """The training model whose keypoints are nearest to given ones."""
-
-    model_id: str
-    points_3d: FloatArray
-    """(m, 3), its keypoints in the order of the shape model's ids [model units]; NaN where it lacks
-    one."""
-    mesh_path: Path | None
-    distance: float
-    """Root of the mean squared distance of the keypoints [model units]; for those that the model
-    lacks the distance expected in the category."""
+    def nearest(self, points: FloatArray, rows: npt.NDArray[np.int64]) -> NearestShape:
+        """The model whose keypoints of some rows (n,) are nearest to points (n, 3)."""
+        known = self.points_3d[:, rows]
+        squares = ((known.astype(np.float64) - points) ** 2).sum(axis=2)
+        # Two objects of the category are this far apart in a keypoint on average.
+        expected = 2 * np.nanvar(known, axis=0).sum(axis=1)
+        distances = np.where(np.isnan(squares), expected, squares).mean(axis=1)
+        best = int(np.argmin(distances))
+        own = self.points_3d[best].astype(np.float64)
+        distance = float(np.sqrt(distances[best]))
+        return NearestShape(self.model_ids[best], own, self.mesh_paths[best], distance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,3 +338,17 @@ def check_ids(ids: Sequence[KeypointId], where: str) -> tuple[KeypointId, ...]:
     if twice is not None:
         raise InputError(f"{twice!r} occurs twice", where=where)
     return tuple(found)
+
+
+def given_ids(
+    ids: Sequence[KeypointId] | None, names: Sequence[str] | None, count: int
+) -> tuple[KeypointId, ...]:
+    """The checked ids or names of so many keypoints, by default their numbers."""
+    if ids is not None and names is not None:
+        raise InputError("both ids and names are given", where="names", fix="give one of them")
+    where = "ids" if names is None else "names"
+    given = ids if names is None else names
+    labels = check_ids(range(count) if given is None else list(given), where)
+    if len(labels) != count:
+        raise InputError(f"{len(labels)} for {count} keypoints", where=where)
+    return labels

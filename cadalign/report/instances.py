@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,15 @@ from cadalign.evaluation.plots import compact
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.work import LEFT_OUT, OK, SKIPPED
-from cadalign.io.files import dense_json, read_bytes, reading, write_text, write_whole, writing
+from cadalign.io.files import (
+    dense_json,
+    made_folder,
+    read_bytes,
+    reading,
+    write_text,
+    write_whole,
+    writing,
+)
 
 InstanceName = tuple[str, str, int]
 """Category, model id, view."""
@@ -152,14 +160,13 @@ class AssetStore:
     meshes: dict[str, Any] = field(default_factory=dict)
     records: dict[str, Any] = field(default_factory=dict)
     _known: dict[tuple[str, bytes], str] = field(default_factory=dict)
-    _calls: list[list[str]] = field(default_factory=list)
-    _exhibit_files: list[str] = field(default_factory=list)
+    _calls: dict[int, list[str]] = field(default_factory=dict)
+    _files: dict[int, str] = field(default_factory=dict)
 
     def fill(self, runs: Sequence[Run], table: InstanceTable) -> None:
         """Take in the pictures and records of runs, and enter their keys in the table."""
         if self.assets is not None:
-            with writing(self.assets):
-                self.assets.mkdir(parents=True, exist_ok=True)
+            with writing(made_folder(self.assets)):
                 for pattern in _OURS:
                     for old in self.assets.glob(pattern):
                         old.unlink()
@@ -172,14 +179,9 @@ class AssetStore:
                 if place is None:
                     continue
                 stem, model = f"{record_stem(*name)}.webp", f"{record_stem(*name[:2])}.json"
-                picture, thumb, mesh = (
-                    store(folder / file) if file in names else None
-                    for store, folder, file, names in (
-                        (self._picture, run.folder.pictures, stem, pictures),
-                        (self._thumb, run.folder.thumbs, stem, thumbs),
-                        (self._mesh, run.folder.previews, model, previews),
-                    )
-                )
+                picture = self._key_of(run.folder.pictures / stem, pictures, self.pictures)
+                thumb = self._key_of(run.folder.thumbs / stem, thumbs, self.thumbs)
+                mesh = self._key_of(run.folder.previews / model, previews, self.meshes)
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
                 record = _object(row["exhibit"], run.folder.records)
@@ -190,12 +192,13 @@ class AssetStore:
         found: dict[str, Any] = {"pictures": self.pictures, "thumbs": self.thumbs}
         if self.assets is None:
             return {**found, "exhibits": self.records, "meshes": self.meshes}
-        for index, calls in enumerate(self._calls):
-            if calls or not self._exhibit_files[index]:
+        count = 1 + max([*self._calls, *self._files], default=-1)
+        for index in range(count):
+            if index in self._calls or index not in self._files:
                 self._write_records(index)
         return {
             **found,
-            "exhibit_files": self._exhibit_files,
+            "exhibit_files": [self._files[index] for index in range(count)],
             "exhibits_per_file": _PER_FILE,
             "mesh_files": {
                 key: self._write_script(
@@ -205,28 +208,19 @@ class AssetStore:
             },
         }
 
-    def _picture(self, path: Path) -> str:
-        return self._once(path, self.pictures, self._address_of)
-
-    def _thumb(self, path: Path) -> str:
-        return self._once(path, self.thumbs, self._address_of)
-
-    def _mesh(self, path: Path) -> str:
-        return self._once(path, self.meshes, lambda data, key: _object(data, path), "m")
-
-    def _once(
-        self,
-        path: Path,
-        store: dict[str, Any],
-        make: Callable[[bytes, str], Any],
-        prefix: str = "",
-    ) -> str:
-        """Store what is made of a file, once for all with its content; returns its key."""
+    def _key_of(self, path: Path, names: frozenset[str], store: dict[str, Any]) -> str | None:
+        """Store a file, once for all with its content; returns its key, None if it is not there."""
+        if path.name not in names:
+            return None
         data, kind = read_bytes(path), path.parent.name
         digest = (kind, hashlib.sha256(data).digest())  # compared runs show the same ones
         if digest not in self._known:
-            key = f"{prefix}{len(store)}"
-            store[key] = make(data, f"{kind[:-1]}_{len(store):06d}.webp")
+            key = str(len(store))
+            if store is self.meshes:
+                key, stored = f"m{key}", _object(data, path)
+            else:
+                stored = self._address_of(data, f"{kind[:-1]}_{len(store):06d}.webp")
+            store[key] = stored
             self._known[digest] = key
         return self._known[digest]
 
@@ -243,17 +237,15 @@ class AssetStore:
             self.records[str(place)] = record
             return
         index = place // _PER_FILE
-        while len(self._calls) <= index:
-            self._calls.append([])
-            self._exhibit_files.append("")
         text = msgspec.json.encode(record).decode()
-        self._calls[index].append(f"cadalignExhibit({place}, {text})")
-        if len(self._calls[index]) == _PER_FILE:
+        calls = self._calls.setdefault(index, [])
+        calls.append(f"cadalignExhibit({place}, {text})")
+        if len(calls) == _PER_FILE:
             self._write_records(index)
 
     def _write_records(self, index: int) -> None:
-        calls, self._calls[index] = self._calls[index], []
-        self._exhibit_files[index] = self._write_script(f"exhibits_{index:04d}.js", calls)
+        calls = self._calls.pop(index, [])
+        self._files[index] = self._write_script(f"exhibits_{index:04d}.js", calls)
 
     def _write_script(self, name: str, calls: Sequence[str]) -> str:
         assert self.assets is not None

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -21,6 +21,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
 from cadalign.shapes.calibration import Calibration, calibrate, excesses_of, learn_margins
+from cadalign.shapes.examples import Example, tabulated
 from cadalign.shapes.gaussians import (
     Gaussians,
     Vectors,
@@ -28,7 +29,7 @@ from cadalign.shapes.gaussians import (
     learn_mixture,
     log_likelihoods,
 )
-from cadalign.shapes.parts import BoxMargins, KeypointId, Reflection, ShapeComponent
+from cadalign.shapes.parts import BoxMargins, KeypointId, Reflection
 
 # Lengths relative to the models' median diagonal.
 _FLOOR = 1e-3
@@ -212,22 +213,19 @@ class _CrossValidation:
         return found
 
 
-def learn_components(
-    ids: Sequence[KeypointId],
-    rows: FloatArray,
+def learn_parts(
+    examples: Sequence[Example],
     on_progress: Callable[[int, int], object],
     *,
     components: int | None,
     modes: int | None,
     reflection: bool,
-) -> tuple[tuple[ShapeComponent, ...], Choice]:
-    """Learn the components of models' rows, (N, m + 2, 3) float with NaN for what is missing.
-
-    Options are those of `cadalign.ShapeModel.learn`.
-    """
+) -> dict[str, Any]:
+    """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
     for name, count in (("components", components), ("modes", modes)):
         if count is not None and (type(count) is not int or count < 1):
             raise InputError(f"{count!r} is not a whole number >= 1", where=name)
+    ids, rows, training = tabulated(examples)
     if (components or 1) > len(rows):
         what = f"{components} are more than the {len(rows)} models"
         raise InputError(what, where="components")
@@ -248,12 +246,20 @@ def learn_components(
     parts = sorted(
         zip(weights, mixture.means, mixture.covariances, strict=True), key=lambda part: -part[0]
     )
-    return tuple(
+    learned = (
         component_of_covariance(
             mean.reshape(-1, 3), covariance, weight=float(weight), modes=choice.modes
         )
         for weight, mean, covariance in parts
-    ), choice
+    )
+    return {
+        "ids": ids,
+        "components": tuple(learned),
+        "reflection": choice.recipe.reflection,
+        "training": training,
+        "box_margins": choice.margins,
+        **choice.calibration._asdict(),
+    }
 
 
 def _vectors(rows: FloatArray, reflection: Reflection | None, ids: Sequence[KeypointId]) -> Vectors:

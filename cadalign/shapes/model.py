@@ -14,9 +14,9 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
 from cadalign.errors import InputError, quote
 from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
-from cadalign.shapes.examples import LEAST_MODELS, Dataset, Example, examples_of, tabulated
+from cadalign.shapes.examples import LEAST_MODELS, Dataset, Example, examples_of
 from cadalign.shapes.gaussians import Gaussians
-from cadalign.shapes.learning import learn_components
+from cadalign.shapes.learning import learn_parts
 from cadalign.shapes.parts import (
     BOX_ROWS,
     BoxMargins,
@@ -158,21 +158,10 @@ class ShapeModel:
             If there are too few models, a model id occurs twice, the models' ids are partly numbers
             and partly names, or an option is out of range.
         """
-        given, rows, training = tabulated(list(models))
-        learned, choice = learn_components(
-            given, rows, on_progress, components=components, modes=modes, reflection=reflection
+        learned = learn_parts(
+            list(models), on_progress, components=components, modes=modes, reflection=reflection
         )
-        return cls(
-            category=category,
-            ids=given,
-            components=learned,
-            up_axis=up_axis,
-            reflection=choice.recipe.reflection,
-            training=training,
-            unit=unit,
-            box_margins=choice.margins,
-            **choice.calibration._asdict(),
-        )
+        return cls(category=category, up_axis=up_axis, unit=unit, **learned)
 
     @classmethod
     def from_dataset(

@@ -20,12 +20,13 @@ from cadalign.solvers.alignment import (
     solve_damped,
 )
 from cadalign.solvers.constants import OK, POSE_SIZE, UNKNOWNS, ScalePrior
-from cadalign.solvers.evidence import KeypointEvidence
+from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
 from cadalign.solvers.linalg import cholesky
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
 from cadalign.solvers.optimal import choose_subsets, minimal_starts, rotation_starts
 from cadalign.solvers.search import refine
+from cadalign.solvers.unknowns import uncenter
 
 LEAST_SHARED = 4
 """Least number of shared keypoints that determine an alignment."""
@@ -88,7 +89,7 @@ def bound_all(query: Query, candidates: Candidates) -> tuple[FloatArray, FloatAr
         for i in range(n):
             gains[c] += query.gains[seen[i]]
         if n >= _BOUNDED_FROM:
-            bounds[c] = error_bound(points[:n], seen, query.rays, weights)
+            bounds[c] = error_bound(points, seen[:n], query.rays, weights)
     return bounds, gains, shared
 
 
@@ -118,43 +119,25 @@ def search_all(
         n = _gather(query, candidates, chosen[m], points, seen)
         if n < LEAST_SHARED:
             continue
+        image = KeypointEvidence(points, query.rays, query.whitening, query.loss, query.loss_scale)
+        shared = take_keypoints(image, seen[:n])
         mean = np.zeros(3)
         for i in range(n):
-            mean += points[i] / n
-        objective = _centred_objective(query, points[:n], seen, mean)
+            mean += shared.points[i] / n
+        for i in range(n):
+            shared.points[i] -= mean
+        objective = Objective(query.free, shared, ScalePrior(query.prior_weight, 0.0))
         effort = subsets, refined, iterations
         costs[m] = _search(objective, query.max_stretch, ceilings[m], effort, poses[m])
-        for k in range(3):
-            for j in range(3):
-                poses[m, 9 + k] -= poses[m, 3 * k + j] * poses[m, 12 + j] * mean[j]
+        uncenter(poses[m], mean, 1.0)
     return poses, costs
-
-
-@kernel
-def _centred_objective(
-    query: Query, points: FloatArray, seen: IntArray, mean: FloatArray
-) -> Objective:
-    """Objective for a pose of the gathered points relative to their mean."""
-    n = points.shape[0]
-    each = query.whitening.shape[0] > 1
-    centred = np.empty((n, 3))
-    rays = np.empty((n, 2))
-    whitening = np.empty((n if each else 1, 3))
-    whitening[0] = query.whitening[0]
-    for i in range(n):
-        centred[i] = points[i] - mean
-        rays[i] = query.rays[seen[i]]
-        if each:
-            whitening[i] = query.whitening[seen[i]]
-    keypoints = KeypointEvidence(centred, rays, whitening, query.loss, query.loss_scale)
-    return Objective(query.free, keypoints, ScalePrior(query.prior_weight, 0.0))
 
 
 @kernel
 def _gather(
     query: Query, candidates: Candidates, c: int, points: FloatArray, seen: IntArray
 ) -> int:
-    """Write the shared model points and their rows in the image; returns their number."""
+    """Write the shared model points, in the rows of the image, and these; returns their number."""
     first, last, row = candidates.spans[c, 0], candidates.spans[c, 1], candidates.spans[c, 2]
     n = 0
     i = 0
@@ -167,7 +150,7 @@ def _gather(
         else:
             place = candidates.rows[row + k - first]
             for j in range(3):
-                points[n, j] = candidates.xyz[place, j]
+                points[i, j] = candidates.xyz[place, j]
             seen[n] = i
             n += 1
             i += 1
@@ -310,6 +293,8 @@ def least_weights(whitening: FloatArray, count: int) -> FloatArray:
 def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: FloatArray) -> float:
     """Bound the sum of squared whitened errors over all poses and stretches from below.
 
+    The points have the rows of the image's rays, of which ``seen`` (n,) are those that have one.
+
     Let a_i = (1, x_i), and let a general linear camera take it to (c_x . a_i, c_y . a_i) / d_i with
     the depth d_i = z . a_i; poses of stretched models are some of these cameras. With w_i the
     weights and r_i the errors, and for any multipliers v_i > 0, the sum of v_i d_i^2 |r_i|^2 is at
@@ -322,7 +307,7 @@ def error_bound(points: FloatArray, seen: IntArray, rays: FloatArray, weights: F
     w_i / d_i^2 at the camera's depths: then v_i d_i^2 / w_i is the same for all points, and the
     bound is that of a general linear camera.
     """
-    n = points.shape[0]
+    n = seen.shape[0]
     multipliers = np.empty(n)
     for i in range(n):
         multipliers[i] = weights[seen[i]]
@@ -345,14 +330,14 @@ def _depth_variances(
     points: FloatArray, seen: IntArray, rays: FloatArray, multipliers: FloatArray
 ) -> FloatArray:
     """Compute q_i of `error_bound`, (n,); the first is 0 if S is singular to rounding."""
-    n = points.shape[0]
+    n = seen.shape[0]
     mean = np.zeros(5)
     total = 0.0
     for i in range(n):
         w = multipliers[i]
         total += w
         for j in range(3):
-            mean[j] += w * points[i, j]
+            mean[j] += w * points[seen[i], j]
         for j in range(2):
             mean[3 + j] += w * rays[seen[i], j]
     for j in range(5):
@@ -363,7 +348,7 @@ def _depth_variances(
     for i in range(n):
         white[i, 0] = 1.0
         for j in range(3):
-            white[i, 1 + j] = points[i, j] - mean[j]
+            white[i, 1 + j] = points[seen[i], j] - mean[j]
         for j in range(4):
             scaled = multipliers[i] * white[i, j]
             for k in range(j + 1):

@@ -17,7 +17,7 @@ from cadalign import Library
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
 from cadalign.retrieval import LibraryModel
-from cadalign.retrieval.models import SCHEMA, SEAL, ModelTable, mirrored_labelings, write_library
+from cadalign.retrieval.models import SCHEMA, SEAL, ModelTable, mirrored_labelings
 
 HEADER = 64
 
@@ -282,7 +282,7 @@ def test_forged_tables_are_refused_when_opened(library: Library, tmp_path: Path)
     for name, entry in forged:
         columns = models | {name: [*models[name][:3], entry, *models[name][4:]]}
         table = pa.table(columns, schema=SCHEMA)
-        write_library(tmp_path / "forged", ModelTable(table))
+        Library(ModelTable(table)).save(tmp_path / "forged")
         with pytest.raises(DataError, match="the library file is invalid: "):
             Library.open(tmp_path / "forged")
 
@@ -309,6 +309,6 @@ def test_forged_symmetries_are_refused_when_the_model_is_asked_for(
 ) -> None:
     columns = {name: library._table.table[name].to_pylist() for name in SCHEMA.names}
     table = pa.table(columns | {"symmetries": [text] * len(library)}, schema=SCHEMA)
-    write_library(tmp_path / "forged", ModelTable(table))
+    Library(ModelTable(table)).save(tmp_path / "forged")
     with pytest.raises(DataError, match="symmetries: "):
         next(iter(Library.open(tmp_path / "forged")))

@@ -101,27 +101,25 @@ def write_track_page(
 
 def _track_plots(found: Sequence[FoundTrack]) -> list[Plot]:
     plots = [
-        _plot(f"place_{name}", _length(name, f"place {name}"), found, _part(_places, k), _BAND)
+        _plot(_length(f"place_{name}", f"place {name}"), found, _part(_places, k), _BAND)
         for k, name in enumerate(_AXES)
     ]
     since = f"since the first frame, turned about z, then x, then y; {_BAND}"
     for k, axis in enumerate("xyz"):
         turn = _length(f"turn_{axis}", f"turn about the camera's {axis}", "deg")
-        plots.append(_plot(turn.key, turn, found, _part(_angles, k), since))
+        plots.append(_plot(turn, found, _part(_angles, k), since))
     for k, speed in enumerate((_SPEED, _TURNING)):
-        plots.append(_plot(speed.key, speed, found, _part(_speeds, k, least=0.0), _BAND))
-    uncertainty = replace(ROTATION_STD, log=False)
-    plots.append(_plot(uncertainty.key, uncertainty, found, _rotation_stds, ""))
+        plots.append(_plot(speed, found, _part(_speeds, k, least=0.0), _BAND))
+    plots.append(_plot(replace(ROTATION_STD, log=False), found, _rotation_stds, ""))
     residuals = _length("residual", "residual of the keypoints", "px")
     note = "line: median of a frame's inliers, band: quartiles"
-    return [*plots, _plot("residual", residuals, found, _residuals, note)]
+    return [*plots, _plot(residuals, found, _residuals, note)]
 
 
 _Curve = tuple[FloatArray, FloatArray, FloatArray]  # middle, low and high end of the band, (P,)
 
 
 def _plot(
-    key: str,
     metric: Metric,
     found: Sequence[FoundTrack],
     curve: Callable[[FoundTrack], _Curve],
@@ -134,7 +132,7 @@ def _plot(
         has_band = low != middle or high != middle
         ends = (low, high) if has_band else (None, None)
         traces.append(Trace(0, each.track.name, x, middle, *ends))
-    return Plot(key, _TIME, metric, traces, note=note, title=metric.label)
+    return Plot(metric.key, _TIME, metric, traces, note=note, title=metric.label)
 
 
 def _part(

@@ -215,12 +215,12 @@ class AssetStore:
         data, kind = read_bytes(path), path.parent.name
         digest = (kind, hashlib.sha256(data).digest())  # compared runs show the same ones
         if digest not in self._known:
-            key = str(len(store))
             if store is self.meshes:
-                key, stored = f"m{key}", _object(data, path)
+                key = f"m{len(store)}"
+                store[key] = _object(data, path)
             else:
-                stored = self._address_of(data, f"{kind[:-1]}_{len(store):06d}.webp")
-            store[key] = stored
+                key = str(len(store))
+                store[key] = self._address_of(data, f"{kind[:-1]}_{len(store):06d}.webp")
             self._known[digest] = key
         return self._known[digest]
 

@@ -43,6 +43,7 @@ _LOCAL_ITERATIONS = 6
 _LOCAL_FOCAL_ITERATIONS = 40
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
+_POOL_SAMPLES = 200_000.0  # after which all points are in the pool
 
 
 class Settings(NamedTuple):
@@ -94,7 +95,7 @@ def ransac_kernel(
     chosen = np.arange(size)
     sample = np.arange(size)
     growth = np.empty(3)
-    start_pool(growth, size, n, 200_000.0)
+    start_pool(growth, size, n)
     candidates = np.empty((MAX_SOLUTIONS, POSE_SIZE))
     memory = minimal_memory()
     trial = np.empty(POSE_SIZE)
@@ -364,9 +365,9 @@ def grow_pool(growth: FloatArray, size: int, count: int, iteration: int) -> None
 
 
 @kernel
-def start_pool(growth: FloatArray, size: int, count: int, budget: float) -> None:
+def start_pool(growth: FloatArray, size: int, count: int) -> None:
     """The pool before the first sample: as many points as a sample has."""
-    average = budget
+    average = _POOL_SAMPLES
     for i in range(size):
         average *= (size - i) / (count - i)
     growth[0], growth[1], growth[2] = size, average, 1.0

@@ -15,7 +15,6 @@ from cadalign.estimation.contours.descent import ContourFit, Masked, Settled, se
 from cadalign.estimation.contours.measured import (
     Place,
     cost_of,
-    scaled,
     weakest_steps,
     with_displacement_modes,
 )
@@ -29,7 +28,7 @@ from cadalign.estimation.search import Minimum
 from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals
 from cadalign.estimation.view import View
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.joint.covariance import information_of
+from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import Evidence, State
 from cadalign.solvers.joint.search import reduced, score_state
 
@@ -173,15 +172,16 @@ class _Search(NamedTuple):
     """Minima without masks, and the surfaces that are brought to the masks' contours from there.
 
     The search ``is_open`` where nothing but the masks determines the estimate. The minima of an own
-    model and a mask alone are ``proposals``, which lie near their ends; some may explain no more
-    than a part of the contour.
+    model and a mask alone are proposals, near their ends, and some of their ends may explain no
+    more than a part of the contour: where it ``is_proposed``, the outline's likelihood ranks them.
     """
 
+    first: Minimum
     starts: list[tuple[Minimum, State]]
     keypoints: int
     choice: SurfaceChoice
     is_open: bool
-    proposals: bool
+    is_proposed: bool
 
     @classmethod
     def of(cls, minima: Sequence[Minimum], keypoints: int, choice: SurfaceChoice) -> _Search:
@@ -191,21 +191,21 @@ class _Search(NamedTuple):
         likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
         starts = [(each, each.state) for each in likely]
         most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
-        proposals = first.outline_score is not None and choice.surfaces[0].is_exact
-        return cls(starts[:most], keypoints, choice, is_open, proposals)
+        is_proposed = first.outline_score is not None and choice.surfaces[0].is_exact
+        return cls(first, starts[:most], keypoints, choice, is_open, is_proposed)
 
     def best(
         self, contours: list[ViewContour], views: Sequence[View]
     ) -> tuple[list[_Candidate], list[ViewContour]]:
         """Candidates, the likeliest first, and the contours, or those of hulls in their place."""
-        if self.proposals:
+        if self.is_proposed:
             return self._by_outline(contours), contours
-        (surfaces, convex), first = self.choice, self.starts[0][0]
+        surfaces, convex = self.choice
         best = self._explored(contours, surfaces)
-        if not convex and not self.is_open and first.track is None:
+        if not convex and not self.is_open and self.first.track is None:
             agrees = bool(best) and _misfit(best[0].settled) <= _AGREEING
             if not agrees or best[0].masked.surface.is_exact:
-                others = _displaced(first, _POORLY_KNOWN if agrees else _WELL_KNOWN)
+                others = _displaced(self.first, _POORLY_KNOWN if agrees else _WELL_KNOWN)
                 best += self._replace(starts=others)._explored(contours, surfaces)
                 best.sort(key=lambda each: _misfit(each.settled))
         hulls = [_hull_contour(each, views[each.image]) for each in contours] if convex else []
@@ -233,8 +233,8 @@ class _Search(NamedTuple):
         Surfaces of a learned shape follow its modes alone: with the keypoints' own displacements a
         step takes several times as long, and modes distinguish the surfaces.
         """
-        cost = _outline_cost if self.proposals else _misfit
-        is_wide = self.is_open and not self.proposals
+        cost = _outline_cost if self.is_proposed else _misfit
+        is_wide = self.is_open and not self.is_proposed
         found = []
         for start, state in self.starts:
             evidence = start.evidence
@@ -256,7 +256,7 @@ def _is_determined(minimum: Minimum) -> bool:
     _, information = information_of(*reduced(minimum.evidence, minimum.state))
     if not np.isfinite(information.diagonal()).all() or not (information.diagonal() > 0).all():
         return False
-    return bool(np.linalg.eigvalsh(scaled(information)[0])[0] > _LEAST_INFORMATION)
+    return bool(np.linalg.eigvalsh(scaled_information(information)[0])[0] > _LEAST_INFORMATION)
 
 
 def _displaced(start: Minimum, least: float) -> list[tuple[Minimum, State]]:

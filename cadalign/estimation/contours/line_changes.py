@@ -36,13 +36,8 @@ def bins_of(colors: ByteImage) -> IntArray:
     return np.asarray((cells[..., 0] * _BINS + cells[..., 1]) * _BINS + cells[..., 2])
 
 
-def _smoothing_matrix() -> FloatArray:
-    """Weights (bins, bins) of neighbouring bins of a channel."""
-    padded = np.pad(np.eye(_BINS), [(1, 1), (0, 0)], mode="edge")
-    return np.asarray((padded[:-2] + 2 * padded[1:-1] + padded[2:]) / 4)
-
-
-_SMOOTHING = _smoothing_matrix()
+_PADDED = np.pad(np.eye(_BINS), [(1, 1), (0, 0)], mode="edge")
+_SMOOTHING = (_PADDED[:-2] + 2 * _PADDED[1:-1] + _PADDED[2:]) / 4  # of bins, by neighbouring ones
 
 
 def _histogram(bins: IntArray) -> FloatArray:

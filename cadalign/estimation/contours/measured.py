@@ -17,7 +17,7 @@ from cadalign.estimation.estimates import poses_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
-from cadalign.solvers.joint.covariance import information_of
+from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import (
     Evidence,
     Planes,
@@ -27,7 +27,7 @@ from cadalign.solvers.joint.evidence import (
     log_focals_of,
     stacked,
 )
-from cadalign.solvers.joint.search import reduced, refine_joint
+from cadalign.solvers.joint.search import displaced_modes, reduced, refine_joint
 
 OWN_MODES = 3
 """Unknowns of a contour: its offset outwards, its registration along x and along y."""
@@ -229,19 +229,15 @@ def _with_measured(
 
 def with_displacement_modes(evidence: Evidence, state: State) -> tuple[Evidence, State]:
     """The same with the points' own displacements as modes, which a warped surface follows."""
-    shape = evidence.shape
-    rows = np.repeat(np.flatnonzero(shape.spread > 0), 3)
+    shape, rows = evidence.shape, np.flatnonzero(evidence.shape.spread > 0)
     if not len(rows):
         return evidence, state
-    axes = np.tile(np.arange(3), len(rows) // 3)
-    own = np.zeros((len(rows), *shape.mean.shape))
-    own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
-    moved = state.displacements[rows, axes] / shape.spread[rows]
-    modes = np.concatenate([shape.modes, own])
+    modes = displaced_modes(shape, rows)
+    moved = state.displacements[rows] / shape.spread[rows, None]
     return (
         evidence._replace(shape=Shape(shape.mean, modes, np.zeros_like(shape.spread))),
         state._replace(
-            coefficients=np.concatenate([state.coefficients, moved]),
+            coefficients=np.concatenate([state.coefficients, moved.ravel()]),
             displacements=np.zeros_like(state.displacements),
         ),
     )
@@ -252,22 +248,16 @@ def cost_of(evidence: Evidence, state: State) -> float:
     return information_of(*reduced(evidence, state))[0]
 
 
-def scaled(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information (U, U) of unit diagonal, and the roots (U,) of its own."""
-    sizes = np.sqrt(np.maximum(information.diagonal(), 1e-300))
-    return information / np.outer(sizes, sizes), sizes
-
-
 def solved(information: FloatArray, right: FloatArray) -> FloatArray:
     """The covariance times columns (U, k), of unknowns of which next to nothing may be known."""
-    matrix, sizes = scaled(information)
+    matrix, sizes = scaled_information(information)
     matrix = matrix + _LEAST_INFORMATION * np.eye(len(sizes))
     return np.asarray(np.linalg.solve(matrix, right / sizes[:, None]) / sizes[:, None])
 
 
 def weakest_steps(information: FloatArray, count: int) -> list[FloatArray]:
     """Steps (U,) of one standard deviation along the directions of which least is known."""
-    matrix, sizes = scaled(information)
+    matrix, sizes = scaled_information(information)
     values, vectors = np.linalg.eigh(matrix)
     roots = np.sqrt(np.maximum(values[:count], _LEAST_INFORMATION))
     return list((vectors[:, :count] / roots / sizes[:, None]).T)

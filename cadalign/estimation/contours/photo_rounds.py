@@ -105,7 +105,8 @@ def finish(pictured: Pictured, start: Approach) -> Approach | None:
             return None
         if number and here.is_close(_FINE[-1]):
             break
-        noises = _noises_of(here)
+        own_rows = here.place.own_of(len(here.outlines))
+        noises = [*map(noise_of_lines, here.outlines, own_rows)]
         here = _round(pictured, here.place, _FINE[-1], noises)
     return None if here is None else _widened(pictured, here, noises)
 
@@ -185,11 +186,6 @@ def _rows(
         own=_OWN_SIGMAS,
         cameras=(given, camera),
     )
-
-
-def _noises_of(here: Approach) -> list[LineNoise]:
-    own = here.place.own_of(len(here.outlines))
-    return [*map(noise_of_lines, here.outlines, own)]
 
 
 def noise_of_lines(outline: Outline | None, own: FloatArray) -> LineNoise:

@@ -280,5 +280,5 @@ class FacedMask(NamedTuple):
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
         )
-        seen_cells = np.asarray(image, dtype=np.float32)
-        return cls(seen_cells, camera.contains(pixels), rays, corner, cell, turn)
+        is_seen = camera.contains(pixels)
+        return cls(np.asarray(image, dtype=np.float32), is_seen, rays, corner, cell, turn)

@@ -16,7 +16,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.tracks.motion import Motion
 from cadalign.solvers.joint.arrow import Arrow, dense_matrix, factorize_arrow, invert_arrow
-from cadalign.solvers.joint.evidence import Evidence, Focals, Rig, kept_rows
+from cadalign.solvers.joint.evidence import Evidence, Rig, kept_rows
 from cadalign.solvers.joint.motion import STATE, MotionPrior, moments
 from cadalign.solvers.joint.tracks import (
     NOTHING_KNOWN,
@@ -87,15 +87,12 @@ class Window:
         anchor = _told_by_first(self)
         state = self.path.state
         later = Path(state._replace(poses=state.poses[1:]), self.path.velocities[1:])
-        rig = self.evidence.rig
-        kept = rig.pose > 0
+        kept = self.evidence.rig.pose > 0
+        some = _of_views(self.evidence, kept[self.evidence.sightings.image], kept)
         number = np.cumsum(kept) - 1
-        sightings = kept_rows(self.evidence.sightings, kept[self.evidence.sightings.image])
-        sightings = sightings._replace(image=number[sightings.image])
-        evidence = self.evidence._replace(
-            sightings=sightings,
-            rig=Rig(rig.cam_from_rig[kept], rig.pose[kept] - 1),
-            focals=_of_views(self.evidence, kept),
+        evidence = some._replace(
+            sightings=some.sightings._replace(image=number[some.sightings.image]),
+            rig=some.rig._replace(pose=some.rig.pose - 1),
         )
         return replace(self, evidence=evidence, times=self.times[1:], path=later, anchor=anchor)
 
@@ -151,19 +148,13 @@ def begun_again(window: Window, pose: FloatArray, evidence: Evidence) -> Window:
 def _told_by_first(window: Window) -> Anchor:
     """Information of the first frame, and what is known of it, on the second one and the border."""
     evidence, path = window.evidence, window.path
-    rig, first = evidence.rig, evidence.rig.pose[evidence.sightings.image] == 0
-    two = rig.pose < 2
-    own = evidence._replace(
-        sightings=kept_rows(evidence.sightings, first),
-        rig=Rig(rig.cam_from_rig[two], rig.pose[two]),
-        focals=_of_views(evidence, two),
-    )
+    first, two = evidence.rig.pose[evidence.sightings.image] == 0, evidence.rig.pose < 2
+    own = _of_views(evidence, first, two)
     state = path.state._replace(poses=path.state.poses[:2])
     pair = Path(state, path.velocities[:2])
     motion = window.prior._replace(seconds=np.diff(window.times[:2]))
     _, arrow = equations_of(Moving(own, False, motion, window.anchor), pair)
-    none = kept_rows(evidence.sightings, np.zeros(len(first), dtype=bool))
-    nothing = own._replace(sightings=none)
+    nothing = _of_views(evidence, np.zeros_like(first), two)
     _, prior = equations_of(Moving(nothing, False, motion, NOTHING_KNOWN), pair)
     information, gradient = dense_matrix(arrow), arrow.gradient.copy()
     size = len(arrow.border)
@@ -182,5 +173,11 @@ def _told_by_first(window: Window) -> Anchor:
     )
 
 
-def _of_views(evidence: Evidence, kept: BoolArray) -> Focals:
-    return evidence.focals._replace(group=evidence.focals.group[kept])
+def _of_views(evidence: Evidence, sighted: BoolArray, views: BoolArray) -> Evidence:
+    """The evidence of some sightings (N,) in some of the views (V,), which keep their numbers."""
+    rig, focals = evidence.rig, evidence.focals
+    return evidence._replace(
+        sightings=kept_rows(evidence.sightings, sighted),
+        rig=Rig(rig.cam_from_rig[views], rig.pose[views]),
+        focals=focals._replace(group=focals.group[views]),
+    )

@@ -28,7 +28,7 @@ from cadalign.estimation.uncertainty.evidence import (
 from cadalign.estimation.uncertainty.residuals import chi_square_quantile, chi_square_tail
 from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
 from cadalign.estimation.uncertainty.summary import name_of
-from cadalign.solvers.joint.covariance import information_of
+from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, packed
 from cadalign.solvers.joint.search import reduced, refine_joint, search_joint
 from cadalign.solvers.joint.system import Joint, joint_cost
@@ -191,9 +191,7 @@ def _determined(evidence: Evidence, state: State) -> tuple[int, int]:
     _, information = information_of(*reduced(evidence, state))
     rank = 0
     if np.isfinite(information).all():
-        sizes = np.sqrt(np.maximum(information.diagonal(), 0.0))
-        safe = np.where(sizes > 0, sizes, 1.0)
-        values = np.linalg.eigvalsh(information / np.outer(safe, safe))
+        values = np.linalg.eigvalsh(scaled_information(information)[0])
         rank = int((values > _LEAST_INFORMATION * len(values)).sum())
     held = int(3 - evidence.scales.free.sum())
     return count_equations(evidence) - (rank - held), rank

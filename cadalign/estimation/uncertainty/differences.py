@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -246,8 +247,8 @@ class JointOptimum:
             columns.append(self._slope(partial(self._with_pixel, k, axis), unit))
         for k in range(len(covariances)):
             columns.append(self._slope(partial(self._with_log_sigma, k), _DIFFERENCE))
-        for point, axis in np.ndindex(len(np.unique(self._point)), 3):
-            changed = partial(self._with_point, int(np.unique(self._point)[point]), axis)
+        for point, axis in product(np.unique(self._point).tolist(), range(3)):
+            changed = partial(self._with_point, point, axis)
             columns.append(self._slope(changed, _DIFFERENCE * length))
         return np.stack(columns, axis=1)
 

@@ -16,7 +16,11 @@ from cadalign.estimation.options import FitOptions
 from cadalign.estimation.problems import pack_one
 from cadalign.estimation.solve import fitted_fields, solve_one
 from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood
-from cadalign.estimation.uncertainty.residuals import chi_square_tail, f_quantile
+from cadalign.estimation.uncertainty.residuals import (
+    chi_square_tail,
+    f_quantile,
+    f_quantile_of_two,
+)
 from cadalign.estimation.uncertainty.summary import Misfit, percent, uncertainty_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -98,7 +102,7 @@ def find_outliers(
         if len(others) and covariance is not None:
             jacobian = projection_jacobian(points_3d[others], camera, alignment)
             expected[others] += predicted_covariances(jacobian, covariance)
-        quantile = _f_quantile_of_two(_FALSE_OUTLIERS / count, equations)
+        quantile = f_quantile_of_two(equations, _FALSE_OUTLIERS / count)
         return _squares(residuals, expected) / 2 / variance, quantile
 
     def nearest(squares: FloatArray) -> Rows:
@@ -126,13 +130,6 @@ def _squares(residuals: FloatArray, covariances: FloatArray) -> FloatArray:
     """Squared lengths (n,) of residuals (n, 2) whitened by their covariances (n, 2, 2)."""
     finite = np.nan_to_num(residuals, posinf=1e9)
     return np.asarray(np.einsum("na,nab,nb->n", finite, np.linalg.inv(covariances), finite))
-
-
-def _f_quantile_of_two(chance: float, equations: float) -> float:
-    """Value that an F variable with (2, equations) degrees of freedom exceeds by this chance."""
-    if math.isinf(equations):
-        return -math.log(chance)
-    return equations / 2 * (math.pow(chance, -2 / equations) - 1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -191,28 +191,26 @@ def _keypoints(scene: _KnownScene, name: Hashable) -> Iterator[Advice]:
 
 
 def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
-    count = len(view.keypoint_ids)
-    depth, relative = view.depth, np.asarray(view.depth_sigma, dtype=np.float64)
-    sigma = 1.0 if view.sigma is None else view.sigma
+    depth = view.depth
     if depth is not None and view.depth_image is None:
         depth = np.append(cast(FloatArray, depth), np.nan)
     return replace(
         _without_scale(view),
         points_2d=np.vstack([view.pixels, place]),
         ids=(*view.keypoint_ids, name),
-        sigma=_with_mean(sigma, count, is_one=np.ndim(sigma) == 0),
+        sigma=1.0 if view.sigma is None else _with_mean(view.sigma),
         scores=None,
         depth=depth,
-        depth_sigma=_with_mean(relative, count, is_one=relative.ndim == 0),
+        depth_sigma=_with_mean(cast(npt.ArrayLike, view.depth_sigma)),
     )
 
 
-def _with_mean(sigma: npt.ArrayLike, count: int, *, is_one: bool) -> npt.ArrayLike:
-    """Deviations of ``count`` values, and their mean for one more."""
+def _with_mean(sigma: npt.ArrayLike) -> npt.ArrayLike:
+    """One deviation of all values, or those of each and their mean for one more."""
     given = np.asarray(sigma, dtype=np.float64)
-    if is_one or not count:
-        return given if is_one else 1.0
-    return np.concatenate([given, given.mean(axis=0, keepdims=True)])
+    if given.ndim == 0:
+        return given
+    return np.concatenate([given, given.mean(axis=0, keepdims=True)]) if len(given) else 1.0
 
 
 def _without_scale(view: View) -> View:

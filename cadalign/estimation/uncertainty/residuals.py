@@ -87,3 +87,10 @@ def f_quantile(first: float, second: float, probability: float) -> float:
     from scipy.special import fdtri  # only where sigma is estimated
 
     return float(fdtri(first, second, 1 - probability))
+
+
+def f_quantile_of_two(second: float, probability: float) -> float:
+    """`f_quantile` of 2 and some degrees of freedom in closed form; infinitely many are allowed."""
+    if math.isinf(second):
+        return -math.log(probability)
+    return second / 2 * (math.pow(probability, -2 / second) - 1)

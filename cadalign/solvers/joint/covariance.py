@@ -264,3 +264,9 @@ def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]
     equations = joint_room(evidence, 6, 0)
     cost = evaluate_joint(Joint(evidence, False), packed(state), equations)
     return float(cost), dense_matrix(equations.arrow)
+
+
+def scaled_information(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Information (U, U) of unit diagonal, and the roots (U,) of its own."""
+    sizes = np.sqrt(np.maximum(information.diagonal(), 1e-300))
+    return information / np.outer(sizes, sizes), sizes

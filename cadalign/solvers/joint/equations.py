@@ -26,13 +26,18 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, kernel
 from cadalign.solvers.joint.arrow import Arrow, add_slope, border_start, empty_arrow
-from cadalign.solvers.joint.evidence import Evidence, Shape, State, unstretched
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    Shape,
+    State,
+    exp_of,
+    stretched_point,
+    unstretched,
+)
 from cadalign.solvers.joint.rows import (
     count_block_equations,
     count_equations,
-    exp_of,
     first_scale,
-    stretched_point,
     write_block_row,
 )
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows

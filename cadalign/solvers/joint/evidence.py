@@ -21,6 +21,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import inlined, kernel
 from cadalign.solvers.constants import ScalePrior
+from cadalign.solvers.linalg import Triple
 
 Table = TypeVar("Table", bound=tuple[Any, ...])
 
@@ -206,11 +207,26 @@ def distances_of(evidence: Evidence, poses: FloatArray, points: FloatArray) -> F
 @kernel
 def points_of(shape: Shape, state: State) -> FloatArray:
     """The points (m, 3) in the model's frame."""
-    points = np.empty_like(shape.mean)
+    points, scale = np.empty_like(shape.mean), exp_of(state.log_scales)
     for i in range(points.shape[0]):
-        for a in range(3):
-            points[i, a] = np.exp(state.log_scales[a]) * unstretched(shape, state, i, a)
+        points[i, 0], points[i, 1], points[i, 2] = stretched_point(shape, state, scale, i)
     return points
+
+
+@inlined
+def exp_of(logs: FloatArray) -> Triple:
+    """The scales of their logarithms (3,)."""
+    return np.exp(logs[0]), np.exp(logs[1]), np.exp(logs[2])
+
+
+@inlined
+def stretched_point(shape: Shape, state: State, scale: Triple, i: int) -> Triple:
+    """Point i in the model's frame."""
+    return (
+        scale[0] * unstretched(shape, state, i, 0),
+        scale[1] * unstretched(shape, state, i, 1),
+        scale[2] * unstretched(shape, state, i, 2),
+    )
 
 
 @inlined

@@ -15,8 +15,8 @@ from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, inlined, kernel
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
 from cadalign.solvers.joint.arrow import Arrow, add_row, border_start
-from cadalign.solvers.joint.evidence import Evidence, Shape, Sightings, State, unstretched
-from cadalign.solvers.linalg import Triple, cross, dot, triple
+from cadalign.solvers.joint.evidence import Evidence, Sightings, State, exp_of, stretched_point
+from cadalign.solvers.linalg import cross, dot, triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
 
 
@@ -24,22 +24,6 @@ from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back,
 def count_equations(sightings: Sightings, n: int) -> int:
     """Number of equations that sighting n gives: a contour point one, a keypoint two or three."""
     return 1 + int(sightings.whitening[n, 2] > 0.0) + int(sightings.depths[n, 1] > 0.0)
-
-
-@inlined
-def exp_of(logs: FloatArray) -> Triple:
-    """The scales of their logarithms (3,)."""
-    return np.exp(logs[0]), np.exp(logs[1]), np.exp(logs[2])
-
-
-@inlined
-def stretched_point(shape: Shape, state: State, scale: Triple, i: int) -> Triple:
-    """Point i in the model's frame."""
-    return (
-        scale[0] * unstretched(shape, state, i, 0),
-        scale[1] * unstretched(shape, state, i, 1),
-        scale[2] * unstretched(shape, state, i, 2),
-    )
 
 
 @borrowing

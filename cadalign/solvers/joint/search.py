@@ -173,10 +173,7 @@ def reduce_modes(evidence: Evidence) -> Reduction:
     is_small = size <= 3 * used.sum()
     if is_small and not len(displaced):
         return Reduction(evidence, np.eye(modes), displaced)
-    whole, spread = np.zeros((size, *shape.mean.shape)), shape.spread.copy()
-    whole[:modes] = shape.modes
-    rows, axes = np.repeat(displaced, 3), np.tile(np.arange(3), len(displaced))
-    whole[np.arange(modes, size), rows, axes] = spread[rows]
+    whole, spread = displaced_modes(shape, displaced), shape.spread.copy()
     spread[displaced] = 0.0
     basis = np.eye(size)
     if not is_small:
@@ -185,6 +182,14 @@ def reduce_modes(evidence: Evidence) -> Reduction:
         whole = (basis @ whole.reshape(size, -1)).reshape(-1, *shape.mean.shape)
     reduced = evidence._replace(shape=Shape(shape.mean, whole, spread))
     return Reduction(reduced, np.ascontiguousarray(basis.T), displaced)
+
+
+def displaced_modes(shape: Shape, displaced: IntArray) -> FloatArray:
+    """Modes (K + 3 u, m, 3): those of the shape, then displacements of some points (u,) by axes."""
+    rows, axes = np.repeat(displaced, 3), np.tile(np.arange(3), len(displaced))
+    own = np.zeros((len(rows), *shape.mean.shape))
+    own[np.arange(len(rows)), rows, axes] = shape.spread[rows]
+    return np.concatenate([shape.modes, own])
 
 
 def reduced_state(reduction: Reduction, whole: Shape, state: State) -> State:

@@ -35,14 +35,12 @@ from cadalign.solvers.joint.equations import (
     joint_room,
     shift_means,
 )
-from cadalign.solvers.joint.evidence import Evidence, State, unpacked
+from cadalign.solvers.joint.evidence import Evidence, State, exp_of, stretched_point, unpacked
 from cadalign.solvers.joint.rows import (
     add_blocks,
     bounded_scales,
     count_equations,
-    exp_of,
     first_scale,
-    stretched_point,
     write_rows,
 )
 from cadalign.solvers.linalg import damp, expected_decrease

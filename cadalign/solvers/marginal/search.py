@@ -10,14 +10,14 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import kernel
-from cadalign.solvers.alignment import Objective, center_and_unit, evaluate_cost
+from cadalign.solvers.alignment import Objective, center_and_unit
 from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
 from cadalign.solvers.marginal.equations import Posed, state_at
 from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, target_of
 from cadalign.solvers.optimal import rotation_starts, widen_by_shape
-from cadalign.solvers.search import Effort, Minima, descend, refine, room_for_minima, search
+from cadalign.solvers.search import Effort, Minima, descend, room_for_minima, search
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _PROBE_ITERATIONS = 2
@@ -125,19 +125,13 @@ def mean_starts(target: GaussianTarget, seen: Seen) -> FloatArray:
     objective = Objective(free, keypoints, ScalePrior(0.0, 0.0))
     grid = np.empty((_ROTATIONS, POSE_SIZE))
     count = rotation_starts(points, seen.rays, grid)
-    costs = np.empty(count)
-    for k in range(count):
-        costs[k] = evaluate_cost(objective, grid[k])
-    order = np.argsort(costs)[: min(count, _REFINED)]
-    refined = np.full(len(order), np.inf)
-    for r in range(len(order)):
-        if costs[order[r]] < np.inf:
-            refined[r], _, _ = refine(objective, _ITERATIONS, grid[order[r]])
-    poses = np.empty((len(order), 12))
+    minima = room_for_minima(_REFINED, POSE_SIZE)
+    search(objective, grid[:count], Effort(_REFINED, _ITERATIONS, 0, np.inf), 0, 0.0, minima)
+    poses = np.empty((_REFINED, 12))
     found = 0
-    for r in np.argsort(refined):
-        if refined[r] < np.inf and not is_among(grid[order[r]], poses[:found], _SAME_CHORD):
-            pose = grid[order[r]]
+    for k in range(minima.counts[0]):
+        pose = minima.states[k]
+        if not is_among(pose, poses[:found], _SAME_CHORD):
             orthonormalize(pose)
             uncenter(pose, center, unit)
             poses[found] = pose[:12]

@@ -53,8 +53,11 @@ def symmetry_group(xyz: FloatArray, symmetries: Symmetries) -> SymmetryGroup:
     if revolution is not None:
         center, axis = revolution
         return SymmetryGroup(center, np.eye(3)[None], axis)
+    equivalent = _equivalent(len(xyz), symmetries)
+    if equivalent.sum() == len(xyz):  # each to itself alone, as with a single reflection
+        return trivial
     center, rotations = xyz.mean(axis=0), _candidates()
-    kept = _onto_themselves(xyz - center, _equivalent(len(xyz), symmetries), rotations, tolerance)
+    kept = _onto_themselves(xyz - center, equivalent, rotations, tolerance)
     if not kept.any():
         return trivial
     return SymmetryGroup(center, np.concatenate([np.eye(3)[None], rotations[kept]]))

@@ -216,7 +216,8 @@ def _align_all(
     if left_out:
         return align_without(left_out, prior, views, inits, align_some)
     problem = JointProblem(prior, views, size, options, lenses)
-    if is_mask_alone(model, views, inits):
+    starts = [] if any(inits) else starts_by_one_view(views, size, align_some)
+    if not starts and is_mask_alone(model, views, inits):
         from cadalign.estimation.contours.proposals import minima_of_mask  # with OpenCV and embree
 
         minima, iterations, hypotheses, mistake = minima_of_mask(problem, model)
@@ -224,7 +225,6 @@ def _align_all(
         minima, iterations, hypotheses = minima_at_start(problem, inits)
         mistake = None
     else:
-        starts = [] if any(inits) else starts_by_one_view(views, size, align_some)
         try:
             problem, minima, iterations, hypotheses = _found(problem, starts or [inits], ransac)
         except NoConsensusError as error:

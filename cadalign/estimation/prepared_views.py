@@ -198,9 +198,13 @@ def starts_by_one_view(
 
     One view determines the pose: the only one with keypoints or, without any, that of the largest
     mask. The object is enlarged about its camera until it is seen amid the masks of the others.
-    There are none for other views. Raises CadalignError if that view alone has no estimate.
+    A single view of a mask and a depth image has such starts, too: its pose by the mask alone,
+    enlarged until the depths agree. There are none for other views. Raises CadalignError if that
+    view alone has no estimate.
     """
-    if len(views) < 2 or any(view.cam_from_rig is None for view in views):
+    if len(views) == 1:
+        return [[start] for start in _starts_by_depths(views[0], align_some)]
+    if any(view.cam_from_rig is None for view in views):
         return []
     seen = [number for number, view in enumerate(views) if len(view.keypoint_ids)]
     has_size = size is not None or any(view.depth is not None for view in views)
@@ -228,6 +232,22 @@ def starts_by_one_view(
         in_rig = Alignment(turn @ pose.rotation, turn @ shift, factor * pose.scale)
         starts.append([in_rig, *[None] * (len(views) - 1)])
     return starts
+
+
+def _starts_by_depths(view: View, align_some: Align) -> list[Alignment]:
+    """Starts of a view whose mask determines the pose, and whose depth image the size."""
+    if len(view.keypoint_ids) or view.mask is None or view.depth_image is None:
+        return []
+    from cadalign.estimation.contours.depth import factor_by_depths  # with OpenCV and embree
+
+    alone = align_some([replace(view, depth=None)], [None])
+    starts = []
+    for each in (alone.alignment, *(other.alignment for other in alone.alternatives)):
+        factor = factor_by_depths(alone.mesh(), view, each)
+        if factor is not None:
+            scaled = each.rotation, factor * each.translation, factor * each.scale
+            starts.append(Alignment(*scaled))
+    return starts[:_MOST_STARTS]
 
 
 def _factor_by_masks(

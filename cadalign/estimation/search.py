@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.estimates import mean_state
 from cadalign.estimation.joint_robust import (
     JointConsensus,
     robust_minima,
@@ -142,9 +143,16 @@ def minima_at_noise(
         hypotheses += len(starts.poses)
         if not len(starts.poses):
             continue
-        if ransac is None:
+        every = np.ones(len(evidence.sightings.point), dtype=bool)
+        if _is_bare(evidence):
+            states = [
+                mean_state(evidence, *each)
+                for each in zip(starts.poses, starts.log_scales, strict=True)
+            ]
+            found = [JointConsensus(every, evidence, each, 0.0, math.inf) for each in states]
+            used = 0
+        elif ransac is None:
             minima_of, used = search_joint(evidence, *starts)
-            every = np.ones(len(evidence.sightings.point), dtype=bool)
             found = [
                 JointConsensus(every, evidence, state, float(cost), float(score))
                 for state, cost, score in zip(*minima_of, strict=True)
@@ -169,6 +177,17 @@ def minima_at_noise(
         minima = [_relinearised(problem, each) for each in minima]
     minima.sort(key=lambda minimum: minimum.score)
     return minima, iterations, hypotheses
+
+
+def _is_bare(evidence: Evidence) -> bool:
+    """True where priors alone would move a given start whose size is to be found by outlines."""
+    told = (
+        evidence.sightings.point,
+        evidence.directions.image,
+        evidence.offsets.image,
+        evidence.planes.image,
+    )
+    return bool(evidence.scales.free.all()) and not any(map(len, told))
 
 
 def minima_at_start(problem: JointProblem, init: Inits) -> tuple[list[Minimum], int, int]:

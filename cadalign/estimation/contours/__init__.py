@@ -27,11 +27,15 @@ def refine_with_images(
     """
     refined: list[Refined] = []
     found = list(minima)
-    if any(view.mask is not None for view in views):
+    shows_outline = [view.mask is not None or view.image is not None for view in views]
+    if any(view.depth_image is not None and shows_outline[k] for k, view in enumerate(views)):
         from cadalign.estimation.contours.depth import fit_depths
+
+        found = fit_depths(model, prior, views, found)
+    if any(view.mask is not None for view in views):
         from cadalign.estimation.contours.fit import fit_masks
 
-        refined.append(fit_masks(model, prior, views, fit_depths(model, prior, views, found)))
+        refined.append(fit_masks(model, prior, views, found))
         found = refined[-1].minima
     if any(view.image is not None and view.mask is None for view in views):
         from cadalign.estimation.contours.photo import fit_photos

@@ -12,22 +12,26 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.estimation.contours.measured import Measured, Place, Sought
-from cadalign.estimation.contours.surface import PosedSurface, surfaces_of
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.contours.contour import Sight
+from cadalign.estimation.contours.measured import Measured, Place, Sought, cost_of
+from cadalign.estimation.contours.surface import PosedSurface, caster_of, surfaces_of
 from cadalign.estimation.contours.view_contour import robust_deviation
+from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import Minimum
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import Planes, kept_rows, log_focals_of
 from cadalign.solvers.joint.search import score_state
 
 _MARGIN = 3  # [px], to the mask's border
+_CELL = 4  # [px], of a silhouette
 _LEAST_SPACING = 8  # [px], of samples that count as independent
 _MOST_SAMPLES = 100  # of a view
 _LOSS_SCALE = 3.0
@@ -55,38 +59,83 @@ def fit_depths(
     views: Sequence[View],
     minima: Sequence[Minimum],
 ) -> list[Minimum]:
-    """Refine the likely minima with the depths of the object's surface, the likeliest first."""
-    samples = [
-        _samples(number, view, minima[0].lenses.cameras[number])
-        for number, view in enumerate(views)
-        if view.mask_image is not None and view.depth_image is not None
-    ]
+    """Refine the likely minima with the depths of the object's surface, the likeliest first.
+
+    These are the depths inside its mask or, where a photo has neither mask nor keypoints, inside
+    the silhouette of the likeliest minimum.
+    """
+    shown = [number for number, view in enumerate(views) if shows_surface(view)]
+    if not shown:
+        return list(minima)
+    keypoints, first = len(prior.ids), minima[0]
+    where = f"views[{shown[0]}].depth"
+    surface = surfaces_of(model, first.points[:keypoints], where).surfaces[0]
+    posed, poses = None, poses_of(first.evidence, first.state)
+    samples = []
+    for number in shown:
+        view, camera = views[number], first.lenses.cameras[number]
+        if view.mask is None:
+            posed = posed or surface.at(first.evidence.shape, first.state)
+            inside = _silhouette(Sight(posed.caster, camera, poses[number]))
+        else:
+            inside = np.asarray(view.mask) > 0.5
+        samples.append(_samples(number, view, camera, inside))
     samples = [each for each in samples if len(each.depths)]
     if not samples:
         return list(minima)
-    keypoints, first = len(prior.ids), minima[0]
-    where = f"views[{samples[0].image}].depth"
-    surface = surfaces_of(model, first.points[:keypoints], where).surfaces[0]
-    likely = [first, *(each for each in minima[1:] if each.score < first.score + _UNLIKELY)]
+    is_open = not np.isfinite(first.score)  # without depths nothing is determined
+    bound = first.score + _UNLIKELY
+    likely = [first, *(each for each in minima[1:] if is_open or each.score < bound)]
     found = []
     for each in likely[:_MOST_STARTS]:
         planes = each.evidence.planes  # depths at keypoints, which may be hidden
         kept = ~np.isin(planes.image, [own.image for own in samples])
         bare = each.evidence._replace(planes=kept_rows(planes, kept))
-        found.append(_settled(each, Sought(bare, keypoints, samples, surface)))
+        sought = Sought(bare, keypoints, samples, surface)
+        found.append(_as_begun(each, sought) if is_open else _settled(each, sought))
     found.sort(key=lambda minimum: minimum.score)
     return found
 
 
-def _samples(number: int, view: View, camera: Camera) -> _Samples:
-    """Pixels of a grid inside the mask whose depth is known."""
+def shows_surface(view: View) -> bool:
+    """True if the depths of a view's surface count: those about keypoints count at these."""
+    if view.depth_image is None:
+        return False
+    return view.mask is not None or (view.image is not None and not len(view.keypoint_ids))
+
+
+def factor_by_depths(mesh: Mesh, view: View, pose: Alignment) -> float | None:
+    """Measured over predicted depths, their median, of a mesh in a view with a mask.
+
+    None where none of them is measured.
+    """
+    samples = _samples(0, view, view.camera, np.asarray(view.mask_image) > 0.5)
+    origin, model_from_ray = model_rays(pose)
+    face, depth = caster_of(mesh).first_hits(origin, samples.rays @ model_from_ray.T)
+    hit = face >= 0
+    return float(np.median(samples.depths[hit] / depth[hit])) if hit.any() else None
+
+
+def _silhouette(sight: Sight) -> BoolArray:
+    """Pixels (h, w) where the object is seen, looked at in every so many."""
+    rows, columns = (
+        np.arange(_CELL // 2, side, _CELL) for side in (sight.camera.height, sight.camera.width)
+    )
+    covered = sight.covers(np.stack(np.meshgrid(columns, rows), axis=-1))
+    return np.kron(covered, np.ones((_CELL, _CELL), dtype=bool)).astype(bool)
+
+
+def _samples(number: int, view: View, camera: Camera, mask: BoolArray) -> _Samples:
+    """Pixels of a grid inside a mask whose depth is known."""
     import cv2  # takes longer to import than all the rest
 
-    mask = np.asarray(view.mask_image) > 0.5
-    padded = np.pad(mask.astype(np.uint8), 1)  # nothing is known of what leaves the image
+    depth = cast(FloatArray, view.depth_image)
+    inside = np.zeros(depth.shape, dtype=bool)
+    height, width = (min(sides) for sides in zip(mask.shape, depth.shape, strict=True))
+    inside[:height, :width] = mask[:height, :width]
+    padded = np.pad(inside.astype(np.uint8), 1)  # nothing is known of what leaves the image
     size = 2 * _MARGIN + 1
     inside = cv2.erode(padded, np.ones((size, size), np.uint8))[1:-1, 1:-1] > 0
-    depth = cast(FloatArray, view.depth_image)
     usable = inside & np.isfinite(depth)
     spacing = max(_LEAST_SPACING, int(np.ceil(np.sqrt(usable.sum() / _MOST_SAMPLES))))
     grid = np.zeros_like(usable)
@@ -98,20 +147,30 @@ def _samples(number: int, view: View, camera: Camera) -> _Samples:
     return _Samples(number, rays[valid], depth[rows, columns][valid], sigma)
 
 
+def _measured(depths: Sought[_Samples], place: Place) -> list[Measured]:
+    """What the samples of every view measure at a place."""
+    posed, poses = depths.at(place.state)
+    ratios = np.exp(log_focals_of(depths.evidence, place.state))
+    is_exact = depths.surface.is_exact
+    return [
+        _rows(posed, poses[each.image], each, ratio=float(ratios[each.image]), is_exact=is_exact)
+        for each in depths.views
+    ]
+
+
+def _as_begun(start: Minimum, depths: Sought[_Samples]) -> Minimum:
+    """A minimum with the depths at its place, where they alone would lead it astray."""
+    place = Place.of(start.state)
+    evidence, state, *_ = depths.joined(place, _measured(depths, place))
+    score = score_state(evidence, state) + start.prior_score
+    return start._replace(evidence=evidence, state=state, cost=cost_of(evidence, state), score=score)
+
+
 def _settled(start: Minimum, depths: Sought[_Samples]) -> Minimum:
     """Rounds from one minimum until the cost changes little."""
     place, last, result, prior_score = Place.of(start.state), np.inf, start, start.prior_score
     for _ in range(_ROUNDS):
-        posed, poses = depths.at(place.state)
-        ratios = np.exp(log_focals_of(depths.evidence, place.state))
-        is_exact = depths.surface.is_exact
-        rows = [
-            _rows(
-                posed, poses[each.image], each, ratio=float(ratios[each.image]), is_exact=is_exact
-            )
-            for each in depths.views
-        ]
-        refined = depths.joined(place, rows).refined(_ITERATIONS)
+        refined = depths.joined(place, _measured(depths, place)).refined(_ITERATIONS)
         if refined is None:
             return start
         cost, (evidence, state, place, *_) = refined

@@ -287,8 +287,15 @@ def _finished(candidates: list[_Candidate]) -> list[_Candidate]:
             each.masked.evidence, each.settled.joined.place.state
         )
         masked = each.masked._replace(evidence=evidence)
-        others = [other.settled.joined.place for other in candidates if other is not each]
-        place = each.settled.joined.place._replace(state=state)
+        own = each.settled.joined.place
+        # The depths that meet the surface are points of the shape, and not the same everywhere.
+        others = [
+            other.settled.joined.place
+            for other in candidates
+            if other is not each
+            and len(other.settled.joined.place.state.displacements) == len(own.state.displacements)
+        ]
+        place = own._replace(state=state)
         settled = settle_with(masked, place, noises, others)
         if settled is not None:
             found.append(each._replace(masked=masked, settled=settled))

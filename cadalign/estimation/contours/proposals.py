@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple, cast
 
 import cv2
@@ -276,7 +275,7 @@ def _rough_contour(view: View, camera: Camera, size: float) -> tuple[ViewContour
     width, height = (round(side / pixel) for side in mask.shape[::-1])
     small = np.clip(cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA), 0.0, 1.0)
     sigma = view.mask_sigma and view.mask_sigma / pixel
-    smaller = replace(view, camera=view.camera.resized(width, height), mask=small, mask_sigma=sigma)
+    smaller = View(view.camera.resized(width, height), mask=small, mask_sigma=sigma)
     return contour_view(0, smaller, _WHERE, camera.resized(width, height)), pixel
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, Mesh, Model, View, align
+from cadalign.estimation.view import without_keypoints
+from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry
 
 CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
@@ -61,3 +65,32 @@ def test_contributions_tell_mask_and_depth_apart() -> None:
     assert list(found) == ["views[0].points_2d", "views[0].mask", "views[0].depth"]
     assert np.isinf(found["views[0].depth"].scale[0])
     assert not any("contradict" in text for text in result.warnings)
+
+
+class TestWithoutKeypoints:
+    """The outline gives the pose, the depths inside of it the size."""
+
+    @pytest.mark.long
+    @pytest.mark.parametrize("seed", range(3))
+    def test_mask_and_depth_image(self, seed: int) -> None:
+        model, _, view, truth = case_of(seed, (1.5, 0.8, 1.2))
+        result = align(model, replace(without_keypoints(view), depth=view.depth))
+        found = [result.alignment, *(each.alignment for each in result.alternatives)]
+        assert min(rotation_error(est=each, gt=truth) for each in found) < 1.0
+        error = np.log(result.stretch / truth.scale)
+        assert np.abs(error).max() < 0.02
+        assert {each.kind for each in result.evidence} == {"mask", "depth"}
+
+    @pytest.mark.slow
+    def test_photo_and_depth_image_from_a_start(self) -> None:
+        model, _, view, truth = case_of(1, (1.5, 0.8, 1.2))
+        colors = np.where(view.mask[..., None], [190, 120, 60], [60, 90, 140])
+        noise = np.random.default_rng(0).normal(0, 12, colors.shape)
+        photo = (colors + noise).clip(0, 255).astype(np.uint8)
+        seen = View(CAMERA, image=photo, depth=view.depth, depth_sigma=0.005)
+        near = Rotation.from_rotvec([0.04, -0.05, 0.03]).as_matrix() @ truth.rotation
+        init = Alignment(near, 1.05 * truth.translation, 1.04 * truth.scale)
+        result = align(model, seen, init=init)
+        assert rotation_error(est=result.alignment, gt=truth) < 0.7
+        assert np.abs(np.log(result.stretch / truth.scale)).max() < 0.02
+        assert {each.kind for each in result.evidence} == {"photo", "depth"}

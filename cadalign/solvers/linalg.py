@@ -15,6 +15,12 @@ LEAST_INFORMATION = 1e-15
 
 
 @inlined
+def plus(a: Triple, b: Triple) -> Triple:
+    """The sum of two vectors."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@inlined
 def cross(a: Triple, b: Triple) -> Triple:
     """The vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -86,6 +86,29 @@ def ray_slopes(seen: Triple, weights: Triple) -> tuple[Triple, Triple]:
 
 
 @inlined
+def slope_of_row(
+    row: Triple, along: float, response: Triple, nearer: Triple, fall: float
+) -> Triple:
+    """The slope of ``along = row . response`` by the point, for a response that is held.
+
+    The ``row`` a of a whitened residual is its slope. With the response y, and ``nearer`` d, the
+    camera's z over the depth, it is ``fall a - (d . y) a - (a . y) d``: what lies farther is seen
+    smaller, which a depth is not (d = 0); and a loss's weight changes by ``fall`` along the row.
+
+    The log determinant of ``M = I + A S A'``, by which integrating over a shape of covariance S
+    widens the residuals, has the derivative ``2 tr(dA P A')``, P the covariance of the shape given
+    the pose. Row a of A touches only the point that it is of: half the derivative by that is the
+    sum of these slopes over the rows, with the response ``y = (P A')`` of the point to each.
+    """
+    shared = fall - dot(nearer, response)
+    return (
+        shared * row[0] - along * nearer[0],
+        shared * row[1] - along * nearer[1],
+        shared * row[2] - along * nearer[2],
+    )
+
+
+@inlined
 def write_motion(turned: Triple, slope: Triple, rows: FloatArray, column: int) -> None:
     """Write the derivatives by rotation vector and translation into ``rows[:6, column]``."""
     rows[0, column], rows[1, column], rows[2, column] = cross(turned, slope)

@@ -5,16 +5,11 @@ For the displacement d of a point that one pose sees, with the prior N(0, spread
 about ``r - D d + J dx``. Whitening them by its Cholesky factor L leaves least squares in x alone,
 and ``e = -spread^2 D' L^-T (whitened residual)`` follows.
 
-Coefficients and displacements that are integrated out leave a log determinant. With the equations
-``r + A z`` of both, z, whose prior is standard normal, it is that of M = I + A A', and its
-derivative is ``2 tr(dA P A')``, P the covariance of z given the rest. Row q of A touches only the
-point i that it is of: with ``y_q = P_i a_q`` the response of this point in the rig's frame, a_q the
-row there, and d the camera's z over the depth, half the derivative by the point is
-
-    h_q = -((a_q . y_q) d + (d . y_q) a_q),
-
-and that by a turn ``X_i x h_q + y_q x a_q``; stretch and focal length scale the rows as well. The
-equations of directions, offsets and planes move with the coefficients alone.
+Coefficients and displacements that are integrated out leave a log determinant. Its slope h_q by
+the point of each equation is that of `cadalign.solvers.projection.slope_of_row`, in the rig's frame
+with the response y_q of the point; the derivative by a turn is ``X_i x h_q + y_q x a_q``, and
+stretch and focal length scale the rows as well. The equations of directions, offsets and planes
+move with the coefficients alone.
 """
 
 from __future__ import annotations
@@ -41,7 +36,7 @@ from cadalign.solvers.joint.rows import (
     write_block_row,
 )
 from cadalign.solvers.linalg import cholesky, cross, dot, factorize, solve_factor_rows
-from cadalign.solvers.projection import turn, turn_back
+from cadalign.solvers.projection import slope_of_row, turn, turn_back
 
 
 class JointEquations(NamedTuple):
@@ -328,12 +323,7 @@ def _add_slopes(
             y = turn(motion, (scale[0] * back[0], scale[1] * back[1], scale[2] * back[2]))
             # A weight of a loss falls where the residual grows.
             fall = (in_image if q < of_depth else along) * seen[6, column]
-            shared = fall - dot(d, y)
-            h = (
-                shared * a[0] - along * d[0],
-                shared * a[1] - along * d[1],
-                shared * a[2] - along * d[2],
-            )
+            h = slope_of_row(a, along, y, d, fall)
             by_turn, by_row, by_point = cross(turned, h), cross(y, a), turn_back(motion, h)
             for c in range(3):
                 gradient[size * p + c] += by_turn[c] + by_row[c]

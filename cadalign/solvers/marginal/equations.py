@@ -9,16 +9,11 @@ What is integrated out leaves its determinant, so that the objective is
 
     F = r' r + x' S^-1 x + log det M,
 
-where M depends on the pose and on the shape, through the points that A is taken at. Its derivative
-is ``d log det M = 2 tr(dA P A')``, P the covariance of the shape given the pose, and row q of A
-touches only the point i that it is of: with ``y_q = (P A')_iq``, all in the model's frame, r_3 the
-camera's z there, z the depth and a_q the row,
-
-    half the derivative by the point    h_i = -sum_q ((a_q y_q) r_3 + (r_3 y_q) a_q) / z,
-    half the derivative by a turn w     w . (sum_i x_i x h_i + sum_q y_q x a_q),
-
-and that by the translation is the sum of h_i. A slope ``h' x`` of the objective moves the prior's
-mean by -S h. The Hessian is that of the least squares alone.
+where M depends on the pose and on the shape, through the points that A is taken at. Half its
+derivative by point i is h_i, a sum of `cadalign.solvers.projection.slope_of_row` in the model's
+frame with the responses ``y_q = (P A')_iq``; that by a turn is ``sum_i x_i x h_i + sum_q y_q x
+a_q``, and that by the translation the sum of h_i. A slope ``h' x`` of the objective moves the
+prior's mean by -S h. The Hessian is that of the least squares alone.
 """
 
 from __future__ import annotations
@@ -38,7 +33,16 @@ from cadalign.solvers.evidence import (
     score_of_distance,
     weigh_error,
 )
-from cadalign.solvers.linalg import add_products, cholesky, copy_into, dot, mirror_upper, triple
+from cadalign.solvers.linalg import (
+    add_products,
+    cholesky,
+    copy_into,
+    cross,
+    dot,
+    mirror_upper,
+    plus,
+    triple,
+)
 from cadalign.solvers.marginal.problem import (
     GaussianTarget,
     Seen,
@@ -53,6 +57,7 @@ from cadalign.solvers.projection import (
     ray_slopes,
     see,
     shift,
+    slope_of_row,
     turn,
     turn_back,
     write_motion,
@@ -250,34 +255,24 @@ def _write_slopes(system: Posed, state: FloatArray, equations: PosedEquations) -
             for k in range(forced.shape[0]):
                 total += covariance[3 * (q // 2) + a, k] * forced[k]
             lever[q, a] = total
-    total_turn, total_slope = np.zeros(3), np.zeros(3)
+    motion = motion_of(state)
+    total_turn = total_slope = (0.0, 0.0, 0.0)
     for i in range(mean.shape[0]):
-        own = slope[3 * i : 3 * i + 3]
-        own[:] = 0.0
+        depth, o = points[i, 0], POSE + 3 * i
+        nearer = motion[6] / depth, motion[7] / depth, motion[8] / depth
+        place = mean[i, 0] + state[o], mean[i, 1] + state[o + 1], mean[i, 2] + state[o + 2]
         rest = 2.0 - square[2 * i, 2 * i] - square[2 * i + 1, 2 * i + 1]  # sum of a_q y_q
-        for q in range(2 * i, 2 * i + 2):
-            a, y = by_shape[q], lever[q]
-            along = 0.0
-            deeper = 0.0
-            for k in range(3):
-                along += a[k] * y[k]
-                deeper += state[6 + k] * y[k]
-            for k in range(3):
-                own[k] -= (along * state[6 + k] + deeper * a[k]) / points[i, 0]
-                own[k] += rest * points[i, 1 + q - 2 * i] * a[k]
-                m, p = (k + 1) % 3, (k + 2) % 3
-                total_turn[k] += y[m] * a[p] - y[p] * a[m]
-        for k in range(3):
-            m, p = (k + 1) % 3, (k + 2) % 3
-            at_m = mean[i, m] + state[POSE + 3 * i + m]
-            at_p = mean[i, p] + state[POSE + 3 * i + p]
-            total_turn[k] += at_m * own[p] - at_p * own[m]
-            total_slope[k] += own[k]
-    for k in range(3):
-        turned[k] = turned[3 + k] = 0.0
-        for m in range(3):
-            turned[k] += state[3 * k + m] * total_turn[m]
-            turned[3 + k] += state[3 * k + m] * total_slope[m]
+        own = (0.0, 0.0, 0.0)
+        for q in range(2):
+            row, response = triple(by_shape[2 * i + q]), triple(lever[2 * i + q])
+            fall = rest * points[i, 1 + q]
+            own = plus(own, slope_of_row(row, dot(row, response), response, nearer, fall))
+            total_turn = plus(total_turn, cross(response, row))
+        total_turn = plus(total_turn, cross(place, own))
+        total_slope = plus(total_slope, own)
+        slope[3 * i], slope[3 * i + 1], slope[3 * i + 2] = own
+    turned[0], turned[1], turned[2] = turn(motion, total_turn)
+    turned[3], turned[4], turned[5] = turn(motion, total_slope)
 
 
 @fast_sums

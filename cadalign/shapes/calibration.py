@@ -38,7 +38,7 @@ _EXCEEDED = 95.0  # percentile of the linear box's errors
 _POSE = 6  # a rotation vector, a translation in the image, the logarithm of the scale
 
 
-class Calibration(NamedTuple):
+class ShapeCalibration(NamedTuple):
     """Factor of the deviations, and degrees of freedom of the errors; None if Gaussian."""
 
     inflation: float = 1.0
@@ -62,7 +62,7 @@ class _View(NamedTuple):
 
 def calibrate(
     parts: Iterable[tuple[FloatArray, Gaussians]], *, sigma: float, rng: np.random.Generator
-) -> Calibration:
+) -> ShapeCalibration:
     """Find the factor and tails at which held-out truths lie where they should.
 
     Shares of truths in regions of rotations and of keypoints, given or not, are to differ least
@@ -86,7 +86,7 @@ def calibrate(
                 view = _view(known, rng.permutation(count)[:FEW], row, sigma, rng)
                 few.append(_squares(view, mixture, sigma))
     if not counts:
-        return Calibration()
+        return ShapeCalibration()
     gaps, typical = _departures(every)[:, :, None], float(np.mean(counts))
     if few and typical > FEW:
         is_less = np.tri(len(_FACTORS), dtype=bool)  # or as large
@@ -95,7 +95,7 @@ def calibrate(
     factor, of_few = float(_FACTORS[row]), None
     if gaps.shape[2] > 1:
         of_few = FewKeypoints(typical, float(_FACTORS[lower]) / factor)
-    return Calibration(factor, _DEGREES_OF_FREEDOM[freedom], of_few)
+    return ShapeCalibration(factor, _DEGREES_OF_FREEDOM[freedom], of_few)
 
 
 def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:

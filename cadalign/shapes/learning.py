@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
-from cadalign.shapes.calibration import Calibration, calibrate, excesses_of, learn_margins
+from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
 from cadalign.shapes.examples import Example, tabulated
 from cadalign.shapes.gaussians import (
     Gaussians,
@@ -138,7 +138,7 @@ class Choice(NamedTuple):
 
     recipe: _Recipe
     modes: int | None
-    calibration: Calibration = Calibration()
+    calibration: ShapeCalibration = ShapeCalibration()
     margins: BoxMargins | None = None
 
 
@@ -182,7 +182,7 @@ class _CrossValidation:
         parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
         return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
 
-    def _calibration(self, trial: _Trial, modes: int) -> Calibration:
+    def _calibration(self, trial: _Trial, modes: int) -> ShapeCalibration:
         held_out = [
             (self._models.rows[self._folds == fold][:_MOST_CALIBRATED], _truncated(mixture, modes))
             for fold, mixture in enumerate(trial.learned)

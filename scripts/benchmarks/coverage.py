@@ -91,7 +91,7 @@ def _similar(seed: int, region_problems: int) -> Iterator[Row]:
 def _estimates(
     draw: Callable[[np.random.Generator], T], seed: int, points: int, count: int
 ) -> list[T]:
-    """What is drawn and estimated, without what is refused."""
+    """Draws and their estimates, without those that are refused."""
     drawn = (
         section.attempt(draw, np.random.default_rng([seed, points, number]))
         for number in range(count)

@@ -207,7 +207,7 @@ def reference_seconds() -> float:
 
 
 def with_reference(call: Callable[[], T]) -> tuple[T, float]:
-    """What a call returns, and the smaller of `reference_seconds` before and after it."""
+    """Value of a call, and the smaller of `reference_seconds` before and after it."""
     before = reference_seconds()
     found = call()
     return found, min(before, reference_seconds())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.shapes.calibration import Calibration, calibrate
+from cadalign.shapes.calibration import ShapeCalibration, calibrate
 from cadalign.shapes.gaussians import Gaussians
 
 pytestmark = pytest.mark.long
@@ -42,7 +42,7 @@ def test_missing_keypoints_are_left_out() -> None:
     assert found.inflation == pytest.approx(1.5, rel=0.12)
     rows[:, 2:] = np.nan
     found = calibrate([(rows, mixture)], sigma=SIGMA, rng=np.random.default_rng(1))
-    assert found == Calibration(1.0, None)
+    assert found == ShapeCalibration(1.0, None)
 
 
 def test_shapes_with_heavy_tails_have_few_degrees_of_freedom() -> None:

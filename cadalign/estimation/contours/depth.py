@@ -162,8 +162,8 @@ def _as_begun(start: Minimum, depths: Sought[_Samples]) -> Minimum:
     """A minimum with the depths at its place, where they alone would lead it astray."""
     place = Place.of(start.state)
     evidence, state, *_ = depths.joined(place, _measured(depths, place))
-    score = score_state(evidence, state) + start.prior_score
-    return start._replace(evidence=evidence, state=state, cost=cost_of(evidence, state), score=score)
+    cost, score = cost_of(evidence, state), score_state(evidence, state) + start.prior_score
+    return start._replace(evidence=evidence, state=state, cost=cost, score=score)
 
 
 def _settled(start: Minimum, depths: Sought[_Samples]) -> Minimum:

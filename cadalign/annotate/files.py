@@ -106,7 +106,7 @@ class Stored:
 
     @property
     def seen(self) -> ObservedImage | None:
-        """What the observation has of the photo."""
+        """Content of the observation about the photo."""
         given = self.observation
         return None if given is None else given.views[self.views.index(None)]
 

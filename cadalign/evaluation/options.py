@@ -179,12 +179,12 @@ class ViewOptions(ModelOptions, NoiseOption, FunctionOptions):
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """What random views follow from, as arguments of `make_instance`."""
+        """Noise, least visible keypoints and seed of random views, for `make_instance`."""
         return {name: getattr(self, name) for name in ("noise_px", "min_visible", "seed")}
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainOptions(ExperimentOptions):
+class SplitOptions(ExperimentOptions):
     """Splits of a dataset: objects of one are aligned by what is learned from the other."""
 
     split: str = "val"

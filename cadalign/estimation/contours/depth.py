@@ -148,7 +148,7 @@ def _samples(number: int, view: View, camera: Camera, mask: BoolArray) -> _Sampl
 
 
 def _measured(depths: Sought[_Samples], place: Place) -> list[Measured]:
-    """What the samples of every view measure at a place."""
+    """Measurements of the samples of every view at a place."""
     posed, poses = depths.at(place.state)
     ratios = np.exp(log_focals_of(depths.evidence, place.state))
     is_exact = depths.surface.is_exact

@@ -15,7 +15,7 @@ from cadalign.errors import InputError
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.photos import DEPTH, YAW
-from cadalign.evaluation.options import FunctionOptions, NoiseOption, TrainOptions
+from cadalign.evaluation.options import FunctionOptions, NoiseOption, SplitOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan
@@ -39,7 +39,7 @@ _SAMPLE = 60  # models of each category of a generated data set
 
 
 @dataclass(frozen=True)
-class TracksOptions(TrainOptions, NoiseOption, FunctionOptions):
+class TracksOptions(SplitOptions, NoiseOption, FunctionOptions):
     """Evaluate tracks of objects through videos.
 
     Videos are simulated of the objects of one split of KeypointNet, whose shape is learned from the

@@ -17,7 +17,7 @@ from cadalign.evaluation.options import (
     FunctionOptions,
     ModelOptions,
     NoiseOption,
-    TrainOptions,
+    SplitOptions,
 )
 from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
 from cadalign.evaluation.registry import Spec
@@ -46,7 +46,7 @@ METHODS = (
 
 
 @dataclass(frozen=True)
-class UnseenOptions(ModelOptions, TrainOptions, NoiseOption, FunctionOptions):
+class UnseenOptions(ModelOptions, SplitOptions, NoiseOption, FunctionOptions):
     """Evaluate alignment to objects that are no stretched copy of any model.
 
     Objects of one split of KeypointNet are aligned with models of the other split, by

@@ -228,10 +228,14 @@ def starts_by_one_view(
         factor = _factor_by_masks(box.center, camera, seen_by)
         if factor is None:
             continue
-        turn, shift = camera[:3, :3].T, factor * pose.translation - camera[:3, 3]
-        in_rig = Alignment(turn @ pose.rotation, turn @ shift, factor * pose.scale)
-        starts.append([in_rig, *[None] * (len(views) - 1)])
+        starts.append([_enlarged(pose, factor, camera), *[None] * (len(views) - 1)])
     return starts
+
+
+def _enlarged(pose: Alignment, factor: float, camera: FloatArray) -> Alignment:
+    """A camera's alignment, enlarged about it, in the frame that the camera's pose (4, 4) is of."""
+    turn, shift = camera[:3, :3].T, factor * pose.translation - camera[:3, 3]
+    return Alignment(turn @ pose.rotation, turn @ shift, factor * pose.scale)
 
 
 def _starts_by_depths(view: View, align_some: Align) -> list[Alignment]:
@@ -240,13 +244,13 @@ def _starts_by_depths(view: View, align_some: Align) -> list[Alignment]:
         return []
     from cadalign.estimation.contours.depth import factor_by_depths  # with OpenCV and embree
 
-    alone = align_some([replace(view, depth=None)], [None])
+    alone = align_some([replace(view, depth=None, cam_from_rig=None)], [None])
+    camera = np.eye(4) if view.cam_from_rig is None else np.asarray(view.cam_from_rig)
     starts = []
     for each in (alone.alignment, *(other.alignment for other in alone.alternatives)):
         factor = factor_by_depths(alone.mesh(), view, each)
         if factor is not None:
-            scaled = each.rotation, factor * each.translation, factor * each.scale
-            starts.append(Alignment(*scaled))
+            starts.append(_enlarged(each, factor, camera))
     return starts[:_MOST_STARTS]
 
 

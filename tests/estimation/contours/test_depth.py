@@ -81,6 +81,17 @@ class TestWithoutKeypoints:
         assert np.abs(error).max() < 0.02
         assert {each.kind for each in result.evidence} == {"mask", "depth"}
 
+    @pytest.mark.long
+    def test_the_camera_of_a_rig(self) -> None:
+        model, _, view, truth = case_of(0, (1.5, 0.8, 1.2))
+        rig = np.eye(4)
+        rig[:3, :3] = Rotation.from_euler("y", 40, True).as_matrix()
+        rig[:3, 3] = [0.5, -0.2, 0.3]
+        own = replace(without_keypoints(view), depth=view.depth, cam_from_rig=rig)
+        result = align(model, own)
+        assert np.abs(np.log(result.stretch / truth.scale)).max() < 0.02
+        assert result.alignment.translation == pytest.approx(truth.translation, rel=0.02, abs=0.02)
+
     @pytest.mark.slow
     def test_photo_and_depth_image_from_a_start(self) -> None:
         model, _, view, truth = case_of(1, (1.5, 0.8, 1.2))

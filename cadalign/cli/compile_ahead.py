@@ -77,7 +77,7 @@ def _align_with_mask() -> None:
     from cadalign.render import Scene, cast_geometry
 
     points, pixels = _points()
-    corners = 0.3 * np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    corners = 0.6 * np.concatenate([np.ones((1, 3)), np.eye(3)]) - 0.3
     mesh = Mesh(corners, np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]))
     mask = cast_geometry(Scene(mesh), _CAMERA, _POSE).mask
     view = View(_CAMERA, pixels, sigma=1.0, mask=mask)

@@ -19,6 +19,7 @@ from cadalign.estimation.contours.view_contour import contour_view
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.prior import prior_of
 from cadalign.geometry.rotations import vector_from_rotation
+from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.solvers.joint.evidence import State
 
@@ -91,7 +92,16 @@ def test_far_objects_of_open_stretch_end_within_the_stated_uncertainty(
 ) -> None:
     model = next(m for m in KeypointNet(real_data / "keypointnet")["bottle"] if m.mesh_path)
     given, view, truth = seen_from_anywhere(model, seed, fill=(0.12, 0.25))
-    assert squared_distance(align(given, view), truth) < chi2.ppf(0.999, 8)
+    found = align(given, view)
+    assert found.std is not None
+    # Stretch and distance are open together by a factor of 2: along so far a way the unknowns that
+    # are well known bend off their joint ellipsoid, and each one's own interval is what is stated.
+    pose, gt = found.alignment, truth
+    logs = np.log(pose.scale[1:] / gt.scale[1:]), np.log(pose.translation[2] / gt.translation[2])
+    stated = found.std.scale[1:], found.std.translation[2] / pose.translation[2]
+    for error, deviation in zip(np.hstack(logs), np.hstack(stated), strict=True):
+        assert error**2 < chi2.ppf(0.999, 1) * deviation**2
+    assert rotation_error(est=pose, gt=gt) < 4 * found.std.rotation_deg
 
 
 @pytest.mark.long

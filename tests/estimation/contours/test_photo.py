@@ -277,13 +277,6 @@ class TestRefusals:
         with pytest.raises(InputError, match="no mesh, which a photo needs"):
             shown.aligned(Model(points_3d=shown.mesh.vertices), image=shown.pixels)
 
-    def test_of_a_wide_lens(self) -> None:
-        shown = scene(0)
-        wide = replace(CAMERA, distortion=(0.0,) * 4, lens="fisheye")
-        view = View(wide, shown.clicks, image=shown.pixels)
-        with pytest.raises(InputError, match="not measured through a wide lens"):
-            align(shown.model(), view)
-
 
 class TestTrack:
     """Frames of a smooth motion: three degrees further each, half of the clicks."""

@@ -27,6 +27,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated, Statistics, ViewResult
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
+from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.io.evidence import Size
 from cadalign.solvers.joint.search import refine_joint
@@ -73,8 +74,7 @@ def with_poses_by_masks(
     if len(views) < 2 or not is_exact_model(model) or getattr(model, "mesh", None) is None:
         return found
     for number, view in enumerate(views):
-        alone = view.mask is not None and view.cam_from_rig is None and not len(view.keypoint_ids)
-        if alone and found[number] is None:
+        if found[number] is None and view.has_mask_alone and view.cam_from_rig is None:
             with contextlib.suppress(DegenerateError):  # it is left out
                 found[number] = align_some([view], [None]).alignment
     return found
@@ -210,7 +210,7 @@ def starts_by_one_view(
     has_size = size is not None or any(view.depth is not None for view in views)
     has_size |= any(view.camera_height is not None for view in views)
     given = {n: np.asarray(view.mask) for n, view in enumerate(views) if view.mask is not None}
-    masks = {number: mask > 0.5 for number, mask in given.items() if (mask > 0.5).any()}
+    masks = {number: mask > 0.5 for number, mask in given.items() if mask.max() > 0.5}
     if len(seen) > 1 or (seen and has_size) or not masks:
         return []
     first = seen[0] if seen else max(masks, key=lambda number: int(masks[number].sum()))
@@ -218,18 +218,24 @@ def starts_by_one_view(
     if not others:
         return []
     alone = _align_used([replace(views[first], cam_from_rig=None)], [None], [first], align_some)
-    known = {views[first].camera: alone.camera}
-    seen_by = [replace(views[n], camera=_camera_of(views[n], known)) for n in others]
-    camera = np.asarray(views[first].cam_from_rig)
+    camera, known = np.asarray(views[first].cam_from_rig), {views[first].camera: alone.camera}
+    middles = []
+    for number in others:
+        own = np.asarray(views[number].cam_from_rig) @ np.linalg.inv(camera)
+        middle = np.argwhere(masks[number]).mean(axis=0)[None, ::-1]
+        middles.append((own, _camera_of(views[number], known).normalize(middle)[0]))
     starts: list[list[Alignment | None]] = []
-    found = [(alone.alignment, alone.box)]
-    found += [(each.alignment, each.box) for each in alone.alternatives]
-    for pose, box in found[:_MOST_STARTS]:
-        factor = _factor_by_masks(box.center, camera, seen_by)
-        if factor is None:
-            continue
-        starts.append([_enlarged(pose, factor, camera), *[None] * (len(views) - 1)])
+    for pose, box in _likely(alone):
+        factor = _factor_amid(box.center, middles)
+        if factor > 0:
+            starts.append([_enlarged(pose, factor, camera), *[None] * (len(views) - 1)])
     return starts
+
+
+def _likely(alone: Result) -> list[tuple[Alignment, Box]]:
+    """The estimate of one view and its alternatives, of which so many are starts."""
+    found = [(alone.alignment, alone.box)]
+    return (found + [(each.alignment, each.box) for each in alone.alternatives])[:_MOST_STARTS]
 
 
 def _enlarged(pose: Alignment, factor: float, camera: FloatArray) -> Alignment:
@@ -240,38 +246,30 @@ def _enlarged(pose: Alignment, factor: float, camera: FloatArray) -> Alignment:
 
 def _starts_by_depths(view: View, align_some: Align) -> list[Alignment]:
     """Starts of a view whose mask determines the pose, and whose depth image the size."""
-    if len(view.keypoint_ids) or view.mask is None or view.depth_image is None:
+    if not (view.has_mask_alone and view.shows_surface):
         return []
-    from cadalign.estimation.contours.depth import factor_by_depths  # with OpenCV and embree
+    from cadalign.estimation.contours.depth import factors_by_depths  # with OpenCV and embree
 
     alone = align_some([replace(view, depth=None, cam_from_rig=None)], [None])
     camera = np.eye(4) if view.cam_from_rig is None else np.asarray(view.cam_from_rig)
-    starts = []
-    for each in (alone.alignment, *(other.alignment for other in alone.alternatives)):
-        factor = factor_by_depths(alone.mesh(), view, each)
-        if factor is not None:
-            starts.append(_enlarged(each, factor, camera))
-    return starts[:_MOST_STARTS]
+    poses = [pose for pose, _ in _likely(alone)]
+    factors = zip(poses, factors_by_depths(alone.mesh(), view, poses), strict=True)
+    return [_enlarged(pose, factor, camera) for pose, factor in factors if factor > 0]
 
 
-def _factor_by_masks(
-    center: FloatArray, camera: FloatArray, others: Sequence[View]
-) -> float | None:
-    """Factor of a point's distance from a camera (4, 4) of a rig, by the masks that show it.
+def _factor_amid(center: FloatArray, middles: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+    """Factor of a point's distance from its camera that puts it amid masks; NaN or less for none.
 
-    The point is seen where they have their centres; None if it lies ahead of no camera there.
+    These are of cameras of known pose (4, 4) in the point's, which see their middles by rays (2,).
     """
     by_factor, rest = [], []
-    for view in others:
-        own = np.asarray(view.cam_from_rig) @ np.linalg.inv(camera)
+    for own, ray in middles:
         along, offset = own[:3, :3] @ center, own[:3, 3]
-        middle = np.argwhere(np.asarray(view.mask_image) > 0.5).mean(axis=0)[::-1]
-        for axis, ray in enumerate(view.camera.normalize(middle[None])[0].tolist()):
-            by_factor.append(along[axis] - ray * along[2])
-            rest.append(offset[axis] - ray * offset[2])
-    squares = np.dot(by_factor, by_factor)
-    factor = -float(np.dot(by_factor, rest) / squares) if squares > 0 else 0.0
-    return factor if factor > 0 else None
+        by_factor.append(along[:2] - ray * along[2])
+        rest.append(offset[:2] - ray * offset[2])
+    first, second = np.concatenate(by_factor), np.concatenate(rest)
+    squares = first @ first
+    return -float(first @ second / squares) if squares > 0 else 0.0
 
 
 def facing_view(view: View, shown: FloatArray | None = None) -> View:
@@ -294,7 +292,7 @@ def facing_view(view: View, shown: FloatArray | None = None) -> View:
 
 def _shown_by(view: View) -> FloatArray:
     """Pixels (n, 2) where a view shows the object: its keypoints or, without any, its mask."""
-    if len(view.keypoint_ids) or view.mask is None:
+    if not view.has_mask_alone:
         return view.pixels
     inside = np.argwhere(np.asarray(view.mask) > 0.5)[:, ::-1]
     return inside[:: max(len(inside) // _MOST_PIXELS, 1)].astype(float)

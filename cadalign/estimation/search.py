@@ -146,8 +146,8 @@ def minima_at_noise(
         every = np.ones(len(evidence.sightings.point), dtype=bool)
         if _is_bare(evidence):
             states = [
-                mean_state(evidence, *each)
-                for each in zip(starts.poses, starts.log_scales, strict=True)
+                mean_state(evidence, poses, log_scales)._replace(log_focals=log_focals)
+                for poses, log_focals, log_scales in zip(*starts, strict=True)
             ]
             found = [JointConsensus(every, evidence, each, 0.0, math.inf) for each in states]
             used = 0

@@ -59,9 +59,7 @@ def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignmen
     """True where the mask of one view is all evidence of the pose of a model with a mesh."""
     if isinstance(model, Model) and model.mesh is None:
         return False
-    view = views[0]
-    is_alone = len(views) == 1 and inits[0] is None and not len(view.keypoint_ids)
-    return is_alone and view.mask is not None
+    return len(views) == 1 and inits[0] is None and views[0].has_mask_alone
 
 
 def begins_at_outline(

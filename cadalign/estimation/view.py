@@ -192,6 +192,18 @@ class View(DeclaredEvidence):
         return cast(FloatArray, self.depth) if is_image else None
 
     @property
+    def has_mask_alone(self) -> bool:
+        """True if a mask, and no keypoint, says where the object is."""
+        return self.mask is not None and not len(self.keypoint_ids)
+
+    @property
+    def shows_surface(self) -> bool:
+        """True if the depths of the surface count: those about keypoints count at these."""
+        if self.depth_image is None:
+            return False
+        return self.mask is not None or (self.image is not None and not len(self.keypoint_ids))
+
+    @property
     def mask_image(self) -> FloatArray | BoolArray | None:
         """The mask (h, w), bool or probabilities."""
         return cast("FloatArray | BoolArray | None", self.mask)

@@ -37,7 +37,7 @@ COLMAP_PARAMS: dict[str, tuple[str, ...]] = {
     ),
     "FOV": ("fx", "fy", "cx", "cy", "omega"),
 }
-C = TypeVar("C", bound="Calibration")  # which completion in editors follows, unlike Self
+_C = TypeVar("_C", bound="Calibration")  # which completion in editors follows, unlike Self
 _DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 # Written models of lenses, by kind and number of coefficients.
 _WRITTEN: dict[tuple[LensKind, int], str] = {
@@ -97,7 +97,7 @@ class Calibration:
             require_perspective_lens(self.lens, where="camera.lens")
 
     @classmethod
-    def from_fov(cls: type[C], width: int, height: int, *, fov_x: float) -> C:
+    def from_fov(cls: type[_C], width: int, height: int, *, fov_x: float) -> _C:
         """Make a camera with square pixels from its horizontal field of view ``fov_x`` [degrees].
 
         Examples
@@ -115,7 +115,7 @@ class Calibration:
 
     @classmethod
     def from_matrix(
-        cls: type[C],
+        cls: type[_C],
         matrix: npt.ArrayLike,
         width: int,
         height: int,
@@ -123,7 +123,7 @@ class Calibration:
         pixel_origin: PixelOrigin = "center",
         distortion: tuple[float, ...] = (),
         lens: LensKind = "perspective",
-    ) -> C:
+    ) -> _C:
         """Make a camera from its calibration matrix K.
 
         Parameters
@@ -151,14 +151,14 @@ class Calibration:
 
     @classmethod
     def without_focal(
-        cls: type[C],
+        cls: type[_C],
         width: int,
         height: int,
         *,
         cx: float | None = None,
         cy: float | None = None,
         distortion: tuple[float, ...] = (),
-    ) -> C:
+    ) -> _C:
         """Make a camera of which only the image is known, for ``fit(..., focal="estimate")``.
 
         Its pixels are square. ``fx`` and ``fy`` are placeholders; `project`, `normalize` and fits
@@ -181,7 +181,7 @@ class Calibration:
         cy = (height - 1) / 2 if cy is None else cy
         return cls(width, height, focal, focal, cx, cy, distortion, focal_known=False)
 
-    def with_focal(self: C, focal: float) -> C:
+    def with_focal(self: _C, focal: float) -> _C:
         """The same camera with the horizontal focal length ``focal`` [px], known from now on.
 
         The shape of its pixels stays: ``fy`` changes in proportion.
@@ -190,7 +190,7 @@ class Calibration:
             raise InputError(f"{quote(focal)} is not a finite number", where="focal")
         return replace(self, fx=focal, fy=focal * (self.fy / self.fx), focal_known=True)
 
-    def resized(self: C, width: int, height: int) -> C:
+    def resized(self: _C, width: int, height: int) -> _C:
         """The camera of the image after it was resized to so many pixels.
 
         Examples
@@ -204,7 +204,7 @@ class Calibration:
         fx, fy = (factors * (self.fx, self.fy)).tolist()
         return replace(self, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
 
-    def cropped(self: C, left: int, top: int, width: int, height: int) -> C:
+    def cropped(self: _C, left: int, top: int, width: int, height: int) -> _C:
         """The camera of a part of the image whose first pixel is (``left``, ``top``).
 
         The part may reach beyond the image, as a crop with a border does.
@@ -284,7 +284,7 @@ class Calibration:
         return form if pixel_origin is None else form | {"pixel_origin": pixel_origin}
 
     @classmethod
-    def from_dict(cls: type[C], data: Mapping[str, Any]) -> C:
+    def from_dict(cls: type[_C], data: Mapping[str, Any]) -> _C:
         """Read a camera in COLMAP's form, see `to_dict`, or as a calibration matrix.
 
         Parameters

@@ -27,8 +27,7 @@ def refine_with_images(
     """
     refined: list[Refined] = []
     found = list(minima)
-    shows_outline = [view.mask is not None or view.image is not None for view in views]
-    if any(view.depth_image is not None and shows_outline[k] for k, view in enumerate(views)):
+    if any(view.shows_surface for view in views):
         from cadalign.estimation.contours.depth import fit_depths
 
         found = fit_depths(model, prior, views, found)

@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, cast
 
+import cv2
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.contours.contour import Sight
 from cadalign.estimation.contours.measured import Measured, Place, Sought, cost_of
-from cadalign.estimation.contours.surface import PosedSurface, caster_of, surfaces_of
+from cadalign.estimation.contours.photo_lines import covered_cells
+from cadalign.estimation.contours.surface import PosedSurface, Surface, caster_of, surfaces_of
 from cadalign.estimation.contours.view_contour import robust_deviation
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.model import Model
@@ -31,7 +33,6 @@ from cadalign.solvers.joint.evidence import Planes, kept_rows, log_focals_of
 from cadalign.solvers.joint.search import score_state
 
 _MARGIN = 3  # [px], to the mask's border
-_CELL = 4  # [px], of a silhouette
 _LEAST_SPACING = 8  # [px], of samples that count as independent
 _MOST_SAMPLES = 100  # of a view
 _LOSS_SCALE = 3.0
@@ -64,22 +65,18 @@ def fit_depths(
     These are the depths inside its mask or, where a photo has neither mask nor keypoints, inside
     the silhouette of the likeliest minimum.
     """
-    shown = [number for number, view in enumerate(views) if shows_surface(view)]
-    if not shown:
-        return list(minima)
+    shown = [number for number, view in enumerate(views) if view.shows_surface]
     keypoints, first = len(prior.ids), minima[0]
     where = f"views[{shown[0]}].depth"
     surface = surfaces_of(model, first.points[:keypoints], where).surfaces[0]
-    posed, poses = None, poses_of(first.evidence, first.state)
     samples = []
     for number in shown:
         view, camera = views[number], first.lenses.cameras[number]
         if view.mask is None:
-            posed = posed or surface.at(first.evidence.shape, first.state)
-            inside = _silhouette(Sight(posed.caster, camera, poses[number]))
+            mask = _silhouette(surface, first, number)
         else:
-            inside = np.asarray(view.mask) > 0.5
-        samples.append(_samples(number, view, camera, inside))
+            mask = np.asarray(view.mask) > 0.5
+        samples.append(_samples(number, view, camera, mask))
     samples = [each for each in samples if len(each.depths)]
     if not samples:
         return list(minima)
@@ -97,45 +94,36 @@ def fit_depths(
     return found
 
 
-def shows_surface(view: View) -> bool:
-    """True if the depths of a view's surface count: those about keypoints count at these."""
-    if view.depth_image is None:
-        return False
-    return view.mask is not None or (view.image is not None and not len(view.keypoint_ids))
+def factors_by_depths(mesh: Mesh, view: View, poses: Sequence[Alignment]) -> list[float]:
+    """Measured over predicted depths of a mesh in a view with a mask, their median at each pose.
 
-
-def factor_by_depths(mesh: Mesh, view: View, pose: Alignment) -> float | None:
-    """Measured over predicted depths, their median, of a mesh in a view with a mask.
-
-    None where none of them is measured.
+    NaN where none of them is measured.
     """
-    samples = _samples(0, view, view.camera, np.asarray(view.mask_image) > 0.5)
-    origin, model_from_ray = model_rays(pose)
-    face, depth = caster_of(mesh).first_hits(origin, samples.rays @ model_from_ray.T)
-    hit = face >= 0
-    return float(np.median(samples.depths[hit] / depth[hit])) if hit.any() else None
+    samples, caster = _samples(0, view, view.camera, np.asarray(view.mask) > 0.5), caster_of(mesh)
+    factors = []
+    for pose in poses:
+        origin, model_from_ray = model_rays(pose)
+        face, depth = caster.first_hits(origin, samples.rays @ model_from_ray.T)
+        hit = face >= 0
+        ratios = samples.depths[hit] / depth[hit]
+        factors.append(float(np.median(ratios)) if len(ratios) else np.nan)
+    return factors
 
 
-def _silhouette(sight: Sight) -> BoolArray:
-    """Pixels (h, w) where the object is seen, looked at in every so many."""
-    rows, columns = (
-        np.arange(_CELL // 2, side, _CELL) for side in (sight.camera.height, sight.camera.width)
-    )
-    covered = sight.covers(np.stack(np.meshgrid(columns, rows), axis=-1))
-    return np.kron(covered, np.ones((_CELL, _CELL), dtype=bool)).astype(bool)
+def _silhouette(surface: Surface, minimum: Minimum, number: int) -> BoolArray:
+    """Pixels (h, w) where a view shows the surface at a minimum."""
+    evidence, state, camera = minimum.evidence, minimum.state, minimum.lenses.cameras[number]
+    posed, pose = surface.at(evidence.shape, state), poses_of(evidence, state)[number]
+    size = camera.height, camera.width
+    return covered_cells(Sight(posed.caster, camera, pose), np.zeros(2), 1.0, size)
 
 
 def _samples(number: int, view: View, camera: Camera, mask: BoolArray) -> _Samples:
     """Pixels of a grid inside a mask whose depth is known."""
-    import cv2  # takes longer to import than all the rest
-
-    depth = cast(FloatArray, view.depth_image)
-    inside = np.zeros(depth.shape, dtype=bool)
-    height, width = (min(sides) for sides in zip(mask.shape, depth.shape, strict=True))
-    inside[:height, :width] = mask[:height, :width]
-    padded = np.pad(inside.astype(np.uint8), 1)  # nothing is known of what leaves the image
+    padded = np.pad(mask.astype(np.uint8), 1)  # nothing is known of what leaves the image
     size = 2 * _MARGIN + 1
     inside = cv2.erode(padded, np.ones((size, size), np.uint8))[1:-1, 1:-1] > 0
+    depth = cast(FloatArray, view.depth_image)
     usable = inside & np.isfinite(depth)
     spacing = max(_LEAST_SPACING, int(np.ceil(np.sqrt(usable.sum() / _MOST_SAMPLES))))
     grid = np.zeros_like(usable)

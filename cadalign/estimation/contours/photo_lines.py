@@ -167,7 +167,7 @@ def silhouette_of(
     corner = low - 4 * cell
     width, height = (np.ceil((high - low) / cell).astype(int) + 9).tolist()
     sight = Sight(surface.caster, camera, pose)
-    inside = _covered(sight, corner, cell, (height, width))
+    inside = covered_cells(sight, corner, cell, (height, width))
     rough = contour_of(inside)
     if not len(rough.points):
         return None
@@ -184,7 +184,9 @@ def silhouette_of(
     return Silhouette(inside, corner, cell, *found)
 
 
-def _covered(sight: Sight, corner: FloatArray, cell: float, shape: tuple[int, int]) -> BoolArray:
+def covered_cells(
+    sight: Sight, corner: FloatArray, cell: float, shape: tuple[int, int]
+) -> BoolArray:
     """Cells (h, w) of the image that the object covers; see `Silhouette`.
 
     Of every second row and column all are looked at, of the rest those near the outline.

@@ -127,7 +127,7 @@ def rank_evidence(
     found.append(min((_advice("view", "", _with_view(scene, t)) for t in turns), key=_worst))
     found.extend(_lengths(scene))
     if mask is not None and given[0].mask is None:
-        first = replace(_without_scale(given[0]), mask=mask, mask_sigma=_MASK_SIGMA)
+        first = replace(given[0], mask=mask, mask_sigma=_MASK_SIGMA)
         masked = _scene_of(model, (first, *given[1:]), estimate, size)
         found.append(_advice("mask", "", masked))
     return tuple(sorted(found, key=_worst))
@@ -195,7 +195,7 @@ def _with_keypoint(view: View, name: Hashable, place: FloatArray) -> View:
     if depth is not None and view.depth_image is None:
         depth = np.append(cast(FloatArray, depth), np.nan)
     return replace(
-        _without_scale(view),
+        view,
         points_2d=np.vstack([view.pixels, place]),
         ids=(*view.keypoint_ids, name),
         sigma=1.0 if view.sigma is None else _with_mean(view.sigma),
@@ -211,11 +211,6 @@ def _with_mean(sigma: npt.ArrayLike) -> npt.ArrayLike:
     if given.ndim == 0:
         return given
     return np.concatenate([given, given.mean(axis=0, keepdims=True)]) if len(given) else 1.0
-
-
-def _without_scale(view: View) -> View:
-    """The view as it is after its depths were read: they are not to be scaled again."""
-    return replace(view, depth_scale=None)
 
 
 def _advice(kind: str, detail: Hashable, scene: _KnownScene) -> Advice:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from cadalign.geometry.mesh import Material, Mesh
     from cadalign.geometry.symmetry import Symmetry
     from cadalign.io.evidence import Size
-    from cadalign.io.meshes.load import load_mesh
+    from cadalign.io.meshes.files import load_mesh
     from cadalign.io.observation import Observation
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match

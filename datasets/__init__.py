@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from cadalign.datasets.sfm.colmap import Colmap
     from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
     from cadalign.datasets.sfm.formats import CORRESPONDENCE_FORMATS, open_correspondences
-    from cadalign.io.meshes.load import check_solid, flat_axes, load_mesh
+    from cadalign.io.meshes.files import check_solid, flat_axes, load_mesh
 
 __all__ = [
     "CORRESPONDENCE_FORMATS",

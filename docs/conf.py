@@ -5,7 +5,7 @@ from pathlib import Path
 
 import cadalign
 
-sys.path.insert(0, str(Path(__file__).parent / "extensions"))
+sys.path.insert(0, str(Path(__file__).parent))
 
 project = "cadalign"
 author = "the cadalign developers"
@@ -20,9 +20,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
-    "command_help",
-    "json_schemas",
-    "public_names",
+    "directives",
 ]
 exclude_patterns = ["_build", "tutorials/*.md", "tutorials/*.rst", "sg_execution_times.rst"]
 suppress_warnings = ["myst.xref_missing", "config.cache"]

@@ -31,8 +31,8 @@ from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import ALL, Summary, csv_text
 from cadalign.io.files import made_folder, write_text, writing
 from cadalign.web import asset, fill

@@ -33,8 +33,14 @@ from cadalign.geometry.rotations import angle_between
 from cadalign.io.files import write_json
 from cadalign.metrics import box_iou_up_to_scale
 from cadalign.torch import PoseBatch, align, fit, posterior_loss, rotation_loss
-from cadalign.torch.detector import KeypointDetector, LossOfKeypoints, train
-from cadalign.torch.renders import RenderedViews, learned_shape, render_views
+from cadalign.torch.detector import (
+    KeypointDetector,
+    LossOfKeypoints,
+    RenderedViews,
+    learned_shape,
+    render_views,
+    train,
+)
 
 _RATE = 5e-4  # of fine-tuning
 _REPROJECTION = 0.02  # weight of a pixel beside a unit of the rotation's loss

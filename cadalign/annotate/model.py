@@ -15,9 +15,8 @@ from trimesh.triangles import closest_point
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import InputError
-from cadalign.geometry.mesh import Mesh
+from cadalign.geometry.mesh import Mesh, farthest_rows, random_points
 from cadalign.geometry.raycaster import FaceArray, RayCaster
-from cadalign.geometry.sampling import farthest_rows, random_points
 from cadalign.geometry.simplify import mesh_edges, simplify
 from cadalign.render.drawing.canvas import bytes_from_linear
 from cadalign.render.raycast.surface import coincident_faces

@@ -20,7 +20,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoin
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.model import Model
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
 

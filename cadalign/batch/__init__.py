@@ -6,8 +6,8 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.batch.fits import fit_many, run_many, stream_fits
+    from cadalign.batch.libraries import RetrieveRunOptions
     from cadalign.batch.options import FitRunOptions
-    from cadalign.batch.retrievals import RetrieveRunOptions
     from cadalign.io.input_kinds import DetectorOptions
 
 __all__ = [

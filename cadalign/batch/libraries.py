@@ -1,4 +1,6 @@
-"""Libraries of CAD models built as a run: a row for each model of a data set, then the library.
+"""Runs on libraries of CAD models: building one, and retrieval for many observations.
+
+A library is built of a table with a row for each model of a data set:
 
 category, model_id
     The model.
@@ -8,6 +10,20 @@ keypoints, mesh
     Number of keypoints, and the file of the mesh; empty where there is none that can be read.
 warning
     Why the bounds are the keypoints' instead of the mesh's.
+
+Retrievals are a run of fits: its table, records and exports are those of the best match of each
+observation, whose model has these columns besides:
+
+match_category, match_id, match_score
+    The model of the library, and its probability; see `cadalign.Match.score`.
+match_log_likelihood, none_probability, silhouette_iou
+    As of `cadalign.Match`.
+mirrored, missing
+    True if the labels are mirrored, and the number of keypoints that the model lacks.
+top_categories, top_ids, top_scores
+    All matches, the best first.
+
+The records hold all matches as JSON (`cadalign.Match.to_dict`) in the column ``matches``.
 """
 
 from __future__ import annotations
@@ -15,21 +31,41 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
+import numpy as np
+
+from cadalign.arrays import worker_count
+from cadalign.batch.experiment import plan_run
 from cadalign.batch.fits import pool_of
+from cadalign.batch.options import Estimated, ManyOptions
+from cadalign.batch.spec import SPEC as FIT_SPEC
+from cadalign.batch.spec import summarize_by
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError
+from cadalign.estimation.result import Result
+from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import OnProgress, execute
 from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups
 from cadalign.evaluation.runs.work import FAILED, OK, Plan, Rows, fingerprint
-from cadalign.retrieval import Library
+from cadalign.evaluation.summary import median
+from cadalign.geometry.box import extent
+from cadalign.io.documents import in_file
+from cadalign.io.files import dense_json
+from cadalign.io.observation import Observation
+from cadalign.io.observation_file import fill_xyz
+from cadalign.retrieval import Library, LibraryModel
 from cadalign.retrieval.models import ModelTable, read_annotated, row_of
+from cadalign.retrieval.query import ObservationRetrieval
 
 _LARGEST_CHUNK = 64
 _EXPERIMENT = "library"
+SCORE = Metric("match_score", "score", "%", 0, better="high", factor=100.0, log=False)
+NONE = Metric("none_probability", "none of these", "%", 0, factor=100.0, log=False)
+_SHOWN = (SCORE, NONE)
 
 
 class ModelTask(NamedTuple):
@@ -133,3 +169,74 @@ def _contents(tasks: Sequence[ModelTask]) -> str:
                 known.append(path.stat().st_mtime_ns)
         parts.append(repr(known))
     return fingerprint(*parts)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetrieveRunOptions(ManyOptions):
+    """A run that retrieves the models of many observations; see `ManyOptions`."""
+
+    experiment: ClassVar[str] = "retrieve"
+    command: ClassVar[str] = "retrieve"
+    columns: ClassVar[Columns] = (
+        *(("match_category", str), ("match_id", str), ("match_score", float)),
+        *(("match_log_likelihood", float), ("none_probability", float)),
+        *(("silhouette_iou", float), ("mirrored", bool), ("missing", int)),
+        *(("top_categories", list[str]), ("top_ids", list[str]), ("top_scores", list[float])),
+    )
+    record_columns: ClassVar[Columns] = (("matches", str),)
+
+    estimate: ObservationRetrieval
+
+    @property
+    def threads(self) -> int:
+        """The search lets go of the interpreter lock: a run without workers takes all cores."""
+        return worker_count(-1)
+
+    @property
+    def learned(self) -> Path | None:
+        return self.estimate.shape[0] if len(self.estimate.shape) == 1 else None
+
+    def warm_up(self, seen: Observation) -> Result:
+        points, ids = seen.points_3d, np.arange(len(seen.points_3d))
+        library = Library.from_models([LibraryModel("", "", points, ids, extent(points))])
+        return library.retrieve(seen.points_2d, ids, seen.camera, workers=1)[0].result
+
+    def read(self, data: Any, where: str, *, folder: Path) -> Observation:
+        with in_file(where):
+            seen = Observation.from_dict(fill_xyz(data), folder=folder)
+        return self.changes.applied_to(seen, where)
+
+    def estimate_of(self, seen: Observation, where: str) -> Estimated:
+        matches = self.estimate.retrieve(seen, where, workers=1)
+        best = matches[0]
+        cells = {
+            "match_category": best.category,
+            "match_id": best.model_id,
+            "match_score": best.score,
+            "match_log_likelihood": best.log_likelihood,
+            "none_probability": best.none_probability,
+            "silhouette_iou": best.silhouette_iou,
+            "mirrored": best.mirrored,
+            "missing": len(best.missing_ids),
+            "top_categories": [match.category for match in matches],
+            "top_ids": [match.model_id for match in matches],
+            "top_scores": [match.score for match in matches],
+        }
+        record = {"matches": dense_json([match.to_dict() for match in matches])}
+        return Estimated(best.observation(seen), best.result, cells, record)
+
+    def contents(self) -> dict[str, Any]:
+        library, _ = self.estimate.opened()
+        return {"library_contents": library.fingerprint}
+
+
+SPEC = replace(
+    FIT_SPEC,
+    options=RetrieveRunOptions,
+    plan=plan_run,
+    columns=(*FIT_SPEC.columns[:3], *_SHOWN, *FIT_SPEC.columns[3:]),
+    summarize=summarize_by({metric.key: median(metric.key) for metric in _SHOWN}),
+    metrics=(*_SHOWN, *FIT_SPEC.metrics),
+    title=lambda runs: "retrieved models",
+    about="Red is the best match: its box and model, posed and stretched.",
+)

@@ -24,7 +24,7 @@ from cadalign.geometry.conventions import resized_camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage, read_image
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.render.drawing.overlay import draw_overlay

@@ -19,7 +19,7 @@ from cadalign.evaluation.options import ExperimentOptions, FunctionOptions, Plug
 from cadalign.evaluation.registry import Spec, known_options, spec_named, spec_of_config
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.runs.opened import Run
+    from cadalign.evaluation.runs.tables import Run
 
 _COMMAND = "evaluate"
 _EXIT_CODES = (

@@ -81,7 +81,7 @@ class FittedFile:
         """
         if not picture and style is None:
             return self
-        from cadalign.io.meshes.load import load_mesh
+        from cadalign.io.meshes.files import load_mesh
         from cadalign.render.drawing.model_overlay import draw_result, mesh_of, photo_of
 
         result = self.result

@@ -17,7 +17,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import read_json
 from cadalign.io.images import JPEG_ENDING
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 from cadalign.render.drawing.canvas import ByteImage, composite
 from cadalign.render.drawing.movie import MOVIES, contact_sheet
 from cadalign.render.drawing.pictures import keypoint_picture

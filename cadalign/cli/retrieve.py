@@ -72,7 +72,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
 
     def _retrieve_many(self) -> int:
         """Retrieve the models of all observations; returns the exit code."""
-        from cadalign.batch.retrievals import RetrieveRunOptions
+        from cadalign.batch.libraries import RetrieveRunOptions
         from cadalign.cli.runs import inputs_of, run_command
 
         if self.mask is not None:

@@ -341,7 +341,7 @@ class ObservationFit:
                 )
             return _opened(shape)
         from cadalign.estimation.observed import model_of
-        from cadalign.io.meshes.load import load_mesh
+        from cadalign.io.meshes.files import load_mesh
 
         mesh = None if observation.model is None else load_mesh(observation.model)
         sigma = self.shape_sigma_of(observation)

@@ -329,7 +329,7 @@ class ResultData:
         InputError
             If there is no mesh to warp.
         """
-        from cadalign.io.meshes.load import as_mesh
+        from cadalign.io.meshes.files import as_mesh
         from cadalign.shapes.model import ShapeModel
         from cadalign.shapes.warp import warp_mesh
 

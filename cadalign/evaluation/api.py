@@ -16,9 +16,9 @@ from cadalign.evaluation.options import ExperimentOptions, tuples
 from cadalign.evaluation.portable import names_of
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.parallel import Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
+from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import Plan
 from cadalign.io.files import as_path
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from cadalign.evaluation.runs.opened import Run
+    from cadalign.evaluation.runs.tables import Run
 
 # Colours that colour-blind people tell apart, too: Okabe and Ito's (jfly.uni-koeln.de/color), then
 # dark ones of Paul Tol's "muted" (personal.sron.nl/~pault).

@@ -27,8 +27,7 @@ from cadalign.io.files import write_text
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.tables import Columns, Run
 
     Summaries = Sequence[Summary]
 
@@ -61,7 +60,7 @@ class Spec:
     results: Columns = COLUMNS
     """Columns that the result table of a run must have to be summarized."""
     run: type[Run] | None = None
-    """The class of its runs; by default `cadalign.evaluation.runs.opened.Run`."""
+    """The class of its runs; by default `cadalign.evaluation.runs.tables.Run`."""
     lines: Callable[[Summaries], Summaries] = list
     """Makes lines of the headline table from summaries; by default a line of each."""
     table: Callable[[Run, Summaries], ConsoleTable] | None = None
@@ -95,7 +94,7 @@ class Spec:
 
     def open(self, path: Path, name: str | None = None) -> Run:
         """Read a run of the experiment, ``name`` being its name beside others."""
-        from cadalign.evaluation.runs.opened import Run
+        from cadalign.evaluation.runs.tables import Run
 
         return (self.run or Run).open(path, name, columns=self.results)
 

@@ -16,8 +16,7 @@ from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
 from cadalign.evaluation.runs.work import OK, SKIPPED
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.runs.opened import Cells, Run
-    from cadalign.evaluation.runs.tables import Row
+    from cadalign.evaluation.runs.tables import Cells, Row, Run
 
     Statistics = Mapping[str, Callable[[Cells], float]]
 

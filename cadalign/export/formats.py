@@ -24,7 +24,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import written_path
 from cadalign.io.files import as_path, printable, refuse_nul, write_json
-from cadalign.io.meshes.write import write_obj_mesh, write_ply_mesh
+from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
 
 _SAME = 1e-9
 

@@ -14,7 +14,7 @@ from cadalign.evaluation.metrics.table import HIGH, Metric
 from cadalign.evaluation.photos.protocols import TRUTH
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.registry import spec_of
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import FAILED, SKIPPED
 from cadalign.evaluation.summary import ALL, Summary, csv_text, group_name
 from cadalign.report.runs import by_spec, read_runs

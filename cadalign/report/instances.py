@@ -23,7 +23,7 @@ from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_stem
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import compact
 from cadalign.evaluation.registry import spec_of
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import LEFT_OUT, OK, SKIPPED
 from cadalign.io.files import (
     dense_json,

@@ -59,7 +59,7 @@ from typing import Any
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, look_of
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import as_path, dense_json, made_folder, write_text
 from cadalign.report.headline import Headline, headline_of
 from cadalign.report.instances import (

@@ -17,7 +17,7 @@ from cadalign.estimation.result_parts import Stated, ViewResult
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.names import renamed
 from cadalign.notebook import card, draw_picture

@@ -31,7 +31,7 @@ from cadalign.errors import DataError, InputError, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.files import as_path, read_text
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 
 logger = logging.getLogger("cadalign")
 

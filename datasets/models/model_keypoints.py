@@ -32,7 +32,7 @@ from cadalign.io.documents import (
     written_path,
 )
 from cadalign.io.files import as_path, write_json
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 from cadalign.names import renamed
 
 FORMAT = "cadalign model keypoints"

@@ -13,7 +13,7 @@ from cadalign.datasets.models.categories import name_of_synset, require_category
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import as_path
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 
 # Where a model's mesh lies in its folder: version 2, then version 1.
 MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))

@@ -38,7 +38,7 @@ from cadalign.io.documents import (
     within,
 )
 from cadalign.io.files import made_folder, read_text, write_json, write_text
-from cadalign.io.meshes.write import write_ply_mesh
+from cadalign.io.meshes.files import write_ply_mesh
 
 TRUTH = "scene_gt.json"
 RESULT_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")

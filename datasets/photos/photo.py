@@ -18,7 +18,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.images import ByteImage, open_photo, read_photo
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import Finite, ForeignDocument, PathText, Point2, Point3, Positive, Text
 from cadalign.io.files import as_path
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 
 T = TypeVar("T")
 ANNOTATIONS = "pix3d.json"

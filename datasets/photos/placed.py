@@ -19,7 +19,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import made_folder, write_json, writing
 from cadalign.io.images import open_photo, write_image
-from cadalign.io.meshes.write import write_obj_mesh
+from cadalign.io.meshes.files import write_obj_mesh
 
 LEVEL_UP = (0.0, -1.0, 0.0)
 """Direction in a level camera that is up in the scene."""

@@ -21,7 +21,7 @@ from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, f
 from cadalign.datasets.sample.vehicles import car, vessel
 from cadalign.errors import DataError, InputError
 from cadalign.io.files import as_path, writing
-from cadalign.io.meshes.write import write_ply_mesh
+from cadalign.io.meshes.files import write_ply_mesh
 
 _Maker = Callable[[np.random.Generator, int], Draft]
 MAKERS: dict[str, _Maker] = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}

@@ -21,9 +21,13 @@ from pathlib import Path
 import numpy as np
 
 import cadalign
-from cadalign.datasets import KeypointNet, ModelKeypoints, write_sample_dataset
-from cadalign.datasets.detections.image_keypoints import join_keypoints
-from cadalign.datasets.detections.keypoint_files import read_image_keypoints
+from cadalign.datasets import (
+    KeypointNet,
+    ModelKeypoints,
+    join_keypoints,
+    read_image_keypoints,
+    write_sample_dataset,
+)
 from cadalign.render import Angles, Scene, pose_in_view, visible_keypoints
 
 folder = Path(tempfile.mkdtemp())

@@ -20,7 +20,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import read_image
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.drawing.layers import LINES, SHADED, TRANSLUCENT, confidence_regions

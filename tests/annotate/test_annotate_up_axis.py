@@ -15,8 +15,7 @@ from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-from cadalign.io.meshes.load import load_mesh
-from cadalign.io.meshes.write import write_obj_mesh
+from cadalign.io.meshes.files import load_mesh, write_obj_mesh
 from cadalign.io.observation import Observation
 
 pytestmark = pytest.mark.long

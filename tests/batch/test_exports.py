@@ -18,8 +18,7 @@ from cadalign.datasets.photos.bop_files import RESULT_COLUMNS
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
-from cadalign.io.meshes.load import load_mesh
-from cadalign.io.meshes.write import write_obj_mesh
+from cadalign.io.meshes.files import load_mesh, write_obj_mesh
 
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
 FACES = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],

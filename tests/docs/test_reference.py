@@ -11,9 +11,9 @@ import pytest
 
 import cadalign
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "docs" / "extensions"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 
-from public_names import further_names, named, rooms, shown_by_itself
+from directives import further_names, named, rooms, shown_by_itself
 
 SOURCE = Path(cadalign.__file__).parent
 PUBLIC = sorted(

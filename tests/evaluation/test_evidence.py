@@ -23,7 +23,7 @@ from cadalign.evaluation.instances.evidence import (
     truth_in,
 )
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.tables import Run
 
 QUICK = ("keypoints", "gravity", "length", "depth", "views-2", "views-2-free", "gravity+length")
 

@@ -28,8 +28,7 @@ from cadalign.evaluation.instances.queries import (
     same_shapes,
 )
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
-from cadalign.evaluation.runs.tables import read_table
+from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.geometry.metrics import box_iou, box_iou_up_to_scale
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.absence import distances

@@ -24,9 +24,8 @@ from cadalign.evaluation.instances.pictures import keep_preview
 from cadalign.evaluation.instances.unseen import UnseenTasks, observe_object
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
-from cadalign.evaluation.runs.tables import read_table
+from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.geometry.metrics import box_iou
 from cadalign.report import headline_text, write_report
 

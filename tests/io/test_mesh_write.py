@@ -12,8 +12,7 @@ from support.exported import wedge
 
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Mesh
-from cadalign.io.meshes.load import load_mesh
-from cadalign.io.meshes.write import write_obj_mesh, write_ply_mesh
+from cadalign.io.meshes.files import load_mesh, write_obj_mesh, write_ply_mesh
 
 WRITERS = {"obj": write_obj_mesh, "ply": write_ply_mesh}
 

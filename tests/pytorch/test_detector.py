@@ -9,8 +9,13 @@ from cadalign.datasets import sample_models
 
 torch = pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
 from cadalign.torch import PoseBatch, fit, rotation_loss  # noqa: E402
-from cadalign.torch.detector import KeypointDetector, train  # noqa: E402
-from cadalign.torch.renders import RenderedViews, learned_shape, render_views  # noqa: E402
+from cadalign.torch.detector import (  # noqa: E402  # noqa: E402
+    KeypointDetector,
+    RenderedViews,
+    learned_shape,
+    render_views,
+    train,
+)
 
 pytestmark = pytest.mark.slow
 

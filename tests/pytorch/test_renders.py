@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
-from cadalign.torch.renders import _on_background
+from cadalign.torch.detector import _on_background
 
 
 def test_pictures_show_the_object_where_it_is_opaque_and_noise_elsewhere() -> None:

@@ -21,7 +21,7 @@ from cadalign.errors import InputError
 from cadalign.estimation.model import Model
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.raycaster import RayCaster
-from cadalign.io.meshes.load import load_mesh
+from cadalign.io.meshes.files import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.warp import LinearWarp, linear_warp
 from cadalign.solvers.joint.evidence import Shape, State, points_of

@@ -20,7 +20,7 @@ from cadalign.io.files import write_text
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Run
+    from cadalign.evaluation.runs.tables import Run
 
 METHOD = "optimal"
 _LEAST_SAMPLE = 12  # models of each category of a sample dataset

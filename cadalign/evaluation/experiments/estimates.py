@@ -28,7 +28,7 @@ from cadalign.io.files import read_bytes
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Run
+    from cadalign.evaluation.runs.tables import Run
 
 logger = logging.getLogger("cadalign")
 

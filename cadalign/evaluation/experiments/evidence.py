@@ -29,8 +29,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.tables import Columns, Run
 
 KEYPOINTS = "keypoints"
 MASK, DEPTH, GRAVITY, LENGTH, IMAGE = "mask", "depth", "gravity", "length", "image"

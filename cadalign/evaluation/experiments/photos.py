@@ -42,8 +42,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Cells, Run
-    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.tables import Cells, Columns, Run
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),

@@ -24,8 +24,7 @@ from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, med
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.queries import RetrievalTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Cells, Run
-    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.tables import Cells, Columns, Run
     from cadalign.retrieval.library import Library
 
 NO_VIEW = "no view"

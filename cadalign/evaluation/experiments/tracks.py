@@ -31,8 +31,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.tracks import TrackTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.tables import Columns, Run
 
 METHODS = ("frames", "shared", "smooth", "online")
 _SAMPLE = 60  # models of each category of a generated data set

@@ -36,8 +36,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Cells, Run
-    from cadalign.evaluation.runs.tables import Columns
+    from cadalign.evaluation.runs.tables import Cells, Columns, Run
 
 METHODS = (
     *("random-rigid", "random-stretched", "nearest", "mean-rigid", "mean-stretched"),

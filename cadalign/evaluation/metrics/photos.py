@@ -28,8 +28,7 @@ from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
-    from cadalign.evaluation.runs.opened import Cells
-    from cadalign.evaluation.runs.tables import Row
+    from cadalign.evaluation.runs.tables import Cells, Row
 
 # PASCAL3D+ ----------------------------------------------------------------------------------------
 

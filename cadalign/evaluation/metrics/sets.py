@@ -21,8 +21,7 @@ from cadalign.geometry.box import Box
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
-    from cadalign.evaluation.runs.opened import Cells
-    from cadalign.evaluation.runs.tables import Columns, Row
+    from cadalign.evaluation.runs.tables import Cells, Columns, Row
 
 PERCENTILE = 90
 

@@ -22,7 +22,7 @@ from cadalign.evaluation.runs.work import UNREADABLE, LeftOutError, fingerprint
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.sampling import farthest_rows, random_points
+from cadalign.geometry.mesh import farthest_rows, random_points
 from cadalign.render.scene import Scene
 
 _KEPT = 16

@@ -24,7 +24,7 @@ from cadalign.evaluation.photos.given import match_estimates
 from cadalign.evaluation.photos.target import PhotoTarget
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.tables import Run
 from cadalign.geometry.rotations import rotation_from_vector
 
 CAMERA = {"fx": 500.0, "fy": 500.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}

@@ -34,8 +34,8 @@ from cadalign.evaluation.photos.given import score_poses, summarize_rows
 from cadalign.evaluation.photos.objects import _around
 from cadalign.evaluation.photos.target import farthest_points, opened
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
 from cadalign.evaluation.runs.run import Progress
+from cadalign.evaluation.runs.tables import Run
 
 pytestmark = pytest.mark.long
 

@@ -11,7 +11,7 @@ import pytest
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.photos import SPEC, PhotosOptions
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.opened import Run
+from cadalign.evaluation.runs.tables import Run
 
 pytestmark = pytest.mark.long
 

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.datasets.models.categories import name_of_synset
 from cadalign.errors import CadalignError, DataError, RenderError
 from cadalign.estimation.result import Result
-from cadalign.evaluation.instances.pictures import write_preview, write_webp
+from cadalign.evaluation.instances.pictures import cut_out, shown_photo, write_preview, write_webp
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.runs.work import AbortError
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import resized_camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage, read_image
@@ -31,9 +27,6 @@ from cadalign.render.drawing.overlay import draw_overlay
 
 NAMING = ("row", "source", "image", "object", "model", "match_category", "match_id")
 """Columns that `page_names` looks at; only a retrieval has the last ones."""
-_MOST = 1024  # pixels of a picture's longer side
-_THUMB = (320, 240)
-_MARGIN = 0.2  # of a thumb, around the object
 
 
 def page_names(row: Row) -> Row:
@@ -78,7 +71,7 @@ def draw_fit(folder: RunFolder, row: Row, seen: Observation, result: Result) -> 
         troubles.append(f"the model is shown as a box: {error}")
     try:
         if photo is not None:
-            small, camera = _resized(photo, result.camera)
+            small, camera = shown_photo(photo, result.camera)
             write_webp(folder.pictures / f"{stem}.webp", small)
             write_webp(folder.thumbs / f"{stem}.webp", _thumb(small, camera, result))
         if mesh is not None:
@@ -99,33 +92,9 @@ def _mesh(seen: Observation, result: Result) -> Mesh | None:
     return None if seen.model is None else load_mesh(seen.model)
 
 
-def _resized(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
-    factor = min(1.0, _MOST / max(camera.width, camera.height))
-    size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
-    if size != photo.shape[1::-1]:
-        photo = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    return photo, resized_camera(camera, *size)
-
-
 def _thumb(photo: ByteImage, camera: Camera, result: Result) -> ByteImage:
     box = Box.from_model(result.bounds, result.alignment)
-    scale = camera.width / result.camera.width
-    observed = rescaled_pixels(result.views[0].points_2d, scale)
-    drawn: Any = draw_overlay(
-        photo, camera, est_box=box, observed=observed, axes=False, legend=False
-    )
-    corners = camera.project_where_ahead(box.corners)
-    points = np.concatenate([observed, corners])
-    return _cropped(drawn, points[np.isfinite(points).all(axis=1)])
-
-
-def _cropped(photo: ByteImage, points: FloatArray) -> ByteImage:
-    limit = np.array(photo.shape[1::-1], dtype=float)
-    low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
-    across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel
-    across = min(max(across, 0.1), float((limit / _THUMB).max()))
-    corner = (low + high) / 2 - across * np.array(_THUMB) / 2
-    warp = np.array([[across, 0, corner[0]], [0, across, corner[1]]])
-    how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
-    crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(crop, dtype=np.uint8)
+    observed = rescaled_pixels(result.views[0].points_2d, camera.width / result.camera.width)
+    drawn = draw_overlay(photo, camera, est_box=box, observed=observed, axes=False, legend=False)
+    points = np.concatenate([observed, camera.project_where_ahead(box.corners)])
+    return cut_out(drawn, camera, points[np.isfinite(points).all(axis=1)])[0]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import tyro
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.io.files import printable
+from cadalign.io.files import finite, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -90,16 +90,8 @@ def answer(text: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print a value as JSON on standard output; NaN becomes null."""
-    answer(json.dumps(_plain(value), indent=2))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and value != value else value
+    """Print a value as JSON on standard output; what is not finite becomes null."""
+    answer(json.dumps(finite(value), indent=2))
 
 
 @contextmanager

@@ -12,12 +12,12 @@ from support.pages import Opened, cut_off, embedded_payload, watched
 
 import cadalign
 from cadalign import Alignment, Camera, Observation
-from cadalign.batch.pictures import _cropped
 from cadalign.batch.spec import SPEC, FitRun
 from cadalign.datasets import write_sample_dataset
 from cadalign.errors import InputError
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
+from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.report import headline_text, write_report
 
@@ -103,7 +103,8 @@ def test_runs_without_instances_are_for_a_page_of_their_own(
 def test_thumbnails_show_the_middle_of_the_object() -> None:
     photo = np.zeros((480, 640, 3), dtype=np.uint8)
     photo[300:340, 400:460] = 200
-    thumb = _cropped(photo, np.array([[390.0, 290.0], [470.0, 350.0]]))
+    camera = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
+    thumb, _ = cut_out(photo, camera, np.array([[390.0, 290.0], [470.0, 350.0]]))
     rows, columns = np.nonzero(thumb[:, :, 0] > 100)
     middle = np.array(thumb.shape[:2]) / 2
     np.testing.assert_allclose([rows.mean(), columns.mean()], middle, atol=2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import resized_camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.simplify import cluster, mesh_edges, simplify
 from cadalign.io.files import dense_json, made_folder, write_text, write_whole
@@ -33,7 +32,11 @@ from cadalign.render.drawing.canvas import ByteImage
 
 logger = logging.getLogger("cadalign")
 
-_THUMB_WIDTH = 320
+NO_PHOTO = 225
+"""Grey of a photo that is not there."""
+_MOST = 1024  # pixels of a photo's longer side
+_THUMB = (320, 240)
+_MARGIN = 0.2  # of a thumb, around the object
 _QUALITY, _THUMB_QUALITY = 85, 75
 _EFFORT = 2  # of WebP's 6: half the time of 4, files 3 % larger
 
@@ -66,7 +69,8 @@ def draw_instance(
         observed=instance.points_2d,
         reprojected=instance.camera.project_where_ahead(estimate.apply(instance.points_3d)),
     )
-    small, camera = _scaled(plain, instance.camera, width=_THUMB_WIDTH)
+    size = _THUMB[0], round(instance.camera.height * _THUMB[0] / instance.camera.width)
+    small, camera = _resized(plain, instance.camera, *size)
     thumb = draw_overlay(
         small, camera, gt_box=instance.gt_box, est_box=est_box, axes=False, legend=False
     )
@@ -76,12 +80,41 @@ def draw_instance(
         write_preview(preview, instance.scene.mesh)
 
 
-def _scaled(image: ByteImage, camera: Camera, *, width: int) -> tuple[ByteImage, Camera]:
-    height = round(camera.height * width / camera.width)
-    small = np.asarray(
-        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8
+def shown_photo(photo: ByteImage, camera: Camera) -> tuple[ByteImage, Camera]:
+    """A photo in a size for a page, its longer side at most 1024 pixels, and its camera."""
+    factor = min(1.0, _MOST / max(camera.width, camera.height))
+    size = camera.width, camera.height
+    return _resized(photo, camera, *(max(1, round(factor * length)) for length in size))
+
+
+def cut_out(photo: ByteImage, camera: Camera, points: FloatArray) -> tuple[ByteImage, Camera]:
+    """The part of a photo around points (n, 2) [px] as a thumb, and its camera."""
+    limit = np.array([camera.width, camera.height], dtype=float)
+    low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
+    across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel
+    across = min(max(across, 0.1), float((limit / _THUMB).max()))
+    left, top = (low + high) / 2 - across * np.array(_THUMB) / 2
+    # A pixel's borders, not its centre, stay in place.
+    warp = np.array([[across, 0, left], [0, across, top]])
+    how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
+    crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderValue=(NO_PHOTO,) * 3)
+    near = replace(
+        camera,
+        width=_THUMB[0],
+        height=_THUMB[1],
+        fx=camera.fx / across,
+        fy=camera.fy / across,
+        cx=(camera.cx - left) / across,
+        cy=(camera.cy - top) / across,
     )
-    return small, resized_camera(camera, width, height)
+    return np.asarray(crop, dtype=np.uint8), near
+
+
+def _resized(image: ByteImage, camera: Camera, width: int, height: int) -> tuple[ByteImage, Camera]:
+    if image.shape[1::-1] != (width, height):
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        image = np.asarray(small, dtype=np.uint8)
+    return image, camera.resized(width, height)
 
 
 def write_pictures(

@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.errors import DataError
 from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
@@ -26,7 +24,13 @@ from cadalign.evaluation.benchmark import (
 )
 from cadalign.evaluation.experiments.photos import COLUMNS, PhotosOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, example_view
-from cadalign.evaluation.instances.pictures import write_pictures, write_preview
+from cadalign.evaluation.instances.pictures import (
+    NO_PHOTO,
+    cut_out,
+    shown_photo,
+    write_pictures,
+    write_preview,
+)
 from cadalign.evaluation.instances.record import (
     RECORD_COLUMNS,
     Estimate,
@@ -51,7 +55,6 @@ from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.runs.work import Outcome
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import resized_camera
 from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage
 from cadalign.render.drawing.overlay import draw_overlay
@@ -200,12 +203,6 @@ def _described(estimate: PhotoEstimate | Any, sighting: Sighting) -> Estimate | 
     )
 
 
-_MOST = 1024  # pixels of a picture's longer side
-_THUMB = (320, 240)
-_MARGIN = 0.2  # of a thumb, around the object
-_GREY = 225  # of a photo that is not there
-
-
 def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate | None) -> None:
     """Write the pictures of an object in a photo, and the preview of its model, to a run's folder.
 
@@ -228,7 +225,10 @@ def draw_sighting(folder: RunFolder, sighting: Sighting, estimate: PhotoEstimate
     observed = rescaled_pixels(sighting.points_2d, scale)
     marks: dict[str, Any] = {"observed": observed, "reprojected": predicted}
     image = draw_overlay(photo, camera, est_frame=frame, **boxes, **marks)
-    crop, near = _around(photo, camera, sighting, observed)
+    points, box = observed, sighting.target.gt_box
+    if box is not None and (box.corners[:, 2] > 0).all():
+        points = np.concatenate([points, camera.project(box.corners)])
+    crop, near = cut_out(photo, camera, points)
     thumb = draw_overlay(crop, near, axes=False, legend=False, **boxes)
     write_pictures(folder, stem, photo, thumb, image)
     if cad is not None and cad.has_mesh:
@@ -241,36 +241,5 @@ def _photo(sighting: Sighting) -> tuple[ByteImage, Camera]:
     try:
         image = sighting.target.photo.read_image()
     except DataError:
-        image = np.full((camera.height, camera.width, 3), _GREY, dtype=np.uint8)
-    factor = min(1.0, _MOST / max(camera.width, camera.height))
-    size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
-    if image.shape[1::-1] != size:
-        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    return image, resized_camera(camera, *size)
-
-
-def _around(
-    photo: ByteImage, camera: Camera, sighting: Sighting, points: FloatArray
-) -> tuple[ByteImage, Camera]:
-    box = sighting.target.gt_box
-    if box is not None and (box.corners[:, 2] > 0).all():
-        points = np.concatenate([points, camera.project(box.corners)])
-    limit = np.array([camera.width, camera.height], dtype=float)
-    low, high = np.clip(points.min(axis=0), 0, limit), np.clip(points.max(axis=0), 0, limit)
-    across = float(((high - low) / _THUMB).max()) * (1 + 2 * _MARGIN)  # photo's pixels per pixel
-    across = min(max(across, 0.1), float((limit / _THUMB).max()))
-    left, top = (low + high) / 2 - across * np.array(_THUMB) / 2
-    # A pixel's borders, not its centre, stay in place.
-    warp = np.array([[across, 0, left], [0, across, top]])
-    how = cv2.WARP_INVERSE_MAP | (cv2.INTER_AREA if across > 1 else cv2.INTER_LINEAR)
-    crop = cv2.warpAffine(photo, warp, _THUMB, flags=how, borderValue=(_GREY,) * 3)
-    near = replace(
-        camera,
-        width=_THUMB[0],
-        height=_THUMB[1],
-        fx=camera.fx / across,
-        fy=camera.fy / across,
-        cx=(camera.cx - left) / across,
-        cy=(camera.cy - top) / across,
-    )
-    return np.asarray(crop, dtype=np.uint8), near
+        image = np.full((camera.height, camera.width, 3), NO_PHOTO, dtype=np.uint8)
+    return shown_photo(image, camera)

@@ -6,7 +6,6 @@ import json
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,8 +29,8 @@ from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.evaluation.api import evaluate, run
 from cadalign.evaluation.experiments.photos import SPEC, PhotosOptions
+from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.photos.given import score_poses, summarize_rows
-from cadalign.evaluation.photos.objects import _around
 from cadalign.evaluation.photos.target import farthest_points, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
@@ -411,8 +410,7 @@ def test_a_thumb_shows_an_object_with_a_margin_and_has_its_camera() -> None:
     photo = np.zeros((480, 640, 3), np.uint8)
     photo[200:261, 300:401] = 255
     corners = np.array([[300.0, 200.0], [400.0, 260.0]])
-    sighting: Any = SimpleNamespace(target=SimpleNamespace(gt_box=None))
-    thumb, near = _around(photo, camera, sighting, corners)
+    thumb, near = cut_out(photo, camera, corners)
     assert (near.width, near.height) == thumb.shape[1::-1]
     rows, columns = np.nonzero(thumb[..., 0] > 128)
     assert (columns.max() - columns.min()) / near.width == pytest.approx(1 / 1.4, abs=0.02)

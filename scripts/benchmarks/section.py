@@ -22,7 +22,7 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
-from cadalign.evaluation.simulation import Problem
+from cadalign.evaluation.simulation.problems import Problem
 from cadalign.geometry.rotations import vector_from_rotation
 
 LIMIT_DRAWS = 20

@@ -19,7 +19,7 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, Observation
 from cadalign.datasets import sample_models
 from cadalign.errors import RenderError
-from cadalign.evaluation.simulation import simulate_problem
+from cadalign.evaluation.simulation.problems import simulate_problem
 from cadalign.io.images import write_image
 from cadalign.render import (
     RaycastRenderer,

@@ -13,7 +13,7 @@ from support.problems import LENS, assert_same, fit_problem, moved, problem_of, 
 
 from cadalign import Alignment, Camera, Model, View, align, fit
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem
+from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem
 from cadalign.geometry.metrics import rotation_error
 
 # --- sigma ------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 from cadalign import Camera, Motion, RansacOptions, ShapeModel, Tracker, View, align
 from cadalign.errors import InputError
 from cadalign.estimation.tracks.tracker import TrackUpdate
-from cadalign.evaluation.simulation import SimulatedTrack, simulate_track, with_mistakes
+from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
 from cadalign.geometry.rotations import angle_between
 
 pytestmark = pytest.mark.slow

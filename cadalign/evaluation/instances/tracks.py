@@ -42,7 +42,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Row
 from cadalign.evaluation.runs.work import fingerprint
 from cadalign.evaluation.shape_files import learn
-from cadalign.evaluation.simulation import (
+from cadalign.evaluation.simulation.tracks import (
     simulate_track,
     with_correlated_errors,
     with_mistakes,

@@ -1,0 +1,1 @@
+"""Simulated problems: those of the AEPnP paper, and videos."""

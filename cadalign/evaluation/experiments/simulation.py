@@ -34,8 +34,7 @@ from cadalign.seeding import instance_rng
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.opened import Run
-    from cadalign.evaluation.runs.tables import Columns, Row
+    from cadalign.evaluation.runs.tables import Columns, Row, Run
 
 
 @dataclass(frozen=True)

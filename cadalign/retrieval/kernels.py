@@ -24,8 +24,8 @@ from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
 from cadalign.solvers.linalg import cholesky
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.optimal import choose_subsets, minimal_starts, rotation_starts
 from cadalign.solvers.search import refine
+from cadalign.solvers.starts import choose_subsets, minimal_starts, rotation_starts
 from cadalign.solvers.unknowns import uncenter
 
 LEAST_SHARED = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import kernel
 from cadalign.solvers.alignment import (
     Objective,
     center_and_unit,
@@ -25,29 +25,25 @@ from cadalign.solvers.constants import (
 )
 from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
 from cadalign.solvers.linalg import (
-    Triple,
-    cholesky,
     copy_into,
-    cross,
-    dot,
-    rotation_from_quaternion,
-    solve_cholesky,
 )
 from cadalign.solvers.linear import aepnp_kernel
-from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
+from cadalign.solvers.minimal import MAX_SOLUTIONS
+from cadalign.solvers.p3p import MAX_POSES, p3p_kernel, p3p_memory, reflect
 from cadalign.solvers.search import Effort, Minima, search
-from cadalign.solvers.unknowns import orthonormalize, pack_pose, uncenter
+from cadalign.solvers.starts import choose_subsets, minimal_starts, relief, rotation_starts
+from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 MAX_MINIMA = 12
 _COARSE_POINTS = 48  # that many tell the minima apart; all points then refine them
 _GRID_ROTATIONS = 96
 _GRID_REFINED = 20
 _PROBE_ITERATIONS = 6
+_TRIANGLES = 6
+_RIGID_REFINED = 6
 _MAX_ITERATIONS = 200
 _LEAST_RELIEF = 3.0  # of points whose subsets tell their depths
 _UNLIKELY = 40.0  # excess cost, over a unit variance, at which a coarse minimum is given up
-_DRAWS_PER_SUBSET = 4
-_LEAST_DEPTH = 1e-9
 
 
 @kernel
@@ -168,6 +164,8 @@ def _search_from_all_starts(
     ``linear`` is the linear solver's pose, where it has one.
     """
     points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
+    if free[6] == 0.0 and free[7] == 0.0:
+        return _search_rigid(objective, minima)
     subset_count, refined = _effort(points.shape[0])
     starts = np.empty((subset_count * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
     count = 0
@@ -194,9 +192,40 @@ def _search_from_all_starts(
             for j in range(2):
                 if free[6 + j] == 0.0:
                     starts[k, 13 + j] = 1.0
-        effort = Effort(refined, _PROBE_ITERATIONS, _MAX_ITERATIONS, np.inf)
-        search(objective, starts[:count], effort, 0, 0.0, minima)
+        _search_from(objective, starts[:count], refined, minima)
     return count
+
+
+@kernel
+def _search_rigid(objective: Objective, minima: Minima) -> int:
+    """Refine the most promising starts of a model without stretch; returns their number.
+
+    Few triangles lead to the optimum; the second minimum, where there is one, is near its
+    reflection. Measured on random problems of 4 to 100 points, also in a plane: none of either is
+    missed that a grid of rotations finds.
+    """
+    points, rays = objective.keypoints.points, objective.keypoints.rays
+    triangles = np.empty((_TRIANGLES, 3), dtype=np.int64)
+    starts = np.empty((max(_TRIANGLES * MAX_POSES, _GRID_ROTATIONS), POSE_SIZE))
+    memory = p3p_memory()
+    count = 0
+    for s in range(choose_subsets(points, triangles)):
+        count += p3p_kernel(points, rays, triangles[s], memory, starts[count:])
+    _search_from(objective, starts[:count], _RIGID_REFINED, minima)
+    if minima.counts[0] > 0:
+        reflected = np.empty((1, POSE_SIZE))
+        reflect(points, minima.states[0], reflected[0])
+        _search_from(objective, reflected, 1, minima)
+        return count + 1
+    found = rotation_starts(points, rays, starts[:_GRID_ROTATIONS])
+    _search_from(objective, starts[:found], _GRID_REFINED, minima)
+    return count + found
+
+
+@kernel
+def _search_from(objective: Objective, starts: FloatArray, refined: int, minima: Minima) -> None:
+    effort = Effort(refined, _PROBE_ITERATIONS, _MAX_ITERATIONS, np.inf)
+    search(objective, starts, effort, 0, 0.0, minima)
 
 
 @kernel
@@ -214,202 +243,3 @@ def _effort(points: int) -> tuple[int, int]:
     if points < 17:
         return 5, 6
     return 3, 3
-
-
-@kernel
-def minimal_starts(
-    points: FloatArray, rays: FloatArray, subsets: IntArray, count: int, poses: FloatArray
-) -> int:
-    """Write every solution of the minimal solver on the given subsets; returns their number.
-
-    ``subsets`` (at least count, 4) holds point numbers, ``poses`` has room for 8 rows a subset.
-    """
-    memory = minimal_memory()
-    found = 0
-    for s in range(count):
-        room = poses[found : found + MAX_SOLUTIONS]
-        found += solve_subset(points, rays, subsets[s], memory, room)
-    return found
-
-
-@kernel
-def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
-    """Fill ``subsets`` (k, 4) with 4-subsets of the points that span large volumes.
-
-    All of them where there are no more than k, otherwise the best of a fixed sequence of draws.
-    Returns how many rows were filled.
-    """
-    n = points.shape[0]
-    wanted = subsets.shape[0]
-    total = n * (n - 1) * (n - 2) * (n - 3) // 24
-    draw = np.arange(4)
-    if total <= wanted:
-        for row in range(total):
-            for k in range(4):
-                subsets[row, k] = draw[k]
-            next_subset(draw, n)
-        return int(total)
-    volumes = np.full(wanted, -1.0)
-    state = np.uint64(88172645463325252)
-    for _ in range(_DRAWS_PER_SUBSET * wanted):
-        k = 0
-        while k < 4:  # xorshift: a fixed sequence, the same for every problem
-            state ^= state << np.uint64(13)
-            state ^= state >> np.uint64(7)
-            state ^= state << np.uint64(17)
-            index = np.int64((state >> np.uint64(11)) % np.uint64(n))
-            fresh = True
-            for m in range(k):
-                fresh = fresh and draw[m] != index
-            if fresh:
-                draw[k] = index
-                k += 1
-        volume = _volume(points, draw)
-        worst = 0
-        for m in range(1, wanted):
-            if volumes[m] < volumes[worst]:
-                worst = m
-        if volume > volumes[worst]:
-            volumes[worst] = volume
-            for m in range(4):
-                subsets[worst, m] = draw[m]
-    return int(wanted)
-
-
-@inlined
-def _difference(points: FloatArray, i: int, j: int) -> Triple:
-    return points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
-
-
-@kernel
-def _volume(points: FloatArray, chosen: IntArray) -> float:
-    """Six times the volume of a tetrahedron."""
-    u = _difference(points, chosen[1], chosen[0])
-    v = _difference(points, chosen[2], chosen[0])
-    w = _difference(points, chosen[3], chosen[0])
-    return abs(dot(u, cross(v, w)))
-
-
-@kernel
-def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float:
-    """Distance of points (n, 3) from their plane, in standard deviations of their image's noise.
-
-    The root mean square distance from the plane that fits best, about: for small ones, the least
-    eigenvalue of a covariance is its determinant over the sum of its principal minors.
-    """
-    n = points.shape[0]
-    a = b = c = p = q = r = 0.0
-    for i in range(n):  # centred, as the search has them
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        a += x * x
-        b += y * y
-        c += z * z
-        p += x * y
-        q += x * z
-        r += y * z
-    minors = a * b - p * p + a * c - q * q + b * c - r * r
-    determinant = a * (b * c - r * r) - p * (p * c - q * r) + q * (p * r - b * q)
-    information = 0.0
-    for i in range(whitening.shape[0]):
-        information += whitening[i, 0] * whitening[i, 2] / whitening.shape[0]
-    if not minors > 0.0:
-        return 0.0
-    share = max(determinant, 0.0) / minors / (a + b + c)
-    return float(np.sqrt(share * _square_spread(rays) * information))
-
-
-@kernel
-def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> int:
-    """Fill ``poses`` (k, 15) with poses of the unstretched model at k evenly spread rotations.
-
-    The rotations are a super-Fibonacci spiral (Alexa, "Super-Fibonacci spirals: fast, low-
-    discrepancy sampling of SO(3)", 2022). Given a rotation, the equations are linear in the
-    translation. These starts need no volume, so they serve coplanar points.
-    """
-    wanted = poses.shape[0]
-    rotation = np.empty((3, 3))
-    matrix = np.empty((3, 3))
-    right = np.empty(3)
-    unstretched = np.ones(3)
-    found = 0
-    for k in range(wanted):
-        s = (k + 0.5) / wanted
-        alpha = 2.0 * np.pi * (k + 0.5) / np.sqrt(2.0)
-        beta = 2.0 * np.pi * (k + 0.5) / 1.533751168755204288118041
-        low, high = np.sqrt(s), np.sqrt(1.0 - s)
-        w, x, y, z = (
-            low * np.sin(alpha),
-            low * np.cos(alpha),
-            high * np.sin(beta),
-            high * np.cos(beta),
-        )
-        rotation_from_quaternion(w, x, y, z, rotation)
-        matrix[:] = 0.0
-        right[:] = 0.0
-        for i in range(points.shape[0]):
-            u, v = rays[i, 0], rays[i, 1]
-            x = y = z = 0.0
-            for j in range(3):
-                x += rotation[0, j] * points[i, j]
-                y += rotation[1, j] * points[i, j]
-                z += rotation[2, j] * points[i, j]
-            # t_x - u t_z = u z - x and t_y - v t_z = v z - y
-            p, q = u * z - x, v * z - y
-            matrix[0, 0] += 1.0
-            matrix[1, 1] += 1.0
-            matrix[2, 0] -= u
-            matrix[2, 1] -= v
-            matrix[2, 2] += u * u + v * v
-            right[0] += p
-            right[1] += q
-            right[2] -= u * p + v * q
-        if not cholesky(matrix, 3, 1e-12):
-            continue
-        solve_cholesky(matrix, 3, right)
-        pack_pose(rotation, right, unstretched, poses[found])
-        found += 1
-    return found
-
-
-@kernel
-def widen_by_shape(
-    points: FloatArray, rays: FloatArray, variances: FloatArray, whitening: FloatArray
-) -> None:
-    """Widen keypoints by the shape's uncertainty, ``variances`` (n,) of each coordinate.
-
-    It is that seen from the distance at which the mean ``points`` have the size of their image.
-    """
-    extent, size = _square_spread(points), _square_spread(rays)
-    depth = max(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)
-    for i in range(whitening.shape[0]):
-        # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
-        information = (whitening[i, 0] ** 2 + whitening[i, 2] ** 2) / 2.0
-        whitening[i] /= np.sqrt(1.0 + variances[i] / depth**2 * information)
-
-
-@kernel
-def _square_spread(rows: FloatArray) -> float:
-    """Sum of the variances of the columns of a matrix."""
-    total = 0.0
-    for a in range(rows.shape[1]):
-        mean = 0.0
-        for n in range(rows.shape[0]):
-            mean += rows[n, a] / rows.shape[0]
-        for n in range(rows.shape[0]):
-            total += (rows[n, a] - mean) ** 2 / rows.shape[0]
-    return total
-
-
-@kernel
-def next_subset(chosen: IntArray, count: int) -> bool:
-    """Step to the next subset in lexicographic order; False after the last."""
-    size = chosen.shape[0]
-    i = size - 1
-    while i >= 0 and chosen[i] == count - size + i:
-        i -= 1
-    if i < 0:
-        return False
-    chosen[i] += 1
-    for k in range(i + 1, size):
-        chosen[k] = chosen[k - 1] + 1
-    return True

@@ -30,9 +30,9 @@ from cadalign.solvers.focal import FocalObjective, at_focal, refine_focal
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
 from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
-from cadalign.solvers.optimal import next_subset
 from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.search import refine
+from cadalign.solvers.starts import next_subset
 
 _FEW_POINTS = 24  # so few are always all looked at
 _RANDOM_SUPPORT = 0.02  # share of the points that a wrong hypothesis fits, at first

@@ -12,8 +12,9 @@ from cadalign.solvers.constants import LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed, unpacked
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
-from cadalign.solvers.optimal import optimal_batch, widen_by_shape
+from cadalign.solvers.optimal import optimal_batch
 from cadalign.solvers.search import Effort, descend, refine, room_for_minima, search
+from cadalign.solvers.starts import widen_by_shape
 
 _PROBE_ITERATIONS = 8
 _MAX_ITERATIONS = 200

@@ -16,8 +16,8 @@ from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.linalg import eigenvectors_4, factorize, solve_factor
 from cadalign.solvers.marginal.equations import Posed, state_at
 from cadalign.solvers.marginal.problem import GaussianTarget, Mixture, Seen, target_of
-from cadalign.solvers.optimal import rotation_starts, widen_by_shape
 from cadalign.solvers.search import Effort, Minima, descend, room_for_minima, search
+from cadalign.solvers.starts import rotation_starts, widen_by_shape
 from cadalign.solvers.unknowns import orthonormalize, uncenter
 
 _PROBE_ITERATIONS = 2

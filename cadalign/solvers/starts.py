@@ -1,0 +1,224 @@
+"""Starts of a search for alignments: subsets of the points for minimal solvers, and rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cadalign.arrays import FloatArray, IntArray
+from cadalign.compile import inlined, kernel
+from cadalign.solvers.linalg import (
+    Triple,
+    cholesky,
+    cross,
+    dot,
+    rotation_from_quaternion,
+    solve_cholesky,
+)
+from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
+from cadalign.solvers.unknowns import pack_pose
+
+_DRAWS_PER_SUBSET = 4
+_LEAST_DEPTH = 1e-9
+
+
+@kernel
+def minimal_starts(
+    points: FloatArray, rays: FloatArray, subsets: IntArray, count: int, poses: FloatArray
+) -> int:
+    """Write every solution of the minimal solver on the given subsets; returns their number.
+
+    ``subsets`` (at least count, 4) holds point numbers, ``poses`` has room for 8 rows a subset.
+    """
+    memory = minimal_memory()
+    found = 0
+    for s in range(count):
+        room = poses[found : found + MAX_SOLUTIONS]
+        found += solve_subset(points, rays, subsets[s], memory, room)
+    return found
+
+
+@kernel
+def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
+    """Fill ``subsets`` (k, 3 or 4) with subsets of the points that span large areas or volumes.
+
+    All of them where there are no more than k, otherwise the best of a fixed sequence of draws.
+    Returns how many rows were filled.
+    """
+    n = points.shape[0]
+    wanted, size = subsets.shape
+    draw = np.arange(size)
+    total = 1
+    for k in range(size):
+        total = total * (n - k) // (k + 1)
+    if total <= wanted:
+        for row in range(total):
+            for k in range(size):
+                subsets[row, k] = draw[k]
+            next_subset(draw, n)
+        return int(total)
+    volumes = np.full(wanted, -1.0)
+    state = np.uint64(88172645463325252)
+    for _ in range(_DRAWS_PER_SUBSET * wanted):
+        k = 0
+        while k < size:  # xorshift: a fixed sequence, the same for every problem
+            state ^= state << np.uint64(13)
+            state ^= state >> np.uint64(7)
+            state ^= state << np.uint64(17)
+            index = np.int64((state >> np.uint64(11)) % np.uint64(n))
+            fresh = True
+            for m in range(k):
+                fresh = fresh and draw[m] != index
+            if fresh:
+                draw[k] = index
+                k += 1
+        volume = _extent(points, draw)
+        worst = 0
+        for m in range(1, wanted):
+            if volumes[m] < volumes[worst]:
+                worst = m
+        if volume > volumes[worst]:
+            volumes[worst] = volume
+            for m in range(size):
+                subsets[worst, m] = draw[m]
+    return int(wanted)
+
+
+@inlined
+def _difference(points: FloatArray, i: int, j: int) -> Triple:
+    return points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+
+
+@kernel
+def _extent(points: FloatArray, chosen: IntArray) -> float:
+    """Six times the volume of a tetrahedron, or the square of twice the area of a triangle."""
+    u = _difference(points, chosen[1], chosen[0])
+    v = _difference(points, chosen[2], chosen[0])
+    normal = cross(u, v)
+    if chosen.shape[0] == 3:
+        return dot(normal, normal)
+    return abs(dot(_difference(points, chosen[3], chosen[0]), normal))
+
+
+@kernel
+def relief(points: FloatArray, rays: FloatArray, whitening: FloatArray) -> float:
+    """Distance of points (n, 3) from their plane, in standard deviations of their image's noise.
+
+    The root mean square distance from the plane that fits best, about: for small ones, the least
+    eigenvalue of a covariance is its determinant over the sum of its principal minors.
+    """
+    n = points.shape[0]
+    a = b = c = p = q = r = 0.0
+    for i in range(n):  # centred, as the search has them
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        a += x * x
+        b += y * y
+        c += z * z
+        p += x * y
+        q += x * z
+        r += y * z
+    minors = a * b - p * p + a * c - q * q + b * c - r * r
+    determinant = a * (b * c - r * r) - p * (p * c - q * r) + q * (p * r - b * q)
+    information = 0.0
+    for i in range(whitening.shape[0]):
+        information += whitening[i, 0] * whitening[i, 2] / whitening.shape[0]
+    if not minors > 0.0:
+        return 0.0
+    share = max(determinant, 0.0) / minors / (a + b + c)
+    return float(np.sqrt(share * _square_spread(rays) * information))
+
+
+@kernel
+def rotation_starts(points: FloatArray, rays: FloatArray, poses: FloatArray) -> int:
+    """Fill ``poses`` (k, 15) with poses of the unstretched model at k evenly spread rotations.
+
+    The rotations are a super-Fibonacci spiral (Alexa, "Super-Fibonacci spirals: fast, low-
+    discrepancy sampling of SO(3)", 2022). Given a rotation, the equations are linear in the
+    translation. These starts need no volume, so they serve coplanar points.
+    """
+    wanted = poses.shape[0]
+    rotation = np.empty((3, 3))
+    matrix = np.empty((3, 3))
+    right = np.empty(3)
+    unstretched = np.ones(3)
+    found = 0
+    for k in range(wanted):
+        s = (k + 0.5) / wanted
+        alpha = 2.0 * np.pi * (k + 0.5) / np.sqrt(2.0)
+        beta = 2.0 * np.pi * (k + 0.5) / 1.533751168755204288118041
+        low, high = np.sqrt(s), np.sqrt(1.0 - s)
+        w, x, y, z = (
+            low * np.sin(alpha),
+            low * np.cos(alpha),
+            high * np.sin(beta),
+            high * np.cos(beta),
+        )
+        rotation_from_quaternion(w, x, y, z, rotation)
+        matrix[:] = 0.0
+        right[:] = 0.0
+        for i in range(points.shape[0]):
+            u, v = rays[i, 0], rays[i, 1]
+            x = y = z = 0.0
+            for j in range(3):
+                x += rotation[0, j] * points[i, j]
+                y += rotation[1, j] * points[i, j]
+                z += rotation[2, j] * points[i, j]
+            # t_x - u t_z = u z - x and t_y - v t_z = v z - y
+            p, q = u * z - x, v * z - y
+            matrix[0, 0] += 1.0
+            matrix[1, 1] += 1.0
+            matrix[2, 0] -= u
+            matrix[2, 1] -= v
+            matrix[2, 2] += u * u + v * v
+            right[0] += p
+            right[1] += q
+            right[2] -= u * p + v * q
+        if not cholesky(matrix, 3, 1e-12):
+            continue
+        solve_cholesky(matrix, 3, right)
+        pack_pose(rotation, right, unstretched, poses[found])
+        found += 1
+    return found
+
+
+@kernel
+def widen_by_shape(
+    points: FloatArray, rays: FloatArray, variances: FloatArray, whitening: FloatArray
+) -> None:
+    """Widen keypoints by the shape's uncertainty, ``variances`` (n,) of each coordinate.
+
+    It is that seen from the distance at which the mean ``points`` have the size of their image.
+    """
+    extent, size = _square_spread(points), _square_spread(rays)
+    depth = max(np.sqrt(extent * 2.0 / 3.0 / max(size, 1e-30)), _LEAST_DEPTH)
+    for i in range(whitening.shape[0]):
+        # The variances add up for a whitening (a, b, c) whose b is small beside a and c.
+        information = (whitening[i, 0] ** 2 + whitening[i, 2] ** 2) / 2.0
+        whitening[i] /= np.sqrt(1.0 + variances[i] / depth**2 * information)
+
+
+@kernel
+def _square_spread(rows: FloatArray) -> float:
+    """Sum of the variances of the columns of a matrix."""
+    total = 0.0
+    for a in range(rows.shape[1]):
+        mean = 0.0
+        for n in range(rows.shape[0]):
+            mean += rows[n, a] / rows.shape[0]
+        for n in range(rows.shape[0]):
+            total += (rows[n, a] - mean) ** 2 / rows.shape[0]
+    return total
+
+
+@kernel
+def next_subset(chosen: IntArray, count: int) -> bool:
+    """Step to the next subset in lexicographic order; False after the last."""
+    size = chosen.shape[0]
+    i = size - 1
+    while i >= 0 and chosen[i] == count - size + i:
+        i -= 1
+    if i < 0:
+        return False
+    chosen[i] += 1
+    for k in range(i + 1, size):
+        chosen[k] = chosen[k - 1] + 1
+    return True

@@ -1,4 +1,4 @@
-"""Poses of 3 points, and the search for the optimum of a model without stretch that starts there."""
+"""Poses of 3 points, and the search for the optimum without stretch that starts from them."""
 
 from __future__ import annotations
 

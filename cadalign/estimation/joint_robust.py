@@ -14,17 +14,16 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
 from cadalign.estimation.uncertainty.evidence import seen_in_cameras
-from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES, UNKNOWNS
+from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
 from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, log_focals_of, points_of
 from cadalign.solvers.joint.search import keypoints_of, search_joint
-from cadalign.solvers.optimal import optimal_batch
-from cadalign.solvers.ransac import score_pose
+from cadalign.solvers.p3p import rigid_hypotheses
 
 OUTLIER_COST = 5.0
 """Cost of a keypoint that is left out, beyond the square of its threshold."""
 _WIDENING = 3.0  # standard deviations of a displacement that a threshold allows for
 _NEAREST = 1e-9  # depth
-_INLIER_RATIO = 0.5
+_INLIER_RATIO = 0.4
 _LEAST_CONFIDENCE = 0.01  # over the largest: none is never drawn
 _LIMIT = 9.0  # squared whitened residual of a keypoint that speaks for a hypothesis
 _REFINED = 8
@@ -167,31 +166,15 @@ def _hypotheses(
     count, size = len(given.points), SAMPLE_SIZES[MINIMAL_SOLVERS[ransac.minimal]]
     if count < size:
         return np.empty((0, 12))
-    draws = _draws(count, size, ransac, scores)
-    free = np.ones(UNKNOWNS)
-    free[6:] = 0.0
-    chosen = draws.ravel()
-    poses, costs, *_ = optimal_batch(
-        given.points[chosen],
-        given.rays[chosen],
-        given.whitening[chosen],
-        np.arange(len(draws) + 1) * size,
-        given.loss,
-        np.ones(len(draws)),
-        np.zeros(len(draws)),
-        0.0,
-        free,
-        size,
-    )
-    poses = poses[np.isfinite(costs)]
-    supports = np.array([score_pose(given, pose, _LIMIT, np.inf, 0.0, 1.0)[0] for pose in poses])
-    return poses[np.argsort(supports)][:_REFINED, :12]
+    poses, supports = rigid_hypotheses(given, _draws(count, size, ransac, scores), _LIMIT)
+    order = np.argsort(supports)[:_REFINED]
+    return poses[order[np.isfinite(supports[order])], :12]
 
 
 def _draws(count: int, size: int, ransac: RansacOptions, scores: FloatArray | None) -> IntArray:
     """Samples (S, size) of keypoints: all where these are few, otherwise drawn at random.
 
-    So many that one without outliers is among them with the wanted probability, if half of the
+    So many that one without outliers is among them with the wanted probability, if 40 % of the
     keypoints are inliers. With scores every other sample is drawn by these.
     """
     without = math.log(1 - ransac.success_prob) / math.log1p(-(_INLIER_RATIO**size))

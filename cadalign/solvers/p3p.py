@@ -6,8 +6,13 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
+from cadalign.solvers.alignment import Objective
+from cadalign.solvers.constants import POSE_SIZE, UNKNOWNS, ScalePrior
+from cadalign.solvers.evidence import KeypointEvidence, take_keypoints
 from cadalign.solvers.linalg import Triple, copy_into, cross, dot
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
+from cadalign.solvers.ransac import score_pose
+from cadalign.solvers.search import refine
 from cadalign.solvers.unknowns import pack_pose
 
 MAX_POSES = 8
@@ -17,6 +22,7 @@ _TOUCHING = 1e-4
 _EXACT = 1e-6
 _ZERO = 1e-12
 _AXIS_STEPS = 8  # of the power method
+_SAMPLE_ITERATIONS = 4
 
 
 @kernel
@@ -172,3 +178,31 @@ def reflect(points: FloatArray, pose: FloatArray, other: FloatArray) -> None:
         along = 2.0 * dot(axis, (other[3 * i], other[3 * i + 1], other[3 * i + 2]))
         for j in range(3):
             other[3 * i + j] -= along * axis[j]
+
+
+@kernel
+def rigid_hypotheses(
+    keypoints: KeypointEvidence, draws: IntArray, limit: float
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (S, 15) of samples (S, k) of keypoints, and their truncated scores (S,) on all.
+
+    The pose of a sample is the one from its first three keypoints that fits all of it best, after a
+    few steps; where there is none, the score is infinite.
+    """
+    free = np.ones(UNKNOWNS)
+    free[6:] = 0.0
+    memory, solutions = p3p_memory(), np.empty((MAX_POSES, POSE_SIZE))
+    poses, scores = np.empty((draws.shape[0], POSE_SIZE)), np.full(draws.shape[0], np.inf)
+    for s in range(draws.shape[0]):
+        sample = take_keypoints(keypoints, draws[s])
+        objective = Objective(free, sample, ScalePrior(0.0, 0.0))
+        found = p3p_kernel(keypoints.points, keypoints.rays, draws[s], memory, solutions)
+        least = np.inf
+        for k in range(found):
+            cost, _, _ = refine(objective, _SAMPLE_ITERATIONS, solutions[k])
+            if cost < least:
+                least = cost
+                copy_into(poses[s], solutions[k])
+        if least < np.inf:
+            scores[s] = score_pose(keypoints, poses[s], limit, np.inf, 0.0, 1.0)[0]
+    return poses, scores

@@ -14,7 +14,7 @@ from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.optimal import optimal_batch
-from cadalign.solvers.p3p import MAX_POSES, p3p_kernel, p3p_memory, reflect
+from cadalign.solvers.p3p import MAX_POSES, p3p_kernel, p3p_memory, reflect, rigid_hypotheses
 from cadalign.solvers.search import Effort, room_for_minima, search
 from cadalign.solvers.starts import rotation_starts
 
@@ -108,3 +108,20 @@ def test_no_minimum_is_missed_that_a_fine_grid_of_rotations_finds(
         assert found[0] == pytest.approx(minima.costs[0], rel=1e-6, abs=1e-9)
         if minima.costs[1] < minima.costs[0] + 9.0:  # another pose that is as likely
             assert found[1] == pytest.approx(minima.costs[1], rel=1e-4, abs=1e-6)
+
+
+def test_hypotheses_of_samples_are_their_rigid_optima() -> None:
+    rng = np.random.default_rng(0)
+    points, rotation = rng.uniform(-0.5, 0.5, (9, 3)), random_rotation(rng)
+    translation = np.array([0.1, -0.2, 3.0])
+    rays = seen(points, rotation, translation) + rng.normal(0, 1e-3, (9, 2))
+    rays[[2, 5]] += 0.2
+    keypoints = KeypointEvidence(points, rays, np.array([[1e3, 0.0, 1e3]]), LINEAR, 1.0)
+    draws = np.array([[0, 1, 3, 4], [8, 7, 6, 4], [0, 1, 2, 5]])
+    poses, scores = rigid_hypotheses(keypoints, draws, 9.0)
+    for row in (0, 1):
+        assert angle_between(poses[row, :9].reshape(3, 3), rotation) < 1.0
+        assert 2 * 9.0 <= scores[row] < 2 * 9.0 + 7 * 9.0
+    assert scores[2] > scores[:2].max()
+    nowhere = KeypointEvidence(np.ones((9, 3)), rays, keypoints.whitening, LINEAR, 1.0)
+    assert np.isinf(rigid_hypotheses(nowhere, draws, 9.0)[1]).all()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -272,7 +273,7 @@ def compact(values: npt.ArrayLike | Sequence[float | None]) -> list[float | None
     [0.333333, None, 2.0]
     """
     numbers = np.asarray(values, dtype=float).tolist()
-    return [float(f"{value:.{_DIGITS}g}") if np.isfinite(value) else None for value in numbers]
+    return [float(f"{value:.{_DIGITS}g}") if math.isfinite(value) else None for value in numbers]
 
 
 def draw_plots(folder: Path, plots: Sequence[Plot]) -> list[Path]:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote as url_quote
 
 import msgspec
@@ -171,20 +171,22 @@ class AssetStore:
                     for old in self.assets.glob(pattern):
                         old.unlink()
         for index, run in enumerate(runs):
-            pictures, thumbs = _names_in(run.folder.pictures), _names_in(run.folder.thumbs)
-            previews = _names_in(run.folder.previews)
+            pictures, thumbs, previews, records = (
+                *map(_Files.of, (run.folder.pictures, run.folder.thumbs, run.folder.previews)),
+                run.folder.records,
+            )
             for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))
                 if place is None:
                     continue
-                stem, model = f"{record_stem(*name)}.webp", f"{record_stem(*name[:2])}.json"
-                picture = self._key_of(run.folder.pictures / stem, pictures, self.pictures)
-                thumb = self._key_of(run.folder.thumbs / stem, thumbs, self.thumbs)
-                mesh = self._key_of(run.folder.previews / model, previews, self.meshes)
+                view, model = f"{record_stem(*name)}.webp", f"{record_stem(*name[:2])}.json"
+                picture = self._key_of(view, pictures, self.pictures)
+                thumb = self._key_of(view, thumbs, self.thumbs)
+                mesh = self._key_of(model, previews, self.meshes)
                 table.instances["thumb"][place] = -1 if thumb is None else int(thumb)
                 table.instances["exhibit"][place] = place
-                record = _object(row["exhibit"], run.folder.records)
+                record = _object(row["exhibit"], records)
                 self._keep(place, {"picture": picture, "mesh": mesh, **record})
 
     def to_dict(self) -> dict[str, Any]:
@@ -208,11 +210,12 @@ class AssetStore:
             },
         }
 
-    def _key_of(self, path: Path, names: frozenset[str], store: dict[str, Any]) -> str | None:
+    def _key_of(self, name: str, files: _Files, store: dict[str, Any]) -> str | None:
         """Store a file, once for all with its content; returns its key, None if it is not there."""
-        if path.name not in names:
+        if name not in files.names:
             return None
-        data, kind = read_bytes(path), path.parent.name
+        path = files.folder / name
+        data, kind = read_bytes(path), files.folder.name
         digest = (kind, hashlib.sha256(data).digest())  # compared runs show the same ones
         if digest not in self._known:
             if store is self.meshes:
@@ -258,12 +261,18 @@ class AssetStore:
         return url_quote(f"{Path(folder).as_posix()}/{name}")
 
 
-def _names_in(folder: Path) -> frozenset[str]:
-    """Names of a folder's files, read once: asking for thousands takes seconds."""
-    if not folder.is_dir():
-        return frozenset()
-    with reading(folder), os.scandir(folder) as entries:
-        return frozenset(entry.name for entry in entries if entry.is_file())
+class _Files(NamedTuple):
+    """A folder and the names of its files, read once: asking for thousands takes seconds."""
+
+    folder: Path
+    names: frozenset[str]
+
+    @classmethod
+    def of(cls, folder: Path) -> _Files:
+        if not folder.is_dir():
+            return cls(folder, frozenset())
+        with reading(folder), os.scandir(folder) as entries:
+            return cls(folder, frozenset(entry.name for entry in entries if entry.is_file()))
 
 
 def _object(text: str | bytes, path: Path) -> dict[str, Any]:

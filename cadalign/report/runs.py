@@ -86,11 +86,17 @@ def by_spec(runs: Sequence[Run]) -> list[tuple[Spec, list[int]]]:
 
 
 def shown_metrics(runs: Sequence[Run]) -> list[Metric]:
-    """Metrics of the instances that some run has; none for runs without instances."""
-    known = {name for run in runs for name in run.results.column_names}
+    """Metrics of the instances that some run has measured; none for runs without instances.
+
+    Where nothing succeeded these are all of the columns.
+    """
     metrics = {metric.key: metric for spec, _ in by_spec(runs) for metric in spec.metrics}
     further = {metric.key: metric for run in runs for metric in run.metrics} if metrics else {}
-    return [metric for metric in (metrics | further).values() if metric.key in known]
+    columns = [(run.results, name) for run in runs for name in run.results.column_names]
+    names = {name for _, name in columns}
+    known = [metric for metric in (metrics | further).values() if metric.key in names]
+    measured = {name for table, name in columns if table[name].null_count < len(table)}
+    return [metric for metric in known if metric.key in measured] or known
 
 
 def all_methods(runs: Sequence[Run]) -> list[str]:

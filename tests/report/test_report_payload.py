@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from PIL import Image
 from support.pages import embedded_payload
@@ -120,6 +122,21 @@ def test_columns_hold_every_instance_and_row(drawn: Path, payload: dict[str, Any
 
 
 @pytest.mark.slow
+def test_metrics_without_a_value_are_not_offered(drawn: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(drawn, tmp_path / "run")
+    table, kept = pq.read_table(run / "results.parquet"), {"rotation_error_deg", "rms_px"}
+    names = {metric["key"] for metric in report(tmp_path, run)["metrics"]}
+    assert kept < names
+    for without in (names - kept, names):
+        for place, name in enumerate(table.column_names):
+            if name in without:
+                nothing = pa.nulls(len(table), table.schema.field(name).type)
+                table = table.set_column(place, name, nothing)
+        pq.write_table(table, run / "results.parquet")
+        offered = {metric["key"] for metric in report(tmp_path, run)["metrics"]}
+        assert offered == (names - without or names)
+
+
 def test_headline_marks_the_best_method_but_never_the_limit(payload: dict[str, Any]) -> None:
     headline = payload["headline"]
     assert [column["key"] for column in headline["columns"]][:2] == ["instances", "failed"]

@@ -191,8 +191,8 @@ SPEC = Spec(
     describe=_describe,
     note=(
         "Medians over the views that did not fail; lengths in diagonals of the object. Each method "
-        "is given keypoints and the evidence that it is named after; views without `free` have "
-        "known camera motion. The bound is the median rotation error of an ideal estimator, from "
-        "the Cramer-Rao bound of each instance; the ratio to it is taken instance by instance."
+        "is given keypoints and the evidence that it is named after. The bound is the median "
+        "rotation error of an ideal estimator, from the Cramer-Rao bound of each instance; the "
+        "ratio to it is taken instance by instance."
     ),
 )

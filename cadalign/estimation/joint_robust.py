@@ -17,7 +17,7 @@ from cadalign.estimation.uncertainty.evidence import seen_in_cameras
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
 from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, log_focals_of, points_of
 from cadalign.solvers.joint.search import keypoints_of, search_joint
-from cadalign.solvers.p3p import rigid_hypotheses
+from cadalign.solvers.ransac import rigid_hypotheses
 
 OUTLIER_COST = 5.0
 """Cost of a keypoint that is left out, beyond the square of its threshold."""

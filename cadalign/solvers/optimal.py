@@ -29,8 +29,7 @@ from cadalign.solvers.linalg import (
     copy_into,
 )
 from cadalign.solvers.linear import aepnp_kernel
-from cadalign.solvers.minimal import MAX_SOLUTIONS
-from cadalign.solvers.p3p import MAX_POSES, p3p_kernel, p3p_memory, reflect
+from cadalign.solvers.minimal import MAX_POSES, MAX_SOLUTIONS, p3p_kernel, p3p_memory, reflect
 from cadalign.solvers.search import Effort, Minima, search
 from cadalign.solvers.starts import choose_subsets, minimal_starts, relief, rotation_starts
 from cadalign.solvers.unknowns import orthonormalize, uncenter

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import kernel
 from cadalign.solvers.alignment import Objective, with_keypoints
-from cadalign.solvers.constants import AP4P, OK, POSE_SIZE
+from cadalign.solvers.constants import AP4P, OK, POSE_SIZE, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import (
     KeypointEvidence,
     LogFocalPrior,
@@ -29,7 +29,14 @@ from cadalign.solvers.evidence import (
 from cadalign.solvers.focal import FocalObjective, at_focal, refine_focal
 from cadalign.solvers.linalg import copy_into
 from cadalign.solvers.linear import aepnp_kernel
-from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
+from cadalign.solvers.minimal import (
+    MAX_POSES,
+    MAX_SOLUTIONS,
+    minimal_memory,
+    p3p_kernel,
+    p3p_memory,
+    solve_subset,
+)
 from cadalign.solvers.projection import scalars_of
 from cadalign.solvers.search import refine
 from cadalign.solvers.starts import next_subset
@@ -43,6 +50,7 @@ _LOCAL_ITERATIONS = 6
 _LOCAL_FOCAL_ITERATIONS = 40
 _FINAL_ROUNDS = 20
 _FINAL_ITERATIONS = 50
+_RIGID_ITERATIONS = 4
 _POOL_SAMPLES = 200_000.0  # after which all points are in the pool
 
 
@@ -387,3 +395,31 @@ def draw_sample(
     else:
         draw_subset(state, pool - 1, chosen[1:])
         chosen[0] = pool - 1
+
+
+@kernel
+def rigid_hypotheses(
+    keypoints: KeypointEvidence, draws: IntArray, limit: float
+) -> tuple[FloatArray, FloatArray]:
+    """Poses (S, 15) of samples (S, k) of keypoints, and their truncated scores (S,) on all.
+
+    The pose of a sample is the one from its first three keypoints that fits all of it best, after a
+    few steps; where there is none, the score is infinite.
+    """
+    free = np.ones(UNKNOWNS)
+    free[6:] = 0.0
+    memory, solutions = p3p_memory(), np.empty((MAX_POSES, POSE_SIZE))
+    poses, scores = np.empty((draws.shape[0], POSE_SIZE)), np.full(draws.shape[0], np.inf)
+    for s in range(draws.shape[0]):
+        sample = take_keypoints(keypoints, draws[s])
+        objective = Objective(free, sample, ScalePrior(0.0, 0.0))
+        found = p3p_kernel(keypoints.points, keypoints.rays, draws[s], memory, solutions)
+        least = np.inf
+        for k in range(found):
+            cost, _, _ = refine(objective, _RIGID_ITERATIONS, solutions[k])
+            if cost < least:
+                least = cost
+                copy_into(poses[s], solutions[k])
+        if least < np.inf:
+            scores[s] = score_pose(keypoints, poses[s], limit, np.inf, 0.0, 1.0)[0]
+    return poses, scores

@@ -13,8 +13,9 @@ from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
+from cadalign.solvers.minimal import MAX_POSES, p3p_kernel, p3p_memory, reflect
 from cadalign.solvers.optimal import optimal_batch
-from cadalign.solvers.p3p import MAX_POSES, p3p_kernel, p3p_memory, reflect, rigid_hypotheses
+from cadalign.solvers.ransac import rigid_hypotheses
 from cadalign.solvers.search import Effort, room_for_minima, search
 from cadalign.solvers.starts import rotation_starts
 

@@ -171,10 +171,8 @@ class AssetStore:
                     for old in self.assets.glob(pattern):
                         old.unlink()
         for index, run in enumerate(runs):
-            pictures, thumbs, previews, records = (
-                *map(_Files.of, (run.folder.pictures, run.folder.thumbs, run.folder.previews)),
-                run.folder.records,
-            )
+            pictures, thumbs = _Files.of(run.folder.pictures), _Files.of(run.folder.thumbs)
+            previews, records = _Files.of(run.folder.previews), run.folder.records
             for row in run.records(RECORD_COLUMNS):
                 name = (row["category"], row["model_id"], row["view"])
                 place = table.places.get((index, name))

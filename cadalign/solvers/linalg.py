@@ -21,6 +21,24 @@ def plus(a: Triple, b: Triple) -> Triple:
 
 
 @inlined
+def minus(a: Triple, b: Triple) -> Triple:
+    """The difference of two vectors."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@inlined
+def scaled(a: Triple, factor: float) -> Triple:
+    """A multiple of a vector."""
+    return a[0] * factor, a[1] * factor, a[2] * factor
+
+
+@inlined
+def unit(a: Triple) -> Triple:
+    """The vector of length 1 along another one."""
+    return scaled(a, 1.0 / np.sqrt(dot(a, a)))
+
+
+@inlined
 def cross(a: Triple, b: Triple) -> Triple:
     """The vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -11,7 +11,16 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import inlined, kernel
 from cadalign.solvers.constants import POSE_SIZE
-from cadalign.solvers.linalg import Triple, copy_into, cross, dot, polish_rotation
+from cadalign.solvers.linalg import (
+    Triple,
+    copy_into,
+    cross,
+    dot,
+    minus,
+    polish_rotation,
+    scaled,
+    unit,
+)
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 from cadalign.solvers.quadrics import (
     INTERSECTION_ROWS,
@@ -24,11 +33,12 @@ from cadalign.solvers.unknowns import pack_pose
 
 MAX_SOLUTIONS = 8
 MAX_POSES = 8
-_DEGREE = 4
-_LARGEST_RATIO = 30.0  # of depths
-_TOUCHING = 1e-4
-_EXACT = 1e-6
-_ZERO = 1e-12
+"""Of three points, without stretch."""
+_DEGREE = 4  # of their polynomial
+_LARGEST_RATIO = 30.0  # of their depths
+_TOUCHING = 1e-4  # see `real_roots`
+_EXACT = 1e-6  # residual of the conics' difference, of a second solution
+_ZERO = 1e-12  # of the polynomial's constant
 _AXIS_STEPS = 8  # of the power method
 
 # Largest cosine between columns of a rotation. Columns that nearly cancel can be far from
@@ -113,10 +123,10 @@ def solve_subset(
 @inlined
 def _write_point(points: FloatArray, i: int, ray: Triple, memory: FloatArray, row: int) -> None:
     """Write a point and its unit ray into the sample."""
-    inverse = 1.0 / np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+    direction = unit(ray)
     for c in range(3):
         memory[_SAMPLE + row, c] = points[i, c]
-        memory[_RAYS + row, c] = ray[c] * inverse
+        memory[_RAYS + row, c] = direction[c]
 
 
 @inlined
@@ -161,7 +171,7 @@ def _column_weights(memory: FloatArray) -> bool:
 @inlined
 def _difference(memory: FloatArray, i: int) -> Triple:
     """From the sample's first point to another one."""
-    return _minus(_triple(memory, _SAMPLE + i), _triple(memory, _SAMPLE))
+    return minus(_triple(memory, _SAMPLE + i), _triple(memory, _SAMPLE))
 
 
 @inlined
@@ -302,9 +312,8 @@ def p3p_kernel(
     memory[0, 4] = m2 * m2 - k2 * n2
     count = 0
     found = real_roots(memory, 0, _DEGREE, _LARGEST_RATIO / e, _TOUCHING)
-    if (
-        abs(memory[0, 0]) < _ZERO and found < 2 * _DEGREE
-    ):  # a triangle seen along its axis of symmetry
+    is_symmetric = abs(memory[0, 0]) < _ZERO  # the triangle, and is seen along its axis
+    if is_symmetric and found < 2 * _DEGREE:
         memory[1, found] = 0.0
         found += 1
     for root in range(found):
@@ -319,38 +328,21 @@ def p3p_kernel(
             depth = np.sqrt(side / chord / (1.0 + q * (e + q)))
             depths = depth, depth * (1.0 + e * p), depth * (1.0 + e * q)
             if count < MAX_POSES and min(depths) > 0.0:
-                seen = _scaled(x, depths[0]), _scaled(y, depths[1]), _scaled(z, depths[2])
+                seen = scaled(x, depths[0]), scaled(y, depths[1]), scaled(z, depths[2])
                 count += _pack_motion((a, b, c), seen, poses[count])
     return count
 
 
 @inlined
 def _unit_ray(rays: FloatArray, i: int) -> Triple:
-    u, v = rays[i, 0], rays[i, 1]
-    inverse = 1.0 / np.sqrt(u * u + v * v + 1.0)
-    return u * inverse, v * inverse, inverse
-
-
-@inlined
-def _scaled(vector: Triple, factor: float) -> Triple:
-    return vector[0] * factor, vector[1] * factor, vector[2] * factor
-
-
-@inlined
-def _minus(first: Triple, second: Triple) -> Triple:
-    return first[0] - second[0], first[1] - second[1], first[2] - second[2]
+    return unit((rays[i, 0], rays[i, 1], 1.0))
 
 
 @inlined
 def _apart(first: Triple, second: Triple) -> float:
     """The square of the distance of two points."""
-    difference = _minus(first, second)
+    difference = minus(first, second)
     return dot(difference, difference)
-
-
-@inlined
-def _unit(vector: Triple) -> Triple:
-    return _scaled(vector, 1.0 / np.sqrt(dot(vector, vector)))
 
 
 @kernel
@@ -359,22 +351,22 @@ def _pack_motion(
 ) -> bool:
     """Pack the motion of a triangle onto a congruent one; False for points in one line."""
     rotation, shift = np.empty((3, 3)), np.empty(3)
-    from_x, from_z = _unit(_minus(model[2], model[0])), _minus(model[1], model[0])
-    from_z = _unit(cross(from_x, from_z))
-    from_y = cross(from_z, from_x)
-    to_x, to_z = _unit(_minus(seen[2], seen[0])), _minus(seen[1], seen[0])
-    to_z = _unit(cross(to_x, to_z))
-    to_y = cross(to_z, to_x)
+    before, after = _frame(model), _frame(seen)
     for i in range(3):
         for j in range(3):
-            rotation[i, j] = to_x[i] * from_x[j] + to_y[i] * from_y[j] + to_z[i] * from_z[j]
-        shift[i] = seen[0][i] - (
-            rotation[i, 0] * model[0][0]
-            + rotation[i, 1] * model[0][1]
-            + rotation[i, 2] * model[0][2]
-        )
+            rotation[i, j] = after[0][i] * before[0][j]
+            rotation[i, j] += after[1][i] * before[1][j] + after[2][i] * before[2][j]
+        shift[i] = seen[0][i] - dot(_triple(rotation, i), model[0])
     pack_pose(rotation, shift, np.ones(3), pose)
     return bool(np.isfinite(pose).all())
+
+
+@inlined
+def _frame(corners: tuple[Triple, Triple, Triple]) -> tuple[Triple, Triple, Triple]:
+    """Axes of a triangle: along a side, in its plane, and across that."""
+    x = unit(minus(corners[2], corners[0]))
+    z = unit(cross(x, minus(corners[1], corners[0])))
+    return x, cross(z, x), z
 
 
 @kernel
@@ -396,8 +388,8 @@ def reflect(points: FloatArray, pose: FloatArray, other: FloatArray) -> None:
     axis = first if first[0] > max(second[1], third[2]) else second
     axis = third if third[2] > max(first[0], second[1]) else axis
     for _ in range(_AXIS_STEPS):
-        axis = _unit((dot(first, axis), dot(second, axis), dot(third, axis)))
-    sight = _unit((pose[9], pose[10], pose[11]))
+        axis = unit((dot(first, axis), dot(second, axis), dot(third, axis)))
+    sight = unit((pose[9], pose[10], pose[11]))
     copy_into(other, pose)
     for j in range(3):
         column = (pose[j], pose[3 + j], pose[6 + j])

@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.compile import inlined, kernel
-from cadalign.solvers.linalg import Triple, cross, dot, plus
+from cadalign.solvers.linalg import Triple, cross, dot, minus, plus
 from cadalign.solvers.polynomial import ROOTS_ROWS, real_roots
 
 _DEGREE = 8
@@ -139,16 +139,16 @@ def _eliminate(memory: FloatArray) -> None:
     a1, b1, c1 = _line(memory, 0, 3), _line(memory, 1, 3), _line(memory, 2, 3)
     a2, b2, c2 = _line(memory, 0, 5), _line(memory, 1, 5), _line(memory, 2, 5)
     d, e = _minus_2(a1, b2), _minus_2(c2, b1)
-    y1 = _minus_3(_minus_3(_times_22(a2, c1), _times_22(b1, b2)), b0)  # equal to z2
+    y1 = minus(minus(_times_22(a2, c1), _times_22(b1, b2)), b0)  # equal to z2
     z1 = plus(plus(_times_22(d, b2), _times_22(a2, e)), a0)
     w1 = _minus_4(_plus_4(_times_23(d, b0), _times_23(a2, c0)), _times_23(b1, a0))
     y2 = plus(plus(_times_22(c1, d), _times_22(e, b1)), c0)
     w2 = _minus_4(_plus_4(_times_23(c1, a0), _times_23(e, b0)), _times_23(b2, c0))
-    yy = _minus_3(_times_22(b1, b1), _times_22(a1, c1))
-    zz = _minus_3(_times_22(b2, b2), _times_22(a2, c2))
+    yy = minus(_times_22(b1, b1), _times_22(a1, c1))
+    zz = minus(_times_22(b2, b2), _times_22(a2, c2))
     b12 = _times_22(b1, b2)
-    yz = _minus_3(_minus_3(plus(b12, b12), _times_22(a1, c2)), _times_22(a2, c1))
-    f, g, h = plus(b0, yz), _minus_3(zz, a0), _minus_3(yy, c0)
+    yz = minus(minus(plus(b12, b12), _times_22(a1, c2)), _times_22(a2, c1))
+    f, g, h = plus(b0, yz), minus(zz, a0), minus(yy, c0)
     y3 = _plus_4(
         _plus_4(_times_23(b1, plus(b0, f)), _times_23(c1, g)),
         _times_23(a1, h),
@@ -290,11 +290,6 @@ def _plus_5(p: Quintuple, q: Quintuple) -> Quintuple:
 @inlined
 def _minus_2(p: Pair, q: Pair) -> Pair:
     return p[0] - q[0], p[1] - q[1]
-
-
-@inlined
-def _minus_3(p: Triple, q: Triple) -> Triple:
-    return p[0] - q[0], p[1] - q[1], p[2] - q[2]
 
 
 @inlined

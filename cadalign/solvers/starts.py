@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.compile import inlined, kernel
+from cadalign.compile import kernel
 from cadalign.solvers.linalg import (
-    Triple,
     cholesky,
     cross,
     dot,
+    minus,
     rotation_from_quaternion,
     solve_cholesky,
+    triple,
 )
 from cadalign.solvers.minimal import MAX_SOLUTIONS, minimal_memory, solve_subset
 from cadalign.solvers.unknowns import pack_pose
@@ -83,20 +84,15 @@ def choose_subsets(points: FloatArray, subsets: IntArray) -> int:
     return int(wanted)
 
 
-@inlined
-def _difference(points: FloatArray, i: int, j: int) -> Triple:
-    return points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
-
-
 @kernel
 def _extent(points: FloatArray, chosen: IntArray) -> float:
     """Six times the volume of a tetrahedron, or the square of twice the area of a triangle."""
-    u = _difference(points, chosen[1], chosen[0])
-    v = _difference(points, chosen[2], chosen[0])
+    first = triple(points[chosen[0]])
+    u, v = minus(triple(points[chosen[1]]), first), minus(triple(points[chosen[2]]), first)
     normal = cross(u, v)
     if chosen.shape[0] == 3:
         return dot(normal, normal)
-    return abs(dot(_difference(points, chosen[3], chosen[0]), normal))
+    return abs(dot(minus(triple(points[chosen[3]]), first), normal))
 
 
 @kernel

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from cadalign.batch.fits import fit_many, run_many, stream_fits
     from cadalign.batch.libraries import RetrieveRunOptions
     from cadalign.batch.options import FitRunOptions
-    from cadalign.io.input_kinds import DetectorOptions
+    from cadalign.io.observation import DetectorOptions
 
 __all__ = [
     "DetectorOptions",

@@ -20,8 +20,7 @@ from cadalign.estimation.result import Result
 from cadalign.export.aligned_object import AlignedObject
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import in_file, read_json
-from cadalign.io.input_kinds import OBSERVATION, kind_of
-from cadalign.io.observation import Observation
+from cadalign.io.observation import OBSERVATION, Observation, kind_of
 from cadalign.render.drawing.model_overlay import mesh_of
 from cadalign.shapes.model import ShapeModel
 

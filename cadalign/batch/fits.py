@@ -30,8 +30,7 @@ from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import OK
 from cadalign.io.files import as_path, write_whole
-from cadalign.io.input_kinds import DetectorOptions
-from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
 _FEW = 200  # observations, which are aligned sooner than processes start
 _STREAMED = 16  # observations that a worker gets at a time

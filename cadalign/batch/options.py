@@ -17,8 +17,7 @@ from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.runs.tables import Columns, Row
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import photo_size
-from cadalign.io.input_kinds import DetectorOptions
-from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 from cadalign.shapes.model import ShapeModel
 
 

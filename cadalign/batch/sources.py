@@ -23,7 +23,7 @@ from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.work import fingerprint
 from cadalign.io.files import open_input, read_bytes
-from cadalign.io.input_kinds import (
+from cadalign.io.observation import (
     DETECTOR,
     LINES,
     OBSERVATION,

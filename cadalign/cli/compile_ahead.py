@@ -55,7 +55,7 @@ def _fits() -> None:
     for method in METHODS:
         fit(points, pixels, _CAMERA, method=method)
     fit(points, pixels, _CAMERA, ransac=_RANSAC, sigma=1.0)
-    fit(points, pixels, _CAMERA, focal="estimate")
+    _ = fit(points, pixels, _CAMERA, focal="estimate").covariance
 
 
 def _align_shape(views: int) -> None:

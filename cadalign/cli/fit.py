@@ -36,8 +36,12 @@ from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
 from cadalign.io.files import write_json
-from cadalign.io.input_kinds import is_of_many, refuse_photo_or_mesh
-from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation import (
+    Observation,
+    ObservationChanges,
+    is_of_many,
+    refuse_photo_or_mesh,
+)
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result

@@ -17,8 +17,7 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
 from cadalign.io.evidence import Size, evidence_fields
-from cadalign.io.input_kinds import DetectorOptions
-from cadalign.io.observation import Observation, ObservationChanges
+from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 from cadalign.io.observation_file import SizeFields, read_size
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from cadalign.errors import InputError
 from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
 from cadalign.io.images import read_image
-from cadalign.io.input_kinds import is_of_many, refuse_photo_or_mesh
+from cadalign.io.observation import is_of_many, refuse_photo_or_mesh
 from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.query import ObservationRetrieval, read_query, read_query_mask
 

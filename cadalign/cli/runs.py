@@ -20,7 +20,7 @@ from rich.progress import (
 from rich.text import Text
 
 from cadalign.cli.common import exit_code, new_console, print_json, print_table, say
-from cadalign.io.input_kinds import DetectorOptions
+from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Coordinates in which a posterior is sampled: their derivatives are those of the projection."""
+"""Coordinates in which a posterior is sampled: where they lead, and what it costs there."""
 
 from __future__ import annotations
 
@@ -8,38 +8,109 @@ from scipy.spatial.transform import Rotation
 
 import cadalign
 from cadalign import Alignment, Camera
-from cadalign.estimation.uncertainty.posterior import _Chart
-from cadalign.solvers.projection import projection_jacobian
+from cadalign.estimation.options import FitOptions
+from cadalign.estimation.uncertainty.posterior import FittedKeypoints, Likelihood, _Chart
+from cadalign.geometry.rotations import rotation_from_vector
 
 CAMERA = Camera(640, 480, 900.0, 880.0, 330.0, 250.0)
+LENS = Camera(640, 480, 900.0, 880.0, 330.0, 250.0, distortion=(-0.2, 0.05, 1e-3, -1e-3))
+POINTS = np.random.default_rng(3).uniform(-0.5, 0.5, (9, 3)) + [0.3, 0.1, -0.2]
+STEPS = 0.05 * np.random.default_rng(4).normal(size=(40, 10))
 
 
-@pytest.fixture
-def chart() -> _Chart:
-    rng = np.random.default_rng(3)
-    turn = Rotation.random(random_state=rng).as_matrix()
-    alignment = Alignment(turn, [0.4, -0.3, 4.0], np.array([1.0, 1.3, 0.8]))
-    points = rng.uniform(-0.5, 0.5, (9, 3)) + [0.3, 0.1, -0.2]
-    result = cadalign.fit(points, CAMERA.project(alignment.apply(points)), CAMERA, sigma=1.0)
-    return _Chart.of(result)  # type: ignore[arg-type]
+def fitted(camera: Camera, **options: object) -> cadalign.Result:
+    turn = Rotation.random(random_state=np.random.default_rng(5)).as_matrix()
+    truth = Alignment(turn, [0.4, -0.3, 4.0], np.array([1.0, 1.3, 0.8]))
+    noise = np.random.default_rng(6).normal(size=(9, 2))
+    pixels = camera.project(truth.apply(POINTS)) + noise
+    return cadalign.fit(POINTS, pixels, camera, **{"sigma": 2.0, **options})  # type: ignore[arg-type]
 
 
-def test_pixels_change_as_the_projection_does(chart: _Chart) -> None:
-    step = 1e-5
-    steps = step * np.concatenate([np.eye(10), -np.eye(10)])
-    pixels = chart.evaluate(steps)[0]
-    measured = (pixels[:10] - pixels[10:]) / (2 * step)
-    points = chart.points + chart.center
-    by_unknowns = projection_jacobian(points, chart.camera, chart.alignment)[:, :, :10]
-    expected = by_unknowns @ np.linalg.inv(chart.jacobian())
-    np.testing.assert_allclose(measured, expected.transpose(2, 0, 1), rtol=1e-5, atol=1e-4)
+def chart_of(result: cadalign.Result, widening: float = 1.0) -> _Chart:
+    alignment, camera, view = result.alignment, result.camera, result.views[0]
+    options = result.options
+    assert isinstance(options, FitOptions)
+    keypoints = FittedKeypoints(POINTS, view.residuals, view.inliers, alignment, camera, options)
+    return _Chart.of(keypoints, Likelihood.of(keypoints), widening)
 
 
-def test_a_longer_focal_length_enlarges_about_the_principal_point(chart: _Chart) -> None:
-    steps = np.zeros((2, 10))
-    steps[1, 9] = np.log(2.0)
-    pixels, deviations, _, log_focals = chart.evaluate(steps)
-    centre = np.array([CAMERA.cx, CAMERA.cy])
-    np.testing.assert_allclose(pixels[1] - centre, 2 * (pixels[0] - centre))
-    assert np.exp(log_focals[1] - log_focals[0]) == pytest.approx(2.0)
-    np.testing.assert_allclose(deviations[:, :9], 0.0, atol=1e-9)
+def moved(result: cadalign.Result, deviation: np.ndarray) -> tuple[Alignment, Camera]:
+    """The alignment and camera that deviations (10,) of the unknowns lead to."""
+    own, camera = result.alignment, result.camera
+    alignment = Alignment(
+        rotation_from_vector(deviation[:3]) @ own.rotation,
+        own.translation + deviation[3:6],
+        own.scale * np.exp(deviation[6:9]),
+    )
+    longer = np.exp(deviation[9])
+    return alignment, Camera(
+        *(camera.width, camera.height, camera.fx * longer, camera.fy * longer),
+        *(camera.cx, camera.cy),
+        distortion=camera.distortion,
+    )
+
+
+def cost_of(result: cadalign.Result, deviation: np.ndarray) -> float:
+    alignment, camera = moved(result, deviation)
+    seen = result.camera.project(result.alignment.apply(POINTS)) - result.residuals
+    return float(((camera.project(alignment.apply(POINTS)) - seen) ** 2).sum()) / 2.0**2
+
+
+def test_costs_are_those_of_the_reprojection_errors() -> None:
+    result = fitted(CAMERA)
+    deviations, costs, _ = chart_of(result).weighed(STEPS)
+    np.testing.assert_allclose(costs, [cost_of(result, each) for each in deviations], rtol=1e-9)
+    np.testing.assert_allclose(chart_of(result, 4.0).weighed(STEPS)[1], costs / 4)
+
+
+def test_a_lens_counts_by_its_derivatives_at_the_estimate() -> None:
+    result = fitted(LENS)
+    deviations, costs, _ = chart_of(result).weighed(STEPS / 20)
+    expected = [cost_of(result, each) for each in deviations]
+    np.testing.assert_allclose(costs, expected, rtol=2e-3)
+
+
+def test_deviations_are_to_first_order_those_of_the_unknowns() -> None:
+    chart, step = chart_of(fitted(CAMERA)), 1e-6
+    deviations = chart.weighed(step * np.concatenate([np.eye(10), -np.eye(10)]))[0]
+    measured = (deviations[:10] - deviations[10:]) / (2 * step)
+    np.testing.assert_allclose(measured.T @ chart.jacobian(), np.eye(10), atol=1e-6)
+
+
+def test_priors_cost_what_their_deviations_say() -> None:
+    prior = cadalign.FocalPrior(1000.0, 0.1)
+    result = fitted(CAMERA, focal="estimate", focal_prior=prior, stretch_sigma=0.2)
+    deviations, costs, _ = chart_of(result).weighed(STEPS)
+    logs = np.log(result.alignment.scale) + deviations[:, 6:9]
+    focal = np.log(result.camera.fx / 1000.0) + deviations[:, 9]
+    expected = [cost_of(result, each) for each in deviations]
+    expected += (logs[:, 1:] ** 2).sum(axis=1) / 0.2**2 + (logs[:, 0] / 0.2) ** 2
+    np.testing.assert_allclose(costs, expected + focal**2 / 0.1**2, rtol=1e-9)
+
+
+def test_rotations_have_their_uniform_measure() -> None:
+    steps = np.zeros((3, 10))
+    steps[1:, 0] = 1.0, 3.0
+    _, costs, logs = chart_of(fitted(CAMERA)).weighed(steps)
+    density = (np.sin(steps[1:, 0] / 2) / (steps[1:, 0] / 2)) ** 2
+    np.testing.assert_allclose(np.exp(logs + costs / 2), [1.0, *density])
+
+
+@pytest.mark.parametrize(
+    ("coordinate", "value"), [(1, 3.2), (5, 3.1), (7, -3.1), (9, 3.1)], ids=str
+)
+def test_beyond_the_priors_ends_nothing_is_likely(coordinate: int, value: float) -> None:
+    step = np.zeros((1, 10))
+    step[0, coordinate] = value
+    _, costs, logs = chart_of(fitted(CAMERA)).weighed(step)
+    assert logs == -np.inf
+    assert costs > 0
+
+
+def test_behind_the_camera_the_cost_is_infinite() -> None:
+    result = fitted(CAMERA)
+    step = np.zeros((1, 10))
+    step[0, 5] = np.log(0.01)  # the centroid comes nearer than keypoints are to it
+    _, costs, logs = chart_of(result).weighed(step)
+    assert costs == np.inf
+    assert logs == -np.inf

@@ -10,6 +10,7 @@ centroid, and the logarithms of scales and focal length. The draws are the same 
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -21,17 +22,19 @@ from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import LOSSES, FitOptions, pixel_information
-from cadalign.estimation.problems import distinct_rows
+from cadalign.estimation.problems import distinct_rows, whitening_by
 from cadalign.estimation.uncertainty.residuals import (
     bent,
     chi_square_quantile,
     f_quantile,
     loss_slopes,
+    whitening_matrices,
 )
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
-from cadalign.geometry.rotations import by_rotation, rotations_from_vectors
+from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
+from cadalign.solvers.draws import Centred, LogPriors, Whitened, weigh_draws
 
 MOST_POINTS = 100
 """Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
@@ -42,8 +45,6 @@ _FREEDOM = 5.0  # degrees of freedom of the Student proposals
 _FIRST_INFLATION = 1.5  # of the inverse Fisher information, for the first proposal
 _INFLATION = 1.3
 _FEW_EFFECTIVE = 60.0  # effective draws below which the weights are tempered
-# Of distance, scales and focal length to the estimates: flat priors end there.
-_MOST_LOG_RATIO = 3.0
 _COVERAGE = 0.95
 _NOISE_OF_DRAWS = 1.25  # ratio of variances that the draws cannot tell from 1
 _SEED = 0
@@ -109,16 +110,6 @@ class Likelihood:
         loss, bend = LOSSES[self.options.loss], self.options.loss_scale
         return loss_slopes(self.squares(residuals), loss, bend)[0]
 
-    def penalties(self, log_scales: FloatArray, log_focals: FloatArray) -> FloatArray:
-        """Squared deviations (k,) from the priors, of the log scales (k, 3) and focals (k,)."""
-        weight, width = self.options.scale_prior
-        excess = np.maximum(np.abs(log_scales) - width, 0.0)
-        total = weight * (excess**2).sum(axis=1)
-        prior = self.options.focal_prior
-        if isinstance(prior, FocalPrior):
-            total = total + ((log_focals - np.log(prior.focal)) / prior.relative_sigma) ** 2
-        return np.asarray(total)
-
 
 def posterior_covariance(result: FittedKeypoints) -> FloatArray:
     """Covariance of the errors by the posterior; see `cadalign.Result.covariance`."""
@@ -181,58 +172,64 @@ def widening_of(unknowns: int, redundancy: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Chart:
-    """Coordinates (10,) about an alignment, in which its posterior is nearly Gaussian."""
+    """Coordinates (10,) about an alignment; see `cadalign.solvers.draws`."""
 
-    alignment: Alignment
-    camera: Camera
-    points: FloatArray  # centred
-    center: FloatArray
-    in_camera: FloatArray  # the center
+    centred: Centred
+    keypoints: Whitened
+    priors: LogPriors
 
     @classmethod
-    def of(cls, result: FittedKeypoints) -> _Chart:
-        points = result.points_3d[result.inliers]
+    def of(cls, result: FittedKeypoints, likelihood: Likelihood, widening: float) -> _Chart:
+        """The chart of a result, at a noise of ``widening`` times its variance."""
+        camera, kept = result.camera, result.inliers
+        points, residuals = result.points_3d[kept], result.residuals[kept]
+        in_camera = result.alignment.apply(points)
+        rays = in_camera[:, :2] / in_camera[:, 2:]
+        principal, focal = (camera.cx, camera.cy), np.array([[camera.fx], [camera.fy]])
+        pixels = camera.pixels_from_normalized(rays) - principal
+        slopes = focal * camera.distortion_jacobian(rays)
+        weights = likelihood.weights(residuals) / widening
+        information = weights[:, None, None] * likelihood.information
+        whitening = whitening_matrices(whitening_by(information))
+        fixed = pixels - (slopes @ rays[:, :, None])[:, :, 0]
+        columns = np.stack([fixed, pixels - residuals], axis=2)
+        fixed, seen = np.moveaxis(whitening @ columns, 2, 0)
         center = points.mean(axis=0)
-        (in_camera,) = result.alignment.apply(center[None])
-        return cls(result.alignment, result.camera, points - center, center, in_camera)
+        keypoints = Whitened(points - center, whitening @ slopes, fixed.copy(), seen.copy())
+        return cls(_centred(result.alignment, center), keypoints, _log_priors(result))
 
     def jacobian(self) -> FloatArray:
         """Derivatives (10, 10) of the coordinates by the unknowns of a covariance."""
-        of_axes = self.alignment.rotation * (self.alignment.scale * self.center)
+        pose, center, _ = self.centred
+        of_axes = pose[:9].reshape(3, 3) * (pose[12:] * center)
         of_center = np.zeros((3, 10))
         of_center[:, :3] = by_rotation(of_axes.sum(axis=1))
         of_center[:, 3:6] = np.eye(3)
         of_center[:, 6:9] = of_axes
-        u, v, depth = self.in_camera
+        u, v, depth = pose[9:12]
         jacobian = np.eye(10)
         jacobian[3:6] = np.array([[1, 0, -u / depth], [0, 1, -v / depth], [0, 0, 1]]) @ of_center
         jacobian[3:6] /= depth
         return jacobian
 
-    def evaluate(self, steps: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Evaluate alignments at coordinates (k, 10).
+    def weighed(self, steps: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Deviations (k, 10), costs (k,) and log densities (k,) at coordinates (k, 10)."""
+        return weigh_draws(self.centred, self.keypoints, self.priors, steps)
 
-        Returns projections (k, n, 2) [px], NaN behind the camera; deviations (k, 10) of the
-        unknowns of a covariance; logarithms of the scales (k, 3) and of the focal lengths (k,).
-        """
-        log_scales = steps[:, 6:9] + np.log(self.alignment.scale)
-        u, v, depth = self.in_camera
-        depths = depth * np.exp(steps[:, 5])
-        centers = np.stack(
-            [(u / depth + steps[:, 3]) * depths, (v / depth + steps[:, 4]) * depths, depths], axis=1
-        )
-        linear = rotations_from_vectors(steps[:, :3]) @ self.alignment.rotation
-        linear = linear * np.exp(log_scales)[:, None]
-        in_camera = (linear.reshape(-1, 3) @ self.points.T).reshape(len(steps), 3, -1)
-        in_camera += centers[:, :, None]
-        ahead = np.where(in_camera[:, 2] > 0, in_camera[:, 2], np.nan)
-        rays = (in_camera[:, :2] / ahead[:, None]).transpose(0, 2, 1)
-        principal = np.array([self.camera.cx, self.camera.cy])
-        pixels = self.camera.pixels_from_normalized(rays.reshape(-1, 2)).reshape(rays.shape)
-        pixels = (pixels - principal) * np.exp(steps[:, 9])[:, None, None] + principal
-        deviations = steps.copy()
-        deviations[:, 3:6] = centers - linear @ self.center - self.alignment.translation
-        return pixels, deviations, log_scales, np.log(self.camera.fx) + steps[:, 9]
+
+def _centred(alignment: Alignment, center: FloatArray) -> Centred:
+    (in_camera,) = alignment.apply(center[None])
+    pose = np.concatenate([alignment.rotation.ravel(), in_camera, alignment.scale])
+    return Centred(pose, center, alignment.translation)
+
+
+def _log_priors(result: FittedKeypoints) -> LogPriors:
+    weight, width = result.options.scale_prior
+    prior = result.options.focal_prior
+    if not isinstance(prior, FocalPrior):
+        return LogPriors(weight, width, 0.0, 0.0)
+    mean = math.log(prior.focal / result.camera.fx)
+    return LogPriors(weight, width, prior.relative_sigma**-2, mean)
 
 
 def _prior_information(options: FitOptions, size: int) -> FloatArray:
@@ -276,31 +273,20 @@ def _sample(
     that the likelihood ratio does not reject at 5 % reaches farther: that region covers the truth
     as often as stated with few keypoints too.
     """
-    chart = _Chart.of(result)
+    chart = _Chart.of(result, likelihood, widening)
     free = likelihood.options.estimated_unknowns
     size = len(first)
     jacobian = chart.jacobian()[:size, :size]
     proposal = (jacobian @ first @ jacobian.T)[np.ix_(free, free)] * _FIRST_INFLATION
     mean = np.zeros(len(free))
-    kept = result.inliers
-    projected = chart.camera.project(result.alignment.apply(result.points_3d[kept]))
-    observed = projected - result.residuals[kept]
-    loss_weights = likelihood.weights(result.residuals[kept])
     deviations, costs, weights = np.zeros((1, 10)), np.zeros(1), np.ones(1)
     for round_, count in enumerate(_DRAWS):
-        factor = np.linalg.cholesky(proposal)
-        draws = _draws(round_, len(free))
+        draws, log_densities = _draws(round_, len(free))
         steps = np.zeros((count, 10))
-        steps[:, free] = mean + draws @ factor.T
-        pixels, deviations, log_scales, log_focals = chart.evaluate(steps)
-        costs = likelihood.squares(pixels - observed) @ loss_weights / widening
-        costs += likelihood.penalties(log_scales, log_focals)
-        angles = np.linalg.norm(steps[:, :3], axis=1)
-        haar = np.log(np.sinc(angles / (2 * np.pi)) ** 2)  # uniform rotations, over their vectors
-        log_weights = -costs / 2 + np.where(angles < np.pi, haar, -np.inf)
-        log_weights += (_FREEDOM + len(free)) / 2 * np.log1p((draws**2).sum(axis=1) / _FREEDOM)
-        outside = (np.abs(steps[:, 5:]) > _MOST_LOG_RATIO).any(axis=1)
-        log_weights[outside | ~np.isfinite(log_weights)] = -np.inf
+        steps[:, free] = mean + draws @ np.linalg.cholesky(proposal).T
+        deviations, costs, log_weights = chart.weighed(steps)
+        log_weights -= log_densities
+        log_weights[~np.isfinite(log_weights)] = -np.inf
         if not log_weights.max() > -np.inf:
             return None
         weights = np.exp(log_weights - log_weights.max())
@@ -314,8 +300,7 @@ def _sample(
         mean = adapted @ steps[:, free]
         centered = steps[:, free] - mean
         proposal = _INFLATION * (centered * adapted[:, None]).T @ centered
-    at_estimate = likelihood.squares(result.residuals[kept]) @ loss_weights / widening
-    at_estimate += likelihood.penalties(*chart.evaluate(np.zeros((1, 10)))[2:])[0]
+    (at_estimate,) = chart.weighed(np.zeros((1, 10)))[1]
     limit = chi_square_quantile(len(free), 1 - _COVERAGE)
     likely = costs - at_estimate <= limit
     covariance, among = np.zeros_like(first), np.ix_(free, free)
@@ -326,13 +311,17 @@ def _sample(
 
 
 @lru_cache(maxsize=64)
-def _draws(round_: int, size: int) -> FloatArray:
-    """The standard Student draws (k, size) of a round, the same for every result."""
+def _draws(round_: int, size: int) -> tuple[FloatArray, FloatArray]:
+    """The standard Student draws (k, size) of a round, and the logarithms of their densities.
+
+    They are the same for every result; densities (k,) are up to a constant.
+    """
     rng = np.random.default_rng(_SEED)
     for count in _DRAWS[: round_ + 1]:
         normal = rng.standard_normal((count, size))
         draws = normal / np.sqrt(rng.chisquare(_FREEDOM, (count, 1)) / _FREEDOM)
-    return np.asarray(draws)
+    logs = -(_FREEDOM + size) / 2 * np.log1p((draws**2).sum(axis=1) / _FREEDOM)
+    return draws, logs
 
 
 def _widened(

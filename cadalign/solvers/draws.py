@@ -1,0 +1,122 @@
+"""Draws from the posterior of an alignment: where each leads, and how likely it is.
+
+The coordinates, in which the posterior is nearly Gaussian, are steps from an alignment: a rotation
+vector, the change of the centroid's direction (u, v) and of its log distance, and the logarithms of
+scales and focal length over the alignment's.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from cadalign.arrays import FloatArray
+from cadalign.compile import kernel
+from cadalign.solvers.projection import project_point, scalars_of
+from cadalign.solvers.unknowns import move_rigid
+
+COORDINATES = 10
+_MOST_LOG_RATIO = 3.0  # of distance, scales and focal length to the estimates: priors end there
+
+
+class Centred(NamedTuple):
+    """An alignment of keypoints about their centroid."""
+
+    pose: FloatArray  # (15,) packed; the translation is the centroid in the camera
+    center: FloatArray  # (3,) of the keypoints
+    translation: FloatArray  # (3,) of the alignment
+
+
+class Whitened(NamedTuple):
+    """Whitened pixels of rays, linear about those of the alignment: ``fixed + slopes ray``.
+
+    They are over the principal point, as are the keypoints ``seen``, and grow with the focal
+    length.
+    """
+
+    points: FloatArray  # (n, 3) about their centroid
+    slopes: FloatArray  # (n, 2, 2)
+    fixed: FloatArray  # (n, 2)
+    seen: FloatArray  # (n, 2)
+
+
+class LogPriors(NamedTuple):
+    """Priors on logarithms: of scales, free within a width, and on the change of a focal length."""
+
+    scale_weight: float
+    scale_width: float
+    focal_weight: float
+    focal_mean: float
+
+
+@kernel
+def weigh_draws(
+    centred: Centred, keypoints: Whitened, priors: LogPriors, steps: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Evaluate the alignments at coordinates (k, 10).
+
+    Returns deviations (k, 10) of the unknowns of a result's covariance; the costs (k,), squared
+    lengths of residuals and of deviations from priors, infinite behind the camera; the logarithms
+    of the posterior's density (k,), of which rotations have the uniform measure.
+    """
+    count = len(steps)
+    deviations, costs, logs = steps.copy(), np.empty(count), np.empty(count)
+    moved, rigid = np.empty(15), np.zeros(6)
+    for k in range(count):
+        step, deviation = steps[k], deviations[k]
+        rigid[:3] = step[:3]
+        _move(centred.pose, step, rigid, moved)
+        for i in range(3):
+            turned = 0.0
+            for j in range(3):
+                turned += moved[3 * i + j] * moved[12 + j] * centred.center[j]
+            deviation[3 + i] = moved[9 + i] - turned - centred.translation[i]
+        costs[k] = _residual_cost(keypoints, moved, np.exp(step[9])) + _prior_cost(
+            priors, moved, step[9]
+        )
+        angle = np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+        within = angle < np.pi
+        for j in range(5, COORDINATES):
+            within = within and abs(step[j]) <= _MOST_LOG_RATIO
+        logs[k] = -0.5 * costs[k] if within else -np.inf
+        if within and angle > 0.0:  # uniform rotations, over their vectors
+            logs[k] += 2.0 * np.log(np.sin(0.5 * angle) / (0.5 * angle))
+    return deviations, costs, logs
+
+
+@kernel
+def _move(pose: FloatArray, step: FloatArray, rigid: FloatArray, moved: FloatArray) -> None:
+    """Write the alignment that a step of the coordinates leads to."""
+    move_rigid(pose, rigid, moved)
+    depth = pose[11] * np.exp(step[5])
+    for i in range(2):
+        moved[9 + i] = (pose[9 + i] / pose[11] + step[3 + i]) * depth
+    moved[11] = depth
+    for j in range(3):
+        moved[12 + j] = pose[12 + j] * np.exp(step[6 + j])
+
+
+@kernel
+def _residual_cost(keypoints: Whitened, pose: FloatArray, enlarged: float) -> float:
+    scalars, total = scalars_of(pose), 0.0
+    for i in range(len(keypoints.points)):
+        point = keypoints.points[i]
+        u, v, depth = project_point(scalars, (point[0], point[1], point[2]))
+        if not depth > 0.0:
+            return np.inf
+        for c in range(2):
+            slope = keypoints.slopes[i, c]
+            pixel = enlarged * (keypoints.fixed[i, c] + slope[0] * u + slope[1] * v)
+            residual = pixel - keypoints.seen[i, c]
+            total += residual * residual
+    return total
+
+
+@kernel
+def _prior_cost(priors: LogPriors, pose: FloatArray, log_focal: float) -> float:
+    total = priors.focal_weight * (log_focal - priors.focal_mean) ** 2
+    for j in range(12, 15):
+        excess = max(abs(np.log(pose[j])) - priors.scale_width, 0.0)
+        total += priors.scale_weight * excess * excess
+    return total

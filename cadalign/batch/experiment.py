@@ -19,8 +19,7 @@ from cadalign.datasets.detections.image_keypoints import ImageKeypoints, join_ke
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import FAILED, Plan, Rows
+from cadalign.evaluation.runs.work import FAILED, Columns, Plan, Row, Rows
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.files import read_text

@@ -49,8 +49,8 @@ from cadalign.estimation.result import Result
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import OnProgress, execute
-from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups
-from cadalign.evaluation.runs.work import FAILED, OK, Plan, Rows, fingerprint
+from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
+from cadalign.evaluation.runs.work import FAILED, OK, Columns, Plan, Row, Rows, fingerprint
 from cadalign.evaluation.summary import median
 from cadalign.geometry.box import extent
 from cadalign.io.documents import in_file

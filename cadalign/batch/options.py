@@ -14,7 +14,7 @@ from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.images import photo_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges

@@ -13,8 +13,7 @@ from cadalign.estimation.result import Result
 from cadalign.evaluation.instances.pictures import cut_out, shown_photo, write_preview, write_webp
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import AbortError
+from cadalign.evaluation.runs.work import AbortError, Row
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh

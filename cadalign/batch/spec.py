@@ -20,7 +20,8 @@ from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.tables import Cells, Columns, Row, Run
+from cadalign.evaluation.runs.tables import Cells, Run
+from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.evaluation.summary import (
     ALL,
     Summary,

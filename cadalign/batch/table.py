@@ -53,8 +53,8 @@ import pyarrow.parquet as pq
 from cadalign.arrays import FloatArray
 from cadalign.estimation.result import Result
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import DONE_ANEW, Columns, Row, read_groups
-from cadalign.evaluation.runs.work import OK
+from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
+from cadalign.evaluation.runs.work import OK, Columns, Row
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.files import write_whole
 from cadalign.io.observation import Observation

@@ -15,7 +15,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.result import Result
 from cadalign.estimation.tracks.motion import Trajectory
 from cadalign.estimation.view import View
-from cadalign.evaluation.runs.tables import Columns, Row
+from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.export.glb import MovingObject
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.methods.method import LIMIT, Method, MethodInput
@@ -25,15 +25,14 @@ from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.runs.work import (
     FAILED,
     AbortError,
+    Columns,
     Outcome,
     Plan,
+    Row,
     Rows,
     reason_of,
     status_of,
 )
-
-if TYPE_CHECKING:
-    from cadalign.evaluation.runs.tables import Columns, Row
 
 R = TypeVar("R")
 T = TypeVar("T")

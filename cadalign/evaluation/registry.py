@@ -21,13 +21,13 @@ from cadalign.errors import DataError, InputError, quote, unknown
 from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plots
-from cadalign.evaluation.runs.work import COLUMNS, FAILED, SKIPPED, Plan
+from cadalign.evaluation.runs.work import COLUMNS, FAILED, SKIPPED, Columns, Plan
 from cadalign.evaluation.summary import Conclusion, ConsoleTable, Summary, summary_csv
 from cadalign.io.files import write_text
 
 if TYPE_CHECKING:
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Columns, Run
+    from cadalign.evaluation.runs.tables import Run
 
     Summaries = Sequence[Summary]
 

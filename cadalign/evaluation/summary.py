@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
-from cadalign.evaluation.runs.work import OK, SKIPPED
+from cadalign.evaluation.runs.work import OK, SKIPPED, Row
 
 if TYPE_CHECKING:
-    from cadalign.evaluation.runs.tables import Cells, Row, Run
+    from cadalign.evaluation.runs.tables import Cells, Run
 
     Statistics = Mapping[str, Callable[[Cells], float]]
 

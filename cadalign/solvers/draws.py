@@ -28,8 +28,8 @@ class Centred(NamedTuple):
     translation: FloatArray  # (3,) of the alignment
 
 
-class Whitened(NamedTuple):
-    """Whitened pixels of rays, linear about those of the alignment: ``fixed + slopes ray``.
+class WhitenedPixels(NamedTuple):
+    """WhitenedPixels pixels of rays, linear about those of the alignment: ``fixed + slopes ray``.
 
     They are over the principal point, as are the keypoints ``seen``, and grow with the focal
     length.
@@ -52,7 +52,7 @@ class LogPriors(NamedTuple):
 
 @kernel
 def weigh_draws(
-    centred: Centred, keypoints: Whitened, priors: LogPriors, steps: FloatArray
+    centred: Centred, keypoints: WhitenedPixels, priors: LogPriors, steps: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Evaluate the alignments at coordinates (k, 10).
 
@@ -98,7 +98,7 @@ def _move(pose: FloatArray, step: FloatArray, rigid: FloatArray, moved: FloatArr
 
 
 @kernel
-def _residual_cost(keypoints: Whitened, pose: FloatArray, enlarged: float) -> float:
+def _residual_cost(keypoints: WhitenedPixels, pose: FloatArray, enlarged: float) -> float:
     scalars, total = scalars_of(pose), 0.0
     for i in range(len(keypoints.points)):
         point = keypoints.points[i]

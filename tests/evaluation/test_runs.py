@@ -30,14 +30,8 @@ from cadalign.evaluation.runs.parallel import (
     in_this_process,
 )
 from cadalign.evaluation.runs.run import Progress, execute, workers_of
-from cadalign.evaluation.runs.tables import (
-    ROW_GROUP,
-    Columns,
-    read_table,
-    write_rows,
-    write_tables,
-)
-from cadalign.evaluation.runs.work import AbortError, Plan, Rows
+from cadalign.evaluation.runs.tables import ROW_GROUP, read_table, write_rows, write_tables
+from cadalign.evaluation.runs.work import AbortError, Columns, Plan, Rows
 from cadalign.io import files
 
 MAIN = "import sys; from cadalign.cli import main; sys.exit(main(sys.argv[1:]))"

@@ -25,8 +25,8 @@ from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.registry import Spec, register
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
-from cadalign.evaluation.runs.tables import Columns, Run
-from cadalign.evaluation.runs.work import Outcome, Plan, Rows
+from cadalign.evaluation.runs.tables import Run
+from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Rows
 from cadalign.evaluation.summary import medians
 from cadalign.report import headline_text, write_report
 from cadalign.seeding import instance_rng

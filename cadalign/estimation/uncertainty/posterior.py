@@ -34,7 +34,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.geometry.rotations import by_rotation
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.solvers.draws import Centred, LogPriors, Whitened, weigh_draws
+from cadalign.solvers.draws import Centred, LogPriors, WhitenedPixels, weigh_draws
 
 MOST_POINTS = 100
 """Keypoints beyond which the inverse Fisher information is accurate, and sampling is slow."""
@@ -175,7 +175,7 @@ class _Chart:
     """Coordinates (10,) about an alignment; see `cadalign.solvers.draws`."""
 
     centred: Centred
-    keypoints: Whitened
+    keypoints: WhitenedPixels
     priors: LogPriors
 
     @classmethod
@@ -195,7 +195,7 @@ class _Chart:
         columns = np.stack([fixed, pixels - residuals], axis=2)
         fixed, seen = np.moveaxis(whitening @ columns, 2, 0)
         center = points.mean(axis=0)
-        keypoints = Whitened(points - center, whitening @ slopes, fixed.copy(), seen.copy())
+        keypoints = WhitenedPixels(points - center, whitening @ slopes, fixed.copy(), seen.copy())
         return cls(_centred(result.alignment, center), keypoints, _log_priors(result))
 
     def jacobian(self) -> FloatArray:

@@ -19,7 +19,7 @@ from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import OK, Plan
+from cadalign.evaluation.runs.work import OK, Columns, Plan
 from cadalign.evaluation.summary import (
     Conclusion,
     ConsoleTable,
@@ -34,7 +34,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.correspondences import CorrespondenceTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Columns, Run
+    from cadalign.evaluation.runs.tables import Cells, Run
 
 
 @dataclass(frozen=True)

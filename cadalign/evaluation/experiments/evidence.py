@@ -16,7 +16,7 @@ from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import Columns, Plan
 from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,
@@ -29,7 +29,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Columns, Run
+    from cadalign.evaluation.runs.tables import Run
 
 KEYPOINTS = "keypoints"
 MASK, DEPTH, GRAVITY, LENGTH, IMAGE = "mask", "depth", "gravity", "length", "image"

@@ -18,7 +18,7 @@ from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE, Met
 from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
 from cadalign.evaluation.registry import Reference, Spec
-from cadalign.evaluation.runs.work import OK, SKIPPED, Plan
+from cadalign.evaluation.runs.work import OK, SKIPPED, Columns, Plan
 from cadalign.evaluation.summary import (
     ALL,
     ConsoleTable,
@@ -32,7 +32,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Columns, Run
+    from cadalign.evaluation.runs.tables import Cells, Run
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from cadalign.evaluation.options import FunctionOptions, PhotoOptions
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec, count_failures
-from cadalign.evaluation.runs.work import FAILED, LEFT_OUT, OK, UNREADABLE, Plan
+from cadalign.evaluation.runs.work import FAILED, LEFT_OUT, OK, UNREADABLE, Columns, Plan
 from cadalign.evaluation.summary import (
     ALL,
     ConsoleTable,
@@ -42,7 +42,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Columns, Run
+    from cadalign.evaluation.runs.tables import Cells, Run
 
 COLUMNS: Columns = (
     *(*VIEW_NAMES, ("status", str), ("reason", str), ("keypoints", int), ("source", str)),

@@ -18,13 +18,13 @@ from cadalign.evaluation.metrics.table import QUERIES, Metric
 from cadalign.evaluation.options import ModelOptions
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import OK, Plan
+from cadalign.evaluation.runs.work import OK, Columns, Plan
 from cadalign.evaluation.summary import ALL, ConsoleTable, Summary, mean_of, median_of
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.queries import RetrievalTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Columns, Run
+    from cadalign.evaluation.runs.tables import Cells, Run
     from cadalign.retrieval.library import Library
 
 NO_VIEW = "no view"

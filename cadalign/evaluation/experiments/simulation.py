@@ -24,7 +24,7 @@ from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import OK, Plan
+from cadalign.evaluation.runs.work import OK, Columns, Plan, Row
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
 from cadalign.geometry.alignment import Alignment
@@ -34,7 +34,7 @@ from cadalign.seeding import instance_rng
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Columns, Row, Run
+    from cadalign.evaluation.runs.tables import Run
 
 
 @dataclass(frozen=True)

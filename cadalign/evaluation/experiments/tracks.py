@@ -18,7 +18,7 @@ from cadalign.evaluation.metrics.photos import DEPTH, YAW
 from cadalign.evaluation.options import FunctionOptions, NoiseOption, SplitOptions
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import Columns, Plan
 from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,
@@ -31,7 +31,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.tracks import TrackTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Columns, Run
+    from cadalign.evaluation.runs.tables import Run
 
 METHODS = ("frames", "shared", "smooth", "online")
 _SAMPLE = 60  # models of each category of a generated data set

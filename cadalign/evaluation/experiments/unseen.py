@@ -21,7 +21,7 @@ from cadalign.evaluation.options import (
 )
 from cadalign.evaluation.plots import Plot, Trace, cumulative_curves
 from cadalign.evaluation.registry import Spec
-from cadalign.evaluation.runs.work import Plan
+from cadalign.evaluation.runs.work import Columns, Plan
 from cadalign.evaluation.summary import (
     ConsoleTable,
     Summary,
@@ -36,7 +36,7 @@ from cadalign.evaluation.summary import (
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import KeypointTask
     from cadalign.evaluation.runs.folder import RunFolder
-    from cadalign.evaluation.runs.tables import Cells, Columns, Run
+    from cadalign.evaluation.runs.tables import Cells, Run
 
 METHODS = (
     *("random-rigid", "random-stretched", "nearest", "mean-rigid", "mean-stretched"),

@@ -23,8 +23,7 @@ from cadalign.evaluation.benchmark import Benchmark, Case, Setting, Tasks
 from cadalign.evaluation.experiments.correspondences import COLUMNS, NAMES, CorrespondenceOptions
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import fingerprint
+from cadalign.evaluation.runs.work import Row, fingerprint
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -46,7 +46,7 @@ from cadalign.evaluation.instances.instance import (
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.evaluation.metrics.errors import alignment_errors, overlap
-from cadalign.evaluation.runs.tables import Row
+from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.mesh import Mesh

@@ -18,6 +18,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
 from cadalign.datasets.models.annotated_symmetry import symmetry_group
 from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_views
+from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -27,7 +28,6 @@ from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
     # Workers that look at annotations only are not to carry the renderer's libraries.
-    from cadalign.evaluation.runs.tables import Row
     from cadalign.render import Scene
 
 KEYPOINT_CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)

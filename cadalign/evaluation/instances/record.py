@@ -17,8 +17,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.estimation.result import Result
 from cadalign.estimation.uncertainty.summary import Uncertainty
-from cadalign.evaluation.runs.tables import Columns, Row
-from cadalign.evaluation.runs.work import Outcome
+from cadalign.evaluation.runs.work import Columns, Outcome, Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 

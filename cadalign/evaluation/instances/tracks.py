@@ -39,8 +39,7 @@ from cadalign.evaluation.metrics.errors import (
     rotation_jitter_deg,
 )
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import fingerprint
+from cadalign.evaluation.runs.work import Row, fingerprint
 from cadalign.evaluation.shape_files import learn
 from cadalign.evaluation.simulation.tracks import (
     simulate_track,

@@ -33,8 +33,7 @@ from cadalign.evaluation.methods.method import LIMIT, SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import Outcome, fingerprint
+from cadalign.evaluation.runs.work import Outcome, Row, fingerprint
 from cadalign.evaluation.shape_files import LearnedFiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

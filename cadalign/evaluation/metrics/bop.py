@@ -18,6 +18,7 @@ from cadalign.errors import InputError
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -25,7 +26,6 @@ from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
-    from cadalign.evaluation.runs.tables import Row
     from cadalign.render.scene import Scene
 
 MAX_STEP = 0.01

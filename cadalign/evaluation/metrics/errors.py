@@ -16,6 +16,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
+from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import (
@@ -38,7 +39,6 @@ from cadalign.geometry.symmetry_group import SymmetryGroup
 
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import Instance
-    from cadalign.evaluation.runs.tables import Row
 
 _FLIPPED_DEG = 90.0
 

@@ -21,6 +21,7 @@ from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.errors import overlap_up_to_scale
 from cadalign.evaluation.metrics.sets import MetricSet, Rate, numbers
 from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import box_iou
@@ -28,7 +29,7 @@ from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
-    from cadalign.evaluation.runs.tables import Cells, Row
+    from cadalign.evaluation.runs.tables import Cells
 
 # PASCAL3D+ ----------------------------------------------------------------------------------------
 

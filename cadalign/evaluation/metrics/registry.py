@@ -22,11 +22,11 @@ from cadalign.errors import InputError, quote, unknown
 from cadalign.evaluation.methods.method import MethodInput
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.portable import Portable, code_hash
+from cadalign.evaluation.runs.work import Columns
 from cadalign.geometry.alignment import Alignment
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result
-    from cadalign.evaluation.runs.tables import Columns
 
 _OF_ESTIMATES = ("est", "gt", "result")
 ARGUMENTS = (*_OF_ESTIMATES, "points_3d", "points_2d", "camera", "sigma", "bounds")

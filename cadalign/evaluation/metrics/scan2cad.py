@@ -17,6 +17,7 @@ from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.metrics import scale_error
@@ -24,7 +25,6 @@ from cadalign.geometry.symmetry import Symmetry, symmetric_rotation_error
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
-    from cadalign.evaluation.runs.tables import Row
 
 MAX_TRANSLATION = 0.2
 """[m]"""

@@ -14,14 +14,14 @@ import numpy as np
 
 from cadalign.arrays import BoolArray
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.runs.work import FAILED
+from cadalign.evaluation.runs.work import FAILED, Columns, Row
 from cadalign.evaluation.summary import known, median_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 
 if TYPE_CHECKING:
     from cadalign.evaluation.photos.target import PhotoTarget
-    from cadalign.evaluation.runs.tables import Cells, Columns, Row
+    from cadalign.evaluation.runs.tables import Cells
 
 PERCENTILE = 90
 

@@ -26,8 +26,7 @@ from cadalign.evaluation.photos.objects import draw_sighting, sighting_record
 from cadalign.evaluation.photos.protocols import protocol_of
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import LeftOutError, Outcome
+from cadalign.evaluation.runs.work import LeftOutError, Outcome, Row
 from cadalign.evaluation.summary import Summary
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

@@ -51,8 +51,7 @@ from cadalign.evaluation.photos.methods import (
 from cadalign.evaluation.photos.protocols import TRUTH, is_own, protocol_of
 from cadalign.evaluation.photos.target import PhotoTarget, PhotoTask, opened, targets_of
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import Outcome
+from cadalign.evaluation.runs.work import Outcome, Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import rescaled_pixels

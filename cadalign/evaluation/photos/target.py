@@ -17,8 +17,7 @@ from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoOb
 from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import Case, Tasks
 from cadalign.evaluation.instances.record import box_alignment
-from cadalign.evaluation.runs.tables import Row
-from cadalign.evaluation.runs.work import UNREADABLE, LeftOutError, fingerprint
+from cadalign.evaluation.runs.work import UNREADABLE, LeftOutError, Row, fingerprint
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera

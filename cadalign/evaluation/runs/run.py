@@ -25,8 +25,8 @@ from typing import Any, TypeVar
 from cadalign.errors import InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Workers, in_processes, in_this_process, on_dask
-from cadalign.evaluation.runs.tables import Columns, is_whole, read_table, write_rows, write_tables
-from cadalign.evaluation.runs.work import Experiment, Plan
+from cadalign.evaluation.runs.tables import is_whole, read_table, write_rows, write_tables
+from cadalign.evaluation.runs.work import Columns, Experiment, Plan
 from cadalign.io.files import made_folder, write_json
 
 logger = logging.getLogger("cadalign")

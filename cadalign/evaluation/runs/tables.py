@@ -19,14 +19,9 @@ from cadalign.arrays import is_number
 from cadalign.errors import DataError, quote
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import COLUMNS
+from cadalign.evaluation.runs.work import COLUMNS, Columns, Row
 from cadalign.io.documents import convert, in_file, read_json
 from cadalign.io.files import write_whole
-
-Row = dict[str, Any]
-"""Cells of a table by column; what is missing or None is an empty cell."""
-Columns = tuple[tuple[str, Any], ...]
-"""Names of a table's columns and their types: str, int, float, bool, or list of one but int."""
 
 DONE_ANEW = "remove it and start the same run again: what is missing is done anew"
 # A table's row groups must not show in which pieces its rows came.

@@ -11,18 +11,20 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from cadalign.errors import CadalignError, DataError, TooFewVisibleError
 
-if TYPE_CHECKING:
-    from cadalign.evaluation.runs.tables import Columns, Row
-
 T = TypeVar("T")
 T_contra = TypeVar("T_contra", contravariant=True)
+
+Row = dict[str, Any]
+"""Cells of a table by column; what is missing or None is an empty cell."""
+Columns = tuple[tuple[str, Any], ...]
+"""Names of a table's columns and their types: str, int, float, bool, or list of one but int."""
 
 COLUMNS: Columns = (("method", str), ("status", str), ("reason", str))
 """Columns of the result table of every experiment."""

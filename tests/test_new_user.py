@@ -63,7 +63,9 @@ def test_package_and_command_are_those_of_the_wheel(user: Environment) -> None:
         "import cadalign, cadalign.datasets; print(cadalign.__file__, cadalign.datasets.__file__)"
     )
     assert all(Path(path).is_relative_to(user.site) for path in python(user, code).split())
-    assert user.run("cadalign", ["--version"]).split() == ["cadalign", cadalign.__version__]
+    shown = user.run("cadalign", ["--version"])
+    assert shown.split() == ["cadalign", cadalign.__version__]
+    assert user.run("python", ["-m", "cadalign", "--version"]) == shown
     assert "fit" in user.run("cadalign", ["--help"])
 
 

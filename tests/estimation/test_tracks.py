@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cadalign import Motion, RansacOptions, Result, ShapeModel, View, align
-from cadalign.errors import InputError
+from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
 from cadalign.geometry.rotations import angle_between, vector_from_rotation
 
@@ -135,6 +135,41 @@ def _swapped(view: View) -> View:
         rows = [ids.index(0), ids.index(1)]
         pixels[rows] = pixels[rows[::-1]]
     return replace(view, points_2d=pixels)
+
+
+def still_views(seed: int, frames: int = 10) -> list[View]:
+    """Frames of an object that does not move."""
+    track = track_of(seed, frames=2)
+    pose, (first, *_) = track.poses[0], track.views
+    rng = np.random.default_rng(seed)
+    pixels = first.camera.project(pose.apply(track.points_3d))
+    return [
+        View(first.camera, pixels + rng.normal(size=pixels.shape), ids=range(POINTS), time=k / 30)
+        for k in range(frames)
+    ]
+
+
+@pytest.mark.parametrize("strength", [1e-2, 1e-5, 1e-8, 1e-12])
+def test_a_weak_motion_states_what_all_frames_determine(strength: float) -> None:
+    views = still_views(5)
+    alone = align(CATEGORY, views[:1]).std.rotation_deg
+    moving = align(CATEGORY, views, motion=Motion(strength, strength / 50))
+    stated = [view.std.rotation_deg for view in moving.views]
+    assert alone / np.sqrt(10) * 0.9 < min(stated)
+    assert max(stated) < alone
+
+
+def test_equal_frames_state_no_more_than_one() -> None:
+    views = still_views(5)
+    alone = align(CATEGORY, views[:1]).std.rotation_deg
+    same = [replace(views[0], time=k / 30) for k in range(10)]
+    assert align(CATEGORY, same, motion="smooth").std.rotation_deg > 0.8 * alone
+
+
+def test_one_frame_with_keypoints_determines_no_motion() -> None:
+    views = still_views(5)[:1] + [View(still_views(5)[0].camera, time=k / 30) for k in (1, 2)]
+    with pytest.raises(DegenerateError, match="keypoints, in two frames at least"):
+        align(CATEGORY, views, motion="smooth")
 
 
 def test_poses_between_frames_and_beyond_them() -> None:

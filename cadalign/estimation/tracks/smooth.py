@@ -43,7 +43,7 @@ from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.evidence import Evidence
 from cadalign.solvers.joint.motion import MotionPrior
-from cadalign.solvers.joint.tracks import Path, moving_covariance, refine_moving
+from cadalign.solvers.joint.tracks import Path, frame_information, moving_covariance, refine_moving
 
 if TYPE_CHECKING:
     from cadalign.estimation.contours.fit import Refined
@@ -60,6 +60,7 @@ _CORRELATION_ROUNDS = 3
 _OF_MEDIAN = 1.5  # standard deviation over the median of absolute values
 _LEAST_STRENGTH = 1e-3  # change of the velocity over the whole track, over its size
 _LEAST_SPEED = 1e-6
+_MOST_MOTION = 1e13  # information of a motion between two frames, over that of one frame
 
 
 class EstimatedTrack(NamedTuple):
@@ -279,7 +280,8 @@ def _likeliest(
 ) -> tuple[Path, MotionPrior, int]:
     """The path and the strengths of the greatest marginal likelihood."""
     first, count = prior.strength, 6 * len(prior.seconds)
-    spent = 0
+    least, spent = _least_strength(evidence, path, prior.seconds), 0
+    prior = prior._replace(strength=np.maximum(first, least))
     for _ in range(_STRENGTH_ROUNDS):
         cost, path, iterations = refine_moving(
             evidence, prior, path, max_iterations=_FIRST_ITERATIONS
@@ -298,7 +300,7 @@ def _likeliest(
         seen = found.squares + _PSEUDO_COUNT * (first / prior.strength) ** 2
         change = np.sqrt(seen / (told + _PSEUDO_COUNT))
         change = np.clip(change, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
-        strength = motion.strength(prior.strength * change)
+        strength = np.maximum(motion.strength(prior.strength * change), least)
         farthest = _FARTHER * float(np.linalg.norm(path.state.poses[:, 9:], axis=1).max())
         per_frame = float(told[1]) / len(path.velocities)
         changes = [*np.log(strength / prior.strength), (prior.told - per_frame) / (per_frame + 1)]
@@ -307,6 +309,12 @@ def _likeliest(
             break
     _, path, iterations = refine_moving(evidence, prior, path, max_iterations=_ITERATIONS)
     return path, prior, spent + iterations
+
+
+def _least_strength(evidence: Evidence, path: Path, seconds: FloatArray) -> FloatArray:
+    """Strengths (2,) below which rounding of the motion's information hides that of a frame."""
+    information = frame_information(evidence, path.state)
+    return np.asarray(np.sqrt(12.0 / (_MOST_MOTION * information)) / seconds.min() ** 1.5)
 
 
 def _of_other_components(best: Minimum, minima: Sequence[Minimum]) -> Iterator[Minimum]:
@@ -343,7 +351,8 @@ def _result(
     covariance = moving_covariance(evidence, found.motion, path)
     if not np.isfinite(covariance.costs).all():
         what = "the evidence does not determine the track"
-        raise DegenerateError(what, where="views", fix="give more keypoints, or a size")
+        fix = "give more keypoints, in two frames at least, or a size"
+        raise DegenerateError(what, where="views", fix=fix)
     unknowns = 12 * len(frames.times) + int(evidence.scales.free.sum())
     unknowns -= round(float(covariance.variances.sum()))
     redundancy = count_equations(evidence) - len(evidence.shape.modes) - unknowns

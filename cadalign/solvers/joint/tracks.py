@@ -85,13 +85,23 @@ def _room_of(system: Moving) -> tuple[JointEquations, JointEquations]:
 @kernel
 def evaluate_moving(system: Moving, row: FloatArray, equations: JointEquations) -> float:
     """Write the normal equations at a state; see `cadalign.solvers.search.evaluate`."""
-    joint, arrow = Joint(system.evidence, system.integrates), equations.arrow
-    cost = evaluate_joint(joint, _joint_part(system, row), equations)
-    if not cost < np.inf:
-        return np.inf
+    cost = _evaluate_evidence(system, row, equations)
+    return cost + _add_motion(system, row, equations) if cost < np.inf else np.inf
+
+
+@kernel
+def _evaluate_evidence(system: Moving, row: FloatArray, equations: JointEquations) -> float:
+    joint = Joint(system.evidence, system.integrates)
+    return evaluate_joint(joint, _joint_part(system, row), equations)
+
+
+@kernel
+def _add_motion(system: Moving, row: FloatArray, equations: JointEquations) -> float:
+    """Add the motion, and what is known of the first frame; returns their cost."""
+    arrow = equations.arrow
     state = unpacked(system.evidence, _joint_part(system, row))
     velocities = _velocities(system, row)
-    cost += add_motion(system.motion, state.poses, velocities, arrow)
+    cost = add_motion(system.motion, state.poses, velocities, arrow)
     if system.motion.told > 0.0:
         cost += _add_volume(system, state, arrow)
     if system.anchor.information.shape[0] > 0:
@@ -182,6 +192,15 @@ class Path(NamedTuple):
     velocities: FloatArray
 
 
+def frame_information(evidence: Evidence, state: State) -> FloatArray:
+    """Greatest information (2,) of one frame about a rotation and a translation along an axis."""
+    reduction, row = reduced_row(evidence, state)
+    equations = joint_room(reduction.evidence, 6, 0)
+    evaluate_joint(Joint(reduction.evidence, False), row, equations)
+    diagonals = np.einsum("pkk->pk", equations.arrow.blocks)
+    return np.asarray(diagonals.reshape(-1, 2, 3).max(axis=(0, 2)))
+
+
 def refine_moving(
     evidence: Evidence,
     motion: MotionPrior,
@@ -252,9 +271,12 @@ def _covariance_of(
     evidence: Evidence, system: Moving, basis: FloatArray, row: FloatArray, sighted: BoolArray
 ) -> PathCovariance:
     equations = joint_room(system.evidence, STATE, STATE)
-    cost = evaluate_moving(system, row, equations)
     arrow = equations.arrow
+    cost = _evaluate_evidence(system, row, equations)
+    # Before the motion, whose information may be more than a trillion times that of the evidence.
     decide_on_undetermined(arrow, True)
+    if cost < np.inf:
+        cost += _add_motion(system, row, equations)
     if not factorize_arrow(arrow):
         frames = arrow.blocks.shape[0]
         nothing = np.full((frames, STATE, STATE), np.inf)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -149,3 +150,25 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         array = array.copy()
         array.flags.writeable = False
     return array
+
+
+def as_one_or_each(value: Any, *, name: str, count: int, entries: str) -> FloatArray:
+    """One positive number, or (count,) of them, one for each of the ``entries``.
+
+    Raises InputError if it has another shape, or a value is not positive and finite.
+    """
+    array = _converted(value, name)
+    if array.shape not in ((), (count,)):
+        fix = f"give one, or one for each of {count} {entries}"
+        raise InputError(f"{array.size} numbers", where=name, fix=fix)
+    if not ((array > 0) & (array < np.inf)).all():
+        raise InputError("must be positive and finite", where=name)
+    return array
+
+
+def copied(value: Any) -> Any:
+    """A copy of an argument, an array or what makes one: the caller may go on to change it."""
+    try:
+        return deepcopy(value)
+    except TypeError:  # a memoryview
+        return np.array(value)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from cadalign.cli.common import JsonOption, answer, new_console, print_json, waiting
 
 if TYPE_CHECKING:
+    from cadalign.cli.health import Health
     from cadalign.datasets import PhotoSummary
-    from cadalign.health import Health
 
 # Problems of a data set that are printed; JSON has all.
 _SHOWN = 10
@@ -37,7 +37,7 @@ class Doctor(JsonOption):
             return self._check_data(self.data)
         if self.compile:
             return self._compile()
-        from cadalign.health import examine
+        from cadalign.cli.health import examine
 
         with waiting("trying the renderers, each in a process of its own ..."):
             health = examine()
@@ -49,7 +49,7 @@ class Doctor(JsonOption):
 
     def _compile(self) -> int:
         from cadalign.cli.compile_ahead import compile_ahead
-        from cadalign.health import compiled_cache
+        from cadalign.cli.health import compiled_cache
 
         began = time.perf_counter()
         with waiting("compiling ...") as show:
@@ -62,7 +62,7 @@ class Doctor(JsonOption):
         return 0
 
     def _check_data(self, folder: Path) -> int:
-        from cadalign.health import examine_data
+        from cadalign.cli.health import examine_data
 
         with waiting("reading the annotations ...") as show:
             summary = examine_data(folder, progress=lambda count: show(f"{count} photos read ..."))

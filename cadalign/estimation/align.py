@@ -34,6 +34,7 @@ from cadalign.estimation.prepared_views import (
     with_poses_by_masks,
 )
 from cadalign.estimation.prior import Lenses, prior_of
+from cadalign.estimation.problems import each_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import FitStats
 from cadalign.estimation.results import Results
@@ -307,6 +308,7 @@ def align_batch(
     [1.0, 2.0]
     """
     threads = worker_count(workers)
+    objects = each_of(objects, "objects", None, "views")
     sizes = _one_each(size, len(objects), "size", Size)
     starts = _one_each(init, len(objects), "init", Alignment)
 

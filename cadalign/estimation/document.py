@@ -108,8 +108,8 @@ class _Summary(ForeignDocument):
     kind: str
     view: int | None
     count: int
-    rms_sigmas: NotNegative
-    rms: NotNegative
+    rms_sigmas: NotNegative | None  # of a mask that was left out
+    rms: NotNegative | None
     unit: str
     share: NotNegative | None = None  # of a photo
 
@@ -229,10 +229,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
             }
             for other in result.alternatives
         ],
-        "evidence": [  # only a photo's outline has a share
-            {name: value for name, value in vars(each).items() if (name, value) != ("share", None)}
-            for each in result.evidence
-        ],
+        "evidence": [_written_evidence(each) for each in result.evidence],
         "misfit": misfit and misfit.to_dict(),
         "options": result.options and _plain_options(result.options),
         "symmetry": result.symmetry and result.symmetry.to_dict(),
@@ -241,6 +238,19 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "mask_residuals": [each and _written_mask(each) for each in result.mask_residuals],
         "stats": {**vars(result.stats)},
     }
+
+
+def _written_evidence(evidence: EvidenceSummary) -> dict[str, Any]:
+    """The fields, of which only a photo's outline has a share."""
+    given = {name: value for name, value in vars(evidence).items() if value is not None}
+    has_rms = math.isfinite(evidence.rms)
+    return {"view": None, **given, **({} if has_rms else {"rms_sigmas": None, "rms": None})}
+
+
+def _read_evidence(read: _Summary) -> EvidenceSummary:
+    fields = msgspec.structs.asdict(read)
+    lacking = {name: math.nan for name in ("rms_sigmas", "rms") if fields[name] is None}
+    return EvidenceSummary(**fields | lacking)
 
 
 def _written_mask(mask: MaskResiduals) -> dict[str, Any]:
@@ -296,7 +306,7 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         points_cam_covariance=_array(in_camera, "points_cam_covariance", None, 3, 3),
         warnings=tuple(read.warnings),
         misfit=_misfit(read.misfit),
-        evidence=tuple(EvidenceSummary(**msgspec.structs.asdict(each)) for each in read.evidence),
+        evidence=tuple(map(_read_evidence, read.evidence)),
         degrees_of_freedom=read.degrees_of_freedom,
     )
     views[0] = replace(views[0], statistics=statistics)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, copied
 from cadalign.errors import CadalignError, InputError, require_kind
 from cadalign.estimation.assemble import canonical_result, result_of_solution
 from cadalign.estimation.focal import USUAL, PriorOption
@@ -146,7 +145,7 @@ def fit(
     except InputError:
         raise
     except (TypeError, ValueError):  # an array as sigma has no hash
-        options = FitOptions(method, _copied(sigma), *chosen[2:])
+        options = FitOptions(method, copied(sigma), *chosen[2:])
     problems = pack_one(points_3d, points_2d, camera)
     _check(ransac, scores, symmetry)
     return _fit_one(problems, options, ransac, scores, symmetry, start)
@@ -230,7 +229,7 @@ def fit_batch(
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
     if per_problem:
-        sigmas = list(each_of(sigma, "sigma", len(problems), "values"))
+        sigmas = list(map(copied, each_of(sigma, "sigma", len(problems), "values")))
     _check(ransac, scores, symmetry)
     if scores is not None:
         scores = each_of(scores, "scores", len(problems), "sets")
@@ -265,14 +264,6 @@ def fit_batch(
         return Results.of(fits, counts=some.counts, unknowns=unknowns)
 
     return Results.joined(in_threads(run, len(problems), workers))
-
-
-def _copied(sigma: Any) -> Any:
-    """A copy that the caller does not go on to change."""
-    try:
-        return deepcopy(sigma)
-    except TypeError:  # a memoryview
-        return np.array(sigma)
 
 
 def _check(ransac: object, scores: object, symmetry: Symmetry | None) -> None:

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, is_number
 from cadalign.errors import DegenerateError
 from cadalign.estimation.estimates import (
     curvature_of_rotations,
@@ -255,7 +255,7 @@ def result_of_minima(
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
-        sigma=problem.noise if problem.lacks_sigma else None,
+        sigma=problem.noise if problem.lacks_sigma else common_sigma(views),
         known_axis=known_axis if known_axis and held["xyz".index(known_axis)] else None,
         stretched_axes=stretched_axes(held),
         symmetry=symmetry,
@@ -263,6 +263,14 @@ def result_of_minima(
         focal="estimate" if minimum.lenses.count else "known",
         focal_prior=prior_of_camera(minimum.lenses.prior, views[0].camera),
     )
+
+
+def common_sigma(views: Sequence[View]) -> float | None:
+    """The standard deviation of all keypoints [px]; None where they do not share one."""
+    given = [view.sigma for view in views if len(view.keypoint_ids)]
+    first, *others = given or [None]
+    is_one = is_number(first) and all(is_number(each) and each == first for each in others)
+    return float(cast(float, first)) if is_one else None
 
 
 def _undetermined_error() -> DegenerateError:

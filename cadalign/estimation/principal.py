@@ -107,7 +107,8 @@ def _with_principal_point(
 ) -> Result:
     views = []
     for number, view in enumerate(result.views):
-        stated = Stated.of(view.statistics)
+        # Those of the result are of its first view, and also name what was left out.
+        stated = Stated.of(view.statistics if number else result.statistics)
         if stated.covariance is not None:
             steps = [_step(result, each, number) for each in beside]
             slopes = np.stack(steps, axis=-1)[: len(stated.covariance)] / difference
@@ -118,12 +119,12 @@ def _with_principal_point(
                 covariance=stated.covariance + added,
                 fisher_covariance=None if fisher is None else fisher + added,
             )
-        if stated.points_cam_covariance is not None:
-            points = result.alignment.apply(result.points_3d)
-            moved = [each.alignment.apply(each.points_3d) - points for each in beside]
-            slopes = np.stack(moved, axis=-1) / difference
-            added = slopes @ covariance @ slopes.swapaxes(1, 2)
-            stated = replace(stated, points_cam_covariance=stated.points_cam_covariance + added)
+        for name, points_of in _POINTS.items():
+            if getattr(stated, name) is not None:
+                moved = [points_of(each) - points_of(result) for each in beside]
+                slopes = np.stack(moved, axis=-1) / difference
+                added = slopes @ covariance @ slopes.swapaxes(1, 2)
+                stated = replace(stated, **{name: getattr(stated, name) + added})
         basis = stated.basis and replace(stated.basis, principal_sigma=options.principal_sigma)
         views.append(replace(view, statistics=replace(stated, basis=basis)))
     x, y = np.sqrt(covariance.diagonal()).tolist()
@@ -134,6 +135,13 @@ def _with_principal_point(
         principal_std=(x, y),
         options=None if result.options is None else options,
     )
+
+
+_POINTS: dict[str, Callable[[Result], FloatArray]] = {
+    "points_covariance": lambda result: result.points_3d * result.alignment.scale,
+    "points_cam_covariance": lambda result: result.alignment.apply(result.points_3d),
+}
+"""Points of a result whose covariances are stated, by the name of these."""
 
 
 def _step(one: Result, other: Result, number: int) -> FloatArray:

@@ -143,7 +143,7 @@ def fit_similar_robustly(
     tolerant = _under_cauchy(problems, options, start)
     strict: tuple[Result, float] | None = None
     refusal: CadalignError | None = None
-    extent = float(np.ptp(problems.points_2d, axis=0).max(initial=0.0))
+    extent = float(np.ptp(problems.points_2d, axis=0).max()) if len(problems.points_2d) else 0.0
     threshold = _FIRST
     while threshold == _FIRST or threshold <= _WIDEST * extent:
         chosen = replace(ransac, max_reproj_error=threshold)

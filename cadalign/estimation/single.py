@@ -17,7 +17,7 @@ from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.assemble import canonical_result
 from cadalign.estimation.estimates import with_boxes
 from cadalign.estimation.fit import fit
-from cadalign.estimation.joint import Estimate, result_of
+from cadalign.estimation.joint import Estimate, common_sigma, result_of
 from cadalign.estimation.mistakes import Explained, Mistake, find_in_all, larger_sizes
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -193,6 +193,7 @@ def align_single(
         cost=cost,
         stats=stats,
         component=component,
+        sigma=common_sigma([view]),
         known_axis=None,
         stretched_axes="",
     )

@@ -298,6 +298,8 @@ def _estimate_sigmas(
     for b in range(len(problems)):
         rows = problems.rows(b)
         squares = (residuals[rows] ** 2).sum(axis=1)
+        if not len(squares):
+            continue  # refused later, as with a known sigma
         redundancy = max(2 * int(problems.distinct_counts[b]) - options.unknowns, 1)
         if options.loss == "linear":
             sigma = np.sqrt(squares.sum() / redundancy)

@@ -15,8 +15,10 @@ from cadalign.arrays import (
     BoolArray,
     FloatArray,
     as_floats,
+    as_one_or_each,
     as_points,
     as_positive,
+    copied,
     is_number,
     read_only,
 )
@@ -36,6 +38,10 @@ if TYPE_CHECKING:
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
 _DEFAULTS = {"depth_sigma": 0.01, "up_sigma_deg": 1.0, "camera_height_sigma": 0.02}
+
+
+class _Numbers(tuple[int, ...]):
+    """Ids of keypoints that none are given for: so they are known in changed copies of a view."""
 
 
 @renamed(confidences="scores")
@@ -64,9 +70,9 @@ class View(DeclaredEvidence):
     depth : (n,) or (h, w) float, or path, optional
         Depths of the keypoints, their z in the camera's frame, also of a wide lens, or an image of
         such depths that is registered to the photo, as an array or as a 16-bit PNG [model units, or
-        the unit in which the object's size is wanted]; 0 or NaN where unknown. A depth image is
-        sampled robustly at the keypoints and, with a mask and a mesh, over the visible surface;
-        beside a photo its steps show the outline.
+        the unit in which the object's size is wanted]; NaN where unknown, in an image also 0. An
+        image is sampled robustly at the keypoints and, with a mask and a mesh, over the visible
+        surface; beside a photo its steps show the outline.
     depth_sigma : float or (n,) float
         Standard deviation of the depths, relative; by default 0.01, 1 %.
     depth_scale : float, optional
@@ -123,8 +129,6 @@ class View(DeclaredEvidence):
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
     noise: InitVar[DetectorNoise | None] = field(default=None, kw_only=True)
     time: float | None = field(default=None, kw_only=True)
-    is_numbered: bool = field(init=False, repr=False)
-    """True where no ids are given."""
 
     def __post_init__(self, noise: DetectorNoise | None) -> None:
         self._check_more()
@@ -137,8 +141,11 @@ class View(DeclaredEvidence):
         points = as_points(points, name="points_2d", dimension=2)
         check_pixels(points, camera.width, camera.height, where="points_2d")
         self._keep("points_2d", points)
-        object.__setattr__(self, "is_numbered", self.ids is None)
-        object.__setattr__(self, "ids", checked_ids(self.ids, len(points)))
+        is_named = self.ids is not None and not self.is_numbered
+        ids = checked_ids(self.ids, len(points)) if is_named else _Numbers(range(len(points)))
+        object.__setattr__(self, "ids", ids)
+        for name in ("sigma", "scores", "depth_sigma", "up_sigma_deg"):
+            object.__setattr__(self, name, copied(getattr(self, name)))
         if noise is not None:
             known = None if self.is_numbered else self.keypoint_ids
             sigma = noise.sigma(points, scores=self.scores, ids=known)
@@ -156,10 +163,9 @@ class View(DeclaredEvidence):
             self._keep("mask", _mask(self.mask, camera))
         if self.image is not None:
             self._keep("image", _photo(self.image, camera))
-        relative = np.asarray(self.depth_sigma, dtype=np.float64)
-        shapes = [()] if self.depth_image is not None else [(), (len(points),)]
-        if relative.shape not in shapes or not (relative > 0).all():
-            raise InputError("must be positive, one or one per keypoint", where="depth_sigma")
+        if self.depth_image is not None:
+            as_positive(self.depth_sigma, name="depth_sigma")
+        as_one_or_each(self.depth_sigma, name="depth_sigma", count=len(points), entries="keypoints")
         for name in ("camera_height", "camera_height_sigma", "mask_sigma"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_positive(getattr(self, name), name=name))
@@ -174,6 +180,11 @@ class View(DeclaredEvidence):
     def sources(self) -> tuple[str, ...]:
         """Names of the fields beside keypoints that are evidence by themselves."""
         return super().sources if self.image is None else (*super().sources, "image")
+
+    @property
+    def is_numbered(self) -> bool:
+        """True where no ids are given."""
+        return isinstance(self.ids, _Numbers)
 
     @property
     def keypoint_ids(self) -> tuple[Hashable, ...]:

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, as_positive
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray, IntArray, as_floats, as_one_or_each, as_points, as_positive
+from cadalign.errors import InputError, require_kind
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Finite, PathText, Point3, Positive
 from cadalign.io.files import as_path
@@ -262,12 +262,8 @@ class Size:
         if np.isnan(self.lengths).all():
             fix = "give width, height or length"
             raise InputError("no length is given", where="size", fix=fix)
-        relative = self.relative
-        if relative.shape not in ((), (3,)):
-            fix = "give one, or one for each of 3 lengths"
-            raise InputError(f"{relative.size} numbers", where="size.sigma", fix=fix)
-        if not (relative > 0).all():
-            raise InputError("must be positive, one or one per axis", where="size.sigma")
+        if self.sigma is not None:
+            as_one_or_each(self.sigma, name="size.sigma", count=3, entries="lengths")
 
     @property
     def relative(self) -> FloatArray:
@@ -336,6 +332,7 @@ class ObservedImage:
     evidence: ImageEvidence = field(default_factory=ImageEvidence, kw_only=True)
 
     def __post_init__(self) -> None:
+        require_kind(self.camera, Camera, "camera")
         points_3d = as_points(self.points_3d, name="points_3d", dimension=3)
         points_2d = as_floats(self.points_2d, name="points_2d", shape=(len(points_3d), 2))
         object.__setattr__(self, "points_3d", points_3d)

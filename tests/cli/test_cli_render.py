@@ -17,12 +17,12 @@ from PIL import Image
 
 from cadalign import Camera
 from cadalign.cli.doctor import Doctor
+from cadalign.cli.health import Health, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
 from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, RenderError
 from cadalign.export.camera_files import write_open3d
-from cadalign.health import Health, compiled_cache
 from cadalign.render import look_at
 from cadalign.render.probe import Probe, probe_renderer
 
@@ -274,7 +274,7 @@ def _health(**changes):
 
 
 def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
-    monkeypatch.setattr("cadalign.health.examine", _health)
+    monkeypatch.setattr("cadalign.cli.health.examine", _health)
     monkeypatch.setenv("COLUMNS", "160")
     assert Doctor().run() == 0
     text = capsys.readouterr().out
@@ -288,7 +288,7 @@ def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys)
 
 def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
     broken = Probe("raycast", False, "embreex is gone", "")
-    monkeypatch.setattr("cadalign.health.examine", lambda: _health(renderers=(broken,)))
+    monkeypatch.setattr("cadalign.cli.health.examine", lambda: _health(renderers=(broken,)))
     assert Doctor().run() == 1
 
 

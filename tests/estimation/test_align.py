@@ -484,3 +484,21 @@ def test_a_blade_whose_edge_may_be_its_back_has_both_poses() -> None:
     assert any("another pose, 1" in text for text in result.warnings)
     others = [each.alignment for each in result.alternatives]
     assert min(rotation_error(est=each, gt=behind) for each in others) < 5
+
+
+def test_a_batch_takes_any_iterable_of_objects() -> None:
+    points = keypoints()
+    view, model = seen(points, truth_of(), np.eye(4)), Model(points_3d=points)
+    assert len(align_batch(model, (each for each in [view, view]))) == 2
+    with pytest.raises(InputError, match=r"objects: expected a sequence .* got View"):
+        align_batch(model, view)  # type: ignore[arg-type]
+
+
+def test_a_standard_deviation_that_all_keypoints_share_is_stated() -> None:
+    points = keypoints()
+    view = replace(seen(points, truth_of(), np.eye(4)), sigma=2.0)
+    each = replace(view, sigma=np.linspace(1.0, 2.0, len(points)))
+    for model in (Model(points_3d=points, shape_sigma=0.01), Model(points_3d=points)):
+        assert align(model, view, size=Size(width=1.0)).sigma == 2.0
+        assert align(model, [view, view]).sigma == 2.0
+        assert align(model, [view, each]).sigma is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -126,6 +127,27 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
             lambda: align(PLAIN, [*rig(POINTS, truth_of(), [0]), View(CAMERA, PIXELS[:3])]),
             "views[1].cam_from_rig: only some views have a known pose; "
             "give it for all views, or for none",
+        ),
+        (
+            lambda: View(CAMERA, PIXELS, depth_sigma="a"),
+            "depth_sigma: not an array of numbers (could not convert string to float: 'a')",
+        ),
+        (
+            lambda: View(CAMERA, PIXELS, depth_sigma=[0.1, 0.2]),
+            f"depth_sigma: 2 numbers; give one, or one for each of {len(PIXELS)} keypoints",
+        ),
+        (
+            lambda: Size(width=1.0, sigma=np.inf),
+            "size.sigma: must be positive and finite",
+        ),
+        (
+            lambda: align(
+                Model(points_3d=POINTS, ids=[*range(1, len(POINTS)), 0]),
+                replace(seen(POINTS, truth_of(), around(0)), sigma=2.0, ids=None),
+            ),
+            "views[0].ids: no ids are given, and the model's keypoints are not 0, 1, 2, ... but "
+            "1, 2, 3, 4, 5, ...; "
+            "give the model's id of each keypoint of the view, in the view's order",
         ),
     ],
 )

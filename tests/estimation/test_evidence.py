@@ -99,7 +99,7 @@ class TestSize:
         [
             (lambda: Size(), "size: no length is given"),
             (lambda: Size(width=-1), "width: -1 is not positive"),
-            (lambda: Size(width=1, sigma=0), "size.sigma: must be positive, one or one per axis"),
+            (lambda: Size(width=1, sigma=0), "size.sigma: must be positive and finite"),
         ],
     )
     def test_bad_lengths_are_named(self, call: Any, message: str) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cadalign import Camera, RansacOptions, Result, Results, fit, fit_batch
+from cadalign import Camera, RansacOptions, Result, Results, View, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.evaluation.simulation.problems import Problem, simulate_problem
 
@@ -144,6 +145,16 @@ def test_every_problem_may_have_its_own_sigma() -> None:
     each = [{"sigma": sigma} for sigma in sigmas]
     for workers in (1, 2):
         assert_like_single_fits(run(RAGGED, sigma=sigmas, workers=workers), RAGGED, each)
+
+
+def test_sigmas_may_be_changed_afterwards() -> None:
+    sigmas = [np.ones(len(each.points_3d)) for each in RAGGED]
+    batch, view = run(RAGGED, sigma=sigmas), View(RAGGED[0].camera, RAGGED[0].points_2d)
+    view = replace(view, sigma=sigmas[0])
+    for sigma in sigmas:
+        sigma *= 100
+    assert batch[0].std.rotation_deg == run(RAGGED, sigma=1.0)[0].std.rotation_deg
+    assert (np.asarray(view.sigma) == 1.0).all()
 
 
 @pytest.mark.parametrize("sigma", [np.float64(2.0), np.float32(2.0), np.array(2.0)])

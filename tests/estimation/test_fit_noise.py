@@ -11,8 +11,8 @@ from scipy.optimize import least_squares
 from support.covariances import of_unknowns
 from support.problems import LENS, assert_same, fit_problem, moved, problem_of, residuals_at
 
-from cadalign import Alignment, Camera, Model, View, align, fit
-from cadalign.errors import DegenerateError
+from cadalign import Alignment, Camera, Model, RansacOptions, View, align, fit
+from cadalign.errors import CadalignError, DegenerateError
 from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem
 from cadalign.geometry.metrics import rotation_error
 
@@ -270,3 +270,10 @@ def test_stats_count_the_work() -> None:
     assert stats.iterations > 0
     assert stats.hypotheses > 0
     assert 0 < stats.seconds <= elapsed
+
+
+@pytest.mark.parametrize("options", [{}, {"loss": "cauchy"}, {"ransac": RansacOptions()}])
+def test_no_keypoints_have_no_noise(options: dict[str, object]) -> None:
+    nothing = np.empty((0, 3)), np.empty((0, 2))
+    with pytest.raises(CadalignError, match="0 keypoints"):
+        fit(*nothing, SIMULATION_CAMERA, sigma=None, **options)  # type: ignore[arg-type]

@@ -208,3 +208,23 @@ def test_wrong_options_are_refused(options: dict[str, object], message: str) -> 
     with pytest.raises(InputError) as caught:
         fitted(cropped(0, 10), **options)
     assert str(caught.value).startswith(message)
+
+
+def test_views_that_are_left_out_are_named_as_without_it() -> None:
+    model, seen, _ = seen_by_cropped(0, 2, 0.0)
+    two = replace(seen[0], points_2d=seen[0].pixels[:2], ids=seen[0].keypoint_ids[:2])
+    views = [seen[0], two, seen[1]]
+    known, shifted = (align(model, views, principal_sigma=each) for each in (None, 1e-3))
+    assert known.warnings == shifted.warnings
+    assert known.warnings
+    assert [each.view for each in known.evidence] == [each.view for each in shifted.evidence]
+    alone = align(model, views[:2], principal_sigma=SIGMA)
+    assert np.isfinite(alone.sensitivity().by_points_2d).all()
+
+
+def test_keypoints_of_a_similar_model_are_as_uncertain_in_both_frames() -> None:
+    model, seen, _ = seen_by_cropped(0, 1, 0.02)
+    known, shifted = (align(model, seen, principal_sigma=each) for each in (None, SIGMA))
+    for name in ("points_covariance", "points_cam_covariance"):
+        before, after = getattr(known, name), getattr(shifted, name)
+        assert np.trace(after.sum(axis=0)) > 1.01 * np.trace(before.sum(axis=0))

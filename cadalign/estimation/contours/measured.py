@@ -256,8 +256,14 @@ def solved(information: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def weakest_steps(information: FloatArray, count: int) -> list[FloatArray]:
-    """Steps (U,) of one standard deviation along the directions of which least is known."""
-    matrix, sizes = scaled_information(information)
+    """Steps (U,) of one standard deviation along the directions of which least is known.
+
+    Unknowns of which nothing is known, poses of a track's frames without evidence, stay.
+    """
+    known = np.flatnonzero(information.diagonal() > 0)
+    matrix, sizes = scaled_information(information[np.ix_(known, known)])
     values, vectors = np.linalg.eigh(matrix)
     roots = np.sqrt(np.maximum(values[:count], _LEAST_INFORMATION))
-    return list((vectors[:, :count] / roots / sizes[:, None]).T)
+    steps = np.zeros((len(roots), len(information)))
+    steps[:, known] = (vectors[:, :count] / roots / sizes[:, None]).T
+    return list(steps)

@@ -125,6 +125,9 @@ def sensitivity_of(result: ResultData, *, exact: bool, view: int) -> Sensitivity
     if result.trajectory is not None:
         what = "an estimate with a motion has no sensitivity"
         raise InputError(what, where="sensitivity", fix="align its frames without `motion`")
+    if not any(len(each.ids) for each in result.views):
+        what = "an estimate without keypoints has no derivatives by them"
+        raise InputError(what, where="sensitivity", fix="align with keypoints")
     basis = statistics.basis
     if basis is None and result.options is not None and result.covariance is not None:
         basis = _basis_of_fit(result, result.options)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from cadalign import Alignment, Camera, Model, View, align
+from cadalign import Alignment, Camera, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.estimation.contours.view_contour import contour_bound
@@ -194,6 +194,13 @@ class TestOtherObjects:
         assert residuals is not None
         assert not residuals.is_used
         assert rotation_error(est=result.alignment, gt=alone.alignment) < 1e-3
+        elsewhere = np.zeros_like(case.mask)
+        elsewhere[:20, :20] = True
+        unmet = align(case.model, case.view(mask=elsewhere))
+        read = Result.from_json(unmet.to_json())
+        assert "NaN" not in unmet.to_json()
+        assert [each.name for each in read.evidence] == ["views[0].points_2d", "views[0].mask"]
+        assert np.isnan(read.evidence[1].rms)
 
     def test_neighbours_are_named_at_least_19_times_of_20(self, sample_root: Path) -> None:
         dataset = KeypointNet(sample_root)

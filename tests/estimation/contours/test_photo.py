@@ -323,6 +323,16 @@ class TestTrack:
         for (frame, _), view in zip(frames(3), result.views, strict=True):
             assert frame.turned(view.alignment) < 0.5
 
+    def test_frames_without_any_evidence_follow(self) -> None:
+        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
+        first, second, third = self.views(3, mask=True)
+        views = [first, View(CAMERA, time=second.time), third]
+        result = align(model, views, motion="smooth")
+        assert all(
+            frame.turned(view.alignment) < 1.0
+            for (frame, _), view in zip(frames(3), result.views, strict=True)
+        )
+
     def test_frames_without_the_outline_are_left_out(self) -> None:
         model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
         result = align(model, self.views(6, image=True, spoilt=(2, 4)), motion="smooth")

@@ -161,8 +161,8 @@ def _with_images(
         return found, refined
     evidence, path = best.evidence, found.path._replace(state=best.state)
     path, prior, spent = _likeliest(evidence, path, found.motion, motion)
-    # The other components' shapes lack the outlines' points. A score that knows nothing of the motion
-    # is infinite where frames have no evidence.
+    # The other components' shapes lack the outlines' points, and a score without the motion is
+    # infinite where frames have no evidence.
     track = found._replace(
         minima=[best._replace(score=found.minima[0].score)],
         evidence=evidence,

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -21,29 +21,31 @@ from cadalign.arrays import FloatArray, as_positive
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.evidence_kinds import upward
-from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
+from cadalign.estimation.focal import FocalPrior, PriorOption, prior_of_camera
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
 from cadalign.estimation.scene_messages import (
+    FALSE_ALARMS,
+    FIELDS,
     PARTS,
-    UP,
     Member,
-    SceneMessage,
     SceneObject,
     SharedUnknowns,
+    agreeing,
     as_prior,
+    but_for,
+    known_by,
+    left_out,
+    reference_of,
 )
-from cadalign.estimation.uncertainty.residuals import chi_square_tail
-from cadalign.estimation.uncertainty.summary import Uncertainty
+from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 
 SHARED = tuple(PARTS)
-_WORDS = {"focal": "focal length", "gravity": "direction of gravity", "ground": "ground"}
 _ROUNDS = 8
 _SETTLED = 0.02  # change of the shared unknowns that ends the rounds, in standard deviations
-_FALSE_ALARMS = 1e-4  # of objects that agree
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +108,7 @@ def align_scene(
     *,
     share: Collection[str] = ("focal",),
     tilt_sigma_deg: float = 1.0,
+    focal: str | None = None,
     focal_prior: PriorOption = FitOptions.focal_prior,
     loss: str = FitOptions.loss,
     loss_scale: float = FitOptions.loss_scale,
@@ -116,8 +119,8 @@ def align_scene(
     Parameters
     ----------
     objects : sequence of SceneObject
-        One model and one view each, the views of one camera. A camera `Camera.without_focal` has
-        its focal length estimated.
+        One model and one view each, the views of one camera. Where gravity or the ground is shared,
+        ``up`` or ``camera_height`` of the first view that has it counts for all.
     share : collection of {"focal", "gravity", "ground"}
         What the objects have in common: the focal length, where it is unknown; the direction of
         gravity, as objects standing upright have it; and the ground that they stand on with their
@@ -126,20 +129,22 @@ def align_scene(
         the others.
     tilt_sigma_deg : float
         Standard deviation of an object's up axis about gravity [degrees].
+    focal : {"known", "estimate"}, optional
+        As for `cadalign.align`; by default known, if the camera has one.
     focal_prior, loss, loss_scale, ransac
-        As for `cadalign.align`.
+        As for `cadalign.align`; what is shared needs ``refine``.
 
     Returns
     -------
     AlignedScene
-        An object that contradicts the others in what they share is aligned alone, and named in the
-        warnings.
+        An object that contradicts the others in what they share is aligned alone, and what is given
+        but contradicts them all is left out; the warnings name both.
 
     Raises
     ------
     InputError
-        If an argument is invalid, the cameras differ, or a model has no up axis and ``share`` needs
-        one.
+        If an argument is invalid, the cameras or what views say of gravity and the ground differ,
+        or a model has no up axis and ``share`` needs one.
     DegenerateError
         If no object can be aligned.
 
@@ -159,32 +164,29 @@ def align_scene(
     >>> bool(abs(scene.camera.fx / 600 - 1) < 2 * scene.focal_std)
     True
     """
-    camera, wanted = _checked(objects, share)
+    camera = _checked(objects)
+    focal = focal or ("known" if camera.focal_known else "estimate")
+    options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
+    if ransac is not None:
+        require_kind(ransac, RansacOptions, "ransac")
+    wanted = _wanted(share, focal=focal, ransac=ransac)
     tilt = math.radians(as_positive(tilt_sigma_deg, name="tilt_sigma_deg"))
-    known = _known(objects, prior_of_camera(focal_prior, camera))
+    known = known_by([each.view for each in objects], prior_of_camera(focal_prior, camera))
+    first = known.tilted(tilt)
+    _check_views(objects, first, wanted, tilt)
     if "gravity" in wanted:
         for each in objects:
             upward("share", prior_of(each.model))
 
     def aligned(given: SceneObject, had: SharedUnknowns) -> Result:
-        prior: PriorOption = USUAL
-        if not camera.focal_known:
-            prior = had.focal_prior if "focal" in wanted else focal_prior
+        own = replace(options, focal_prior=had.focal_prior) if "focal" in wanted else options
+        view = had.seen_by(given.view, wanted)
         return align(
-            given.model,
-            had.seen_by(given.view, wanted),
-            size=given.size,
-            init=given.init,
-            loss=loss,
-            loss_scale=loss_scale,
-            ransac=ransac,
-            focal="known" if camera.focal_known else "estimate",
-            focal_prior=prior,
+            given.model, view, size=given.size, init=given.init, ransac=ransac, **own.of_views
         )
 
     found: list[Result | CadalignError] = []
-    members = []
-    first = known.tilted(tilt)
+    members, warnings = [], []
     for number, each in enumerate(objects):
         try:
             result = aligned(each, first)
@@ -192,16 +194,36 @@ def align_scene(
             found.append(error)
             continue
         found.append(result)
-        members.append(Member(number, each, wanted, first, result))
-    if not members:
-        raise DegenerateError(f"no object can be aligned: {found[0]}", where="objects")
-    members, warnings = _agreeing(members, known, tilt)
-    shared = _fused(members, _reference(members), known, tilt)
-    if wanted and len(members) > 1:
+        member = Member(number, each, wanted, first, result)
+        if result.covariance is not None:
+            members.append(member)
+        elif wanted:
+            warnings.append(f"{member.name} has no covariance to share by, and is aligned alone")
+    _require_one(found)
+    if not members or not wanted:
+        return AlignedScene(Results.of(found), camera, warnings=tuple(warnings))
+    members, agreed, contradictions = agreeing(members, known, tilt)
+    if agreed is not known:  # which has misled the objects
+        wrong: dict[str, Any] = {
+            name: None for part, name in FIELDS.items() if np.isinf(agreed.std(part))
+        }
+        scene = align_scene(
+            [replace(each, view=replace(each.view, **wrong)) for each in objects],
+            share=share,
+            tilt_sigma_deg=tilt_sigma_deg,
+            focal=focal,
+            focal_prior=None if np.isinf(agreed.std("focal")) else focal_prior,
+            loss=loss,
+            loss_scale=loss_scale,
+            ransac=ransac,
+        )
+        return replace(scene, warnings=(*left_out(known, agreed), *scene.warnings))
+    shared = _fused(members, reference_of(members), known, tilt)
+    if len(members) > 1:
         shared, members = _settled(members, shared, known, tilt, aligned)
     for member in members:
         found[member.number] = member.result
-    scene = AlignedScene(Results.of(found), camera, warnings=tuple(warnings))
+    scene = AlignedScene(Results.of(found), camera, warnings=(*warnings, *contradictions))
     if "focal" in wanted:
         focal_std = shared.std("focal")
         scene = replace(scene, camera=camera.with_focal(shared.focal), focal_std=focal_std)
@@ -254,67 +276,73 @@ def focal_prior_by_others(
     """
     given = enumerate(zip(objects, results, priors, strict=True))
     members = [
-        Member(number, each, ("focal",), _known([], prior), result)
+        Member(number, each, ("focal",), known_by([], prior), result)
         for number, (each, result, prior) in given
     ]
     own = members[0]
-    members, warnings = _agreeing(members, own.had, 0.0)
+    members, known, contradictions = agreeing(members, own.had, 0.0)
     prior = priors[0]
     if own in members and len(members) > 1:
-        reference = _reference(members)
-        messages = [each.message(reference, 0.0) for each in members]
-        others = _but_for(messages, members.index(own), as_prior(own.had, reference))
+        reference = reference_of(members)
+        said = [each.message(reference, 0.0) for each in members]
+        others = but_for([*said, as_prior(known, reference)], members.index(own))
         prior = reference.moved(*others.moments).focal_prior
-    return prior, tuple(warnings)
+    return prior, (*left_out(own.had, known), *contradictions)
 
 
-def _checked(
-    objects: Sequence[SceneObject], share: Collection[str]
-) -> tuple[Camera, tuple[str, ...]]:
-    """The camera of valid objects, and the unknowns that they share, in order."""
+def _checked(objects: Sequence[SceneObject]) -> Camera:
+    """The camera of valid objects."""
     if not isinstance(objects, Sequence) or not len(objects):
         fix = "give a list of cadalign.SceneObject"
         raise InputError("expected at least one object", where="objects", fix=fix)
     for number, one in enumerate(objects):
         require_kind(one, SceneObject, f"objects[{number}]")
+        fix = "give the object's one view of the photo"
+        require_kind(one.view, View, f"objects[{number}].view", fix=fix)
         if one.view.camera != objects[0].view.camera:
             what = "the camera differs from the first object's"
             fix = "give objects of one photo, with its camera"
             raise InputError(what, where=f"objects[{number}].view.camera", fix=fix)
-    if isinstance(share, str) or not set(share) <= set(SHARED):
+    return objects[0].view.camera
+
+
+def _wanted(share: Collection[str], *, focal: str, ransac: RansacOptions | None) -> tuple[str, ...]:
+    """The unknowns that the objects share, in order."""
+    is_known = isinstance(share, Collection) and not isinstance(share, str)
+    if not is_known or not all(isinstance(each, str) and each in SHARED for each in share):
         fix = f"give some of {', '.join(SHARED)}"
         raise InputError(f"{quote(share)} is not what objects share", where="share", fix=fix)
-    camera, wanted = objects[0].view.camera, set(share)
+    wanted = set(share)
     if "ground" in wanted:  # which includes gravity
         wanted.add("gravity")
-    if camera.focal_known:
+    if focal == "known":
         wanted.discard("focal")
-    return camera, tuple(part for part in SHARED if part in wanted)
+    if wanted and ransac is not None and not ransac.refine:
+        what = "a hypothesis has no covariance, by which objects share what is unknown"
+        raise InputError(what, where="refine", fix="leave it True, or share nothing")
+    return tuple(part for part in SHARED if part in wanted)
 
 
-def _known(objects: Sequence[SceneObject], focal: FocalPrior | None) -> SharedUnknowns:
-    """Knowledge of the user about the shared unknowns, by the first view that has it."""
-    covariance = np.diag(np.full(4, np.inf))
-    up, height = np.array([0.0, -1.0, 0.0]), 1.0
-    given = [each.view for each in objects if each.view.up is not None]
-    if given:
-        up, sigma = cast(FloatArray, given[0].up), np.asarray(given[0].up_sigma_deg, dtype=float)
-        across = SharedUnknowns(1.0, up, 1.0, covariance).across
-        turned = np.radians(np.radians(sigma if sigma.ndim else sigma**2 * np.eye(3)))
-        covariance[UP, UP] = across @ turned @ across.T
-    heights = [each.view for each in objects if each.view.camera_height is not None]
-    if heights:
-        height = cast(float, heights[0].camera_height)
-        covariance[3, 3] = cast(float, heights[0].camera_height_sigma) ** 2
-    if focal is not None:
-        covariance[0, 0] = focal.relative_sigma**2
-    return SharedUnknowns(1.0 if focal is None else focal.focal, up, height, covariance)
+def _check_views(
+    objects: Sequence[SceneObject], known: SharedUnknowns, wanted: Collection[str], tilt: float
+) -> None:
+    """Refuse views that contradict what is known by the first of them."""
+    said = as_prior(known, known)
+    for number, each in enumerate(objects):
+        own = as_prior(known_by([each.view]).tilted(tilt), known)
+        for part, name in FIELDS.items():
+            if part in wanted and own.disagreement(said, PARTS[part])[0] < FALSE_ALARMS:
+                what = f"contradicts the {name} of an object before, which the photo shares"
+                fix = "give the one that is right"
+                raise InputError(what, where=f"objects[{number}].view.{name}", fix=fix)
 
 
-def _reference(members: Sequence[Member]) -> SharedUnknowns:
-    """Values of the object that is most certain of its rotation."""
-    best = min(members, key=lambda each: cast(Uncertainty, each.result.std).rotation_deg)
-    return best.values(SharedUnknowns(1.0, np.array([0.0, -1.0, 0.0]), 1.0, np.zeros((4, 4))))
+def _require_one(found: Sequence[Result | CadalignError]) -> None:
+    """Refuse objects of which none was aligned; wrong arguments stay such."""
+    if all(isinstance(each, CadalignError) for each in found):
+        is_refused = all(isinstance(each, InputError) for each in found)
+        kind = InputError if is_refused else DegenerateError
+        raise kind(f"no object can be aligned: {found[0]}", where="objects")
 
 
 def _fused(
@@ -323,48 +351,6 @@ def _fused(
     """The shared unknowns by all objects and what the user knows."""
     messages = [each.message(reference, tilt) for each in members]
     return reference.moved(*sum(messages, as_prior(known, reference)).moments)
-
-
-def _agreeing(
-    members: list[Member], known: SharedUnknowns, tilt: float
-) -> tuple[list[Member], list[str]]:
-    """The objects that agree in what they share; the others are named, the worst first."""
-    warnings = []
-    while len(members) > 1:
-        reference = _reference(members)
-        messages = [each.message(reference, tilt) for each in members]
-        prior = as_prior(known, reference)
-        worst: tuple[float, int, str] = (1.0, 0, "")
-        for number, member in enumerate(members):
-            others = _but_for(messages, number, prior)
-            for part in member.shared:
-                tail = _tail(messages[number], others, PARTS[part])
-                worst = min(worst, (tail, number, part))
-        tail, number, part = worst
-        if tail > _FALSE_ALARMS / len(members):
-            break
-        warnings.append(
-            f"{members[number].name} contradicts the {_WORDS[part]} of the other objects, and is "
-            "aligned alone: check its model, its keypoints, and whether it stands in this photo"
-        )
-        members = members[:number] + members[number + 1 :]
-    return members, warnings
-
-
-def _but_for(messages: Sequence[SceneMessage], number: int, prior: SceneMessage) -> SceneMessage:
-    """The prior of an object: what the others say, and what the user knows."""
-    return sum((each for k, each in enumerate(messages) if k != number), prior)
-
-
-def _tail(own: SceneMessage, others: SceneMessage, part: slice) -> float:
-    """Probability that two messages about a part differ by more than they do."""
-    (mean, covariance), (other_mean, other_covariance) = own.moments, others.moments
-    block = covariance[part, part] + other_covariance[part, part]
-    if not np.isfinite(block).all():
-        return 1.0
-    difference = mean[part] - other_mean[part]
-    square = float(difference @ np.linalg.pinv(block, hermitian=True) @ difference)
-    return chi_square_tail(square, len(difference))
 
 
 def _settled(
@@ -376,18 +362,17 @@ def _settled(
 ) -> tuple[SharedUnknowns, list[Member]]:
     """The shared unknowns, and the objects aligned with each other as their priors."""
     for _ in range(_ROUNDS):
-        prior = as_prior(known, shared)
-        messages = [each.message(shared, tilt) for each in members]
+        said = [*(each.message(shared, tilt) for each in members), as_prior(known, shared)]
         moved = []
         for number, member in enumerate(members):
-            others = _but_for(messages, number, prior)
-            had = shared.moved(*others.moments).tilted(tilt)
+            had = shared.moved(*but_for(said, number).moments).tilted(tilt)
             try:
                 result = aligned(member.given, had)
             except CadalignError:  # as it was
                 moved.append(member)
             else:
-                moved.append(replace(member, had=had, result=result))
+                is_told = result.covariance is not None
+                moved.append(replace(member, had=had, result=result) if is_told else member)
         members = moved
         last, shared = shared, _fused(members, shared, known, tilt)
         change = last.deviations(shared.focal, shared.up, shared.height)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result
+from cadalign.estimation.uncertainty.residuals import chi_square_tail
+from cadalign.estimation.uncertainty.summary import Uncertainty
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.evidence import Size
@@ -26,6 +29,12 @@ from cadalign.shapes.model import ShapeModel
 
 UP = slice(1, 3)
 PARTS = {"focal": slice(0, 1), "gravity": UP, "ground": slice(3, 4)}
+_WORDS = {"focal": "focal length", "gravity": "direction of gravity", "ground": "ground"}
+FIELDS = {"gravity": "up", "ground": "camera_height"}  # of a view, that say what is shared
+_GIVEN = {"focal": "the prior on the focal length"} | {
+    part: f"the `{name}` that is given" for part, name in FIELDS.items()
+}
+FALSE_ALARMS = 1e-4  # of objects that agree
 _LOWEST = 1e-6  # height of a camera above the ground
 _LEAST_INFORMATION = 1e-9  # below, nothing is said of an unknown
 _WIDEST_UP = 0.5  # standard deviation of a direction that is taken as a prior [rad]
@@ -74,6 +83,19 @@ class SceneMessage:
         factor = np.linalg.inv(np.eye(4) + self.information @ noise)
         return SceneMessage(factor @ self.information, factor @ self.weighted)
 
+    def disagreement(self, other: SceneMessage, part: slice) -> tuple[float, float]:
+        """Probability that two messages about a part differ by more than they do.
+
+        After it minus chi-squared, which orders those of which it is 0 in floats.
+        """
+        (mean, covariance), (other_mean, other_covariance) = self.moments, other.moments
+        block = covariance[part, part] + other_covariance[part, part]
+        if not np.isfinite(block).all():
+            return 1.0, 0.0
+        difference = mean[part] - other_mean[part]
+        square = float(difference @ np.linalg.pinv(block, hermitian=True) @ difference)
+        return chi_square_tail(square, len(difference)), -square
+
 
 NOTHING = SceneMessage(np.zeros((4, 4)), np.zeros(4))
 
@@ -99,8 +121,9 @@ class SharedUnknowns:
     def deviations(self, focal: float, up: FloatArray, height: float) -> FloatArray:
         """Deviations (4,) of values from these."""
         sine, cosine = self.across @ up, float(self.up @ up)
-        angle = math.atan2(float(np.linalg.norm(sine)), cosine)
-        turned = sine * (angle / max(float(np.linalg.norm(sine)), 1e-300))
+        length = float(np.linalg.norm(sine))
+        toward = sine / length if length else np.array([1.0, 0.0])  # the opposite is on every side
+        turned = math.atan2(length, cosine) * toward
         return np.array([math.log(focal / self.focal), *turned, math.log(height / self.height)])
 
     def moved(self, mean: FloatArray, covariance: FloatArray) -> SharedUnknowns:
@@ -121,6 +144,12 @@ class SharedUnknowns:
         variance = self.covariance[0, 0]
         return FocalPrior(self.focal, math.sqrt(variance), _OTHERS) if variance < np.inf else None
 
+    def without(self, part: str) -> SharedUnknowns:
+        """The values with nothing known of a part."""
+        covariance, rows = self.covariance.copy(), PARTS[part]
+        covariance[rows, rows] = np.diag(np.full(rows.stop - rows.start, np.inf))
+        return replace(self, covariance=covariance)
+
     def seen_by(self, view: View, wanted: Collection[str]) -> View:
         """A view with what is known of gravity and ground."""
         if "gravity" in wanted and self.std("gravity") < _WIDEST_UP:
@@ -137,6 +166,25 @@ class SharedUnknowns:
         if not np.isfinite(block).all():
             return math.inf
         return float(np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0)))
+
+
+def known_by(views: Sequence[View], focal: FocalPrior | None = None) -> SharedUnknowns:
+    """Knowledge of the user about the shared unknowns, by the first view that has it."""
+    covariance = np.diag(np.full(4, np.inf))
+    up, height = np.array([0.0, -1.0, 0.0]), 1.0
+    given = [view for view in views if view.up is not None]
+    if given:
+        up, sigma = cast(FloatArray, given[0].up), np.asarray(given[0].up_sigma_deg, dtype=float)
+        across = SharedUnknowns(1.0, up, 1.0, covariance).across
+        turned = np.radians(np.radians(sigma if sigma.ndim else sigma**2 * np.eye(3)))
+        covariance[UP, UP] = across @ turned @ across.T
+    heights = [view for view in views if view.camera_height is not None]
+    if heights:
+        height = cast(float, heights[0].camera_height)
+        covariance[3, 3] = cast(float, heights[0].camera_height_sigma) ** 2
+    if focal is not None:
+        covariance[0, 0] = focal.relative_sigma**2
+    return SharedUnknowns(1.0 if focal is None else focal.focal, up, height, covariance)
 
 
 def as_prior(
@@ -232,3 +280,51 @@ class Member:
         mean = reference.deviations(found.focal, found.up, found.height)
         own = SceneMessage(information, information @ mean) - as_prior(self.had, reference, told)
         return own.positive(told).tilted(tilt)
+
+
+def reference_of(members: Sequence[Member]) -> SharedUnknowns:
+    """Values of the object that is most certain of its rotation."""
+    best = min(members, key=lambda each: cast(Uncertainty, each.result.std).rotation_deg)
+    return best.values(SharedUnknowns(1.0, np.array([0.0, -1.0, 0.0]), 1.0, np.zeros((4, 4))))
+
+
+def agreeing(
+    given: list[Member], known: SharedUnknowns, tilt: float
+) -> tuple[list[Member], SharedUnknowns, list[str]]:
+    """The objects, and what of the known, that agree; other objects are named, the worst first."""
+    members, warnings = given, []
+    while len(members) > 1:
+        reference = reference_of(members)
+        said = [each.message(reference, tilt) for each in members]
+        said.append(as_prior(known, reference))  # may be what is wrong, as an object may
+        (tail, _), number, part = min(
+            (message.disagreement(but_for(said, number), PARTS[part]), number, part)
+            for number, message in enumerate(said)
+            for part in members[0].shared
+        )
+        if tail > FALSE_ALARMS / len(members):
+            break
+        if number == len(members):
+            return agreeing(given, known.without(part), tilt)
+        others = f", or {_GIVEN[part]}" if math.isfinite(known.std(part)) else ""
+        warnings.append(
+            f"{members[number].name} contradicts the {_WORDS[part]} of the other objects{others}, "
+            "and is aligned alone: check its model, its keypoints, and whether it stands in this "
+            "photo"
+        )
+        members = members[:number] + members[number + 1 :]
+    return members, known, warnings
+
+
+def left_out(known: SharedUnknowns, agreed: SharedUnknowns) -> list[str]:
+    """Warnings about what was known and contradicts the objects."""
+    return [
+        f"{_GIVEN[part]} contradicts the objects, and is left out: check it"
+        for part in PARTS
+        if math.isfinite(known.std(part)) and not math.isfinite(agreed.std(part))
+    ]
+
+
+def but_for(said: Sequence[SceneMessage], number: int) -> SceneMessage:
+    """What all say but one."""
+    return sum((each for k, each in enumerate(said) if k != number), NOTHING)

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.refusals import refusal_text
 
 from cadalign import (
     Camera,
     FocalPrior,
     Model,
+    RansacOptions,
     Result,
     SceneObject,
     Size,
@@ -23,8 +25,10 @@ from cadalign import (
 )
 from cadalign.cli import main
 from cadalign.errors import InputError
+from cadalign.estimation.result_parts import Stated
 from cadalign.evaluation.simulation.problems import UNIT_BOUNDS, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation
 
 FOCAL, HEIGHT = 700.0, 1.6
@@ -138,6 +142,98 @@ def test_object_that_contradicts_the_others_is_named_and_left_alone() -> None:
     assert named >= 8
 
 
+@pytest.mark.parametrize("degrees", [20.0, 180.0])
+def test_wrong_gravity_of_one_view_is_named_and_left_out(degrees: float) -> None:
+    simulated = Simulated(5, 3)
+    objects = simulated.objects(CAMERA)
+    axis = np.cross(simulated.up, [0.0, 0.0, 1.0])
+    turn = rotation_from_vector(np.radians(degrees) * axis / np.linalg.norm(axis))
+    objects[1] = replace(objects[1], view=replace(objects[1].view, up=turn @ simulated.up))
+    scene = align_scene(objects, share=("gravity",))
+    assert scene.warnings == (
+        "the `up` that is given contradicts the objects, and is left out: check it",
+    )
+    assert scene.up is not None
+    assert np.degrees(np.arccos(scene.up @ simulated.up)) < 3 * scene.up_std_deg < 4.0
+    for result, truth in zip(scene.results, simulated.poses, strict=True):
+        assert isinstance(result, Result)
+        assert rotation_error(est=result.alignment, gt=truth) < 4
+
+
+def test_object_that_lies_is_named_where_gravity_is_given() -> None:
+    simulated = Simulated(5, 2)
+    objects = simulated.objects(CAMERA)
+    lying = Model(points_3d=simulated.points[0][:, [0, 2, 1]] * [1, 1, -1], stretch_sigma=0.3)
+    objects[0] = replace(objects[0], model=lying, name="lying")
+    objects[1] = replace(objects[1], view=replace(objects[1].view, up=simulated.up))
+    (text,) = align_scene(objects, share=("gravity",)).warnings
+    assert text == (
+        "lying contradicts the direction of gravity of the other objects, or the `up` that is "
+        "given, and is aligned alone: check its model, its keypoints, and whether it stands in "
+        "this photo"
+    )
+
+
+def test_wrong_prior_on_the_focal_length_is_left_out() -> None:
+    scene = align_scene(Simulated(6, 3).objects(UNKNOWN), focal_prior=FocalPrior(2100.0, 0.02))
+    assert scene.warnings == (
+        "the prior on the focal length contradicts the objects, and is left out: check it",
+    )
+    assert abs(np.log(scene.camera.fx / FOCAL)) < 3 * scene.focal_std < 0.5
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "name"),
+    [
+        ({"camera_height": 1.0}, {"camera_height": 2.0}, "camera_height"),
+        ({"up": [0, -1, 0.2]}, {"up": [0, 1, -0.2]}, "up"),
+    ],
+)
+def test_views_that_contradict_each_other_are_refused(
+    first: dict[str, Any], second: dict[str, Any], name: str
+) -> None:
+    objects = [
+        replace(each, view=replace(each.view, **evidence))
+        for each, evidence in zip(Simulated(4, 2).objects(CAMERA), (first, second), strict=True)
+    ]
+    assert refusal_text(lambda: align_scene(objects, share=("ground",))) == (
+        f"objects[1].view.{name}: contradicts the {name} of an object before, which the photo "
+        "shares; give the one that is right"
+    )
+    assert not align_scene(objects, share=()).warnings
+
+
+def test_calibrated_focal_length_is_estimated_where_asked() -> None:
+    objects = Simulated(6, 3).objects(CAMERA.with_focal(2100.0))
+    scene = align_scene(objects, focal="estimate")
+    assert abs(np.log(scene.camera.fx / FOCAL)) < 3 * scene.focal_std < 0.5
+
+
+def test_hypotheses_are_aligned_where_nothing_is_shared() -> None:
+    ransac = RansacOptions(refine=False)
+    scene = align_scene(Simulated(5, 2).objects(CAMERA), ransac=ransac)
+    assert not scene.results.errors
+    assert refusal_text(lambda: align_scene(Simulated(5, 2).objects(UNKNOWN), ransac=ransac)) == (
+        "refine: a hypothesis has no covariance, by which objects share what is unknown; "
+        "leave it True, or share nothing"
+    )
+
+
+def test_object_without_covariance_is_aligned_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    objects = Simulated(5, 3).objects(UNKNOWN)
+
+    def bare(model: Model, view: View, **options: Any) -> Result:
+        result = align(model, view, **options)
+        if model is not objects[1].model:
+            return result
+        return replace(result, statistics=Stated(None))
+
+    monkeypatch.setattr("cadalign.estimation.scene.align", bare)
+    scene = align_scene(objects)
+    assert scene.warnings == ("objects[1] has no covariance to share by, and is aligned alone",)
+    assert 0 < scene.focal_std < 0.2
+
+
 def test_bad_object_stops_no_other() -> None:
     objects = Simulated(5, 3).objects(UNKNOWN)
     few = View(UNKNOWN, np.asarray(objects[1].view.points_2d)[:2])
@@ -162,6 +258,12 @@ def test_prior_on_the_focal_length_counts_once() -> None:
         ({"objects": []}, "objects: expected at least one object"),
         ({"objects": [1]}, "objects[0]: expected a cadalign.SceneObject, got int"),
         ({"tilt_sigma_deg": -1}, "tilt_sigma_deg: "),
+        ({"share": 5}, "share: 5 is not what objects share; give some of focal"),
+        ({"share": None}, "share: None is not what objects share"),
+        ({"share": ["focal", ["x"]]}, "share: ['focal', ['x']] is not what objects share"),
+        ({"loss": "foo"}, "loss: unknown loss 'foo'; known are linear, huber, cauchy"),
+        ({"focal": "guess"}, "focal: unknown focal 'guess'; known are known, estimate"),
+        ({"ransac": 3}, "ransac: expected a cadalign.RansacOptions, got int"),
     ],
 )
 def test_wrong_arguments_are_refused(changes: dict[str, Any], message: str) -> None:
@@ -169,6 +271,29 @@ def test_wrong_arguments_are_refused(changes: dict[str, Any], message: str) -> N
     with pytest.raises(InputError) as caught:
         align_scene(**arguments)
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model": 3}, "objects: no object can be aligned: model: expected a cadalign.Model or a "),
+        ({"size": 1.0}, "objects: no object can be aligned: size: expected a cadalign.Size, got "),
+        ({"init": 1}, "objects: no object can be aligned: init: expected a cadalign.Alignment, "),
+        ({"view": [1]}, "objects[0].view: expected a cadalign.View, got list; give the object's "),
+    ],
+)
+def test_wrong_fields_of_all_objects_are_refused(changes: dict[str, Any], message: str) -> None:
+    objects = [replace(each, **changes) for each in Simulated(0, 2).objects(UNKNOWN)]
+    with pytest.raises(InputError) as caught:
+        align_scene(objects)
+    assert str(caught.value).startswith(message)
+
+
+def test_prior_on_a_known_focal_length_is_refused_as_by_align() -> None:
+    objects = Simulated(0, 2).objects(CAMERA)
+    assert refusal_text(lambda: align_scene(objects, focal_prior=FocalPrior(FOCAL))) == (
+        'focal_prior: given for a known focal length; give focal="estimate" with it'
+    )
 
 
 def test_objects_of_two_photos_are_refused() -> None:

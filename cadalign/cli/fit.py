@@ -14,7 +14,7 @@ from cadalign.cli.common import (
     NOTHING_WORKED,
     answer,
     exit_code,
-    file_stem,
+    file_stems,
     make_folder,
     print_json,
     say,
@@ -29,7 +29,7 @@ from cadalign.cli.options import (
     flag_of,
     named_as_flags,
 )
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError, quote
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
@@ -225,7 +225,8 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
     with named_as_flags(command, command.fitting, command.ransac):
         seen = _observations(command, path, data)
         problems = [command.problem(each, name) for name, each in seen.items()]
-        options = problems[0][2]
+        given = {name: own for name, (_, _, own) in zip(seen, problems, strict=True)}
+        options = _common_options(command, given)
         objects = []
         for (name, each), (model, views, _) in zip(seen.items(), problems, strict=True):
             if len(views) != 1:
@@ -236,6 +237,7 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
             scene = align_scene(
                 objects,
                 share=data.get(_SHARE, ("focal",)),
+                focal=options.focal,
                 focal_prior=options.focal_prior,
                 loss=options.loss,
                 loss_scale=options.loss_scale,
@@ -272,6 +274,23 @@ def _observations(command: Fit, path: Path, data: dict[str, Any]) -> dict[str, O
     return found
 
 
+def _common_options(command: Fit, options: dict[str, FitOptions]) -> FitOptions:
+    """The options of the fit of all objects, given by their names; refuses others."""
+    first, common = next(iter(options.items()))
+    for name, own in options.items():
+        for option, value in own.of_views.items():
+            if value != getattr(common, option):
+                what = f"{quote(value)}, but {quote(getattr(common, option))} for {first}"
+                fix = "give objects of one photo the same options, beside `objects`"
+                raise InputError(what, where=f"{name}: fit.{option}", fix=fix)
+    if common.principal_sigma is not None:
+        what = "objects of one photo are aligned with a known principal point"
+        is_stored = command.fitting.principal_sigma is None
+        where = f"{first}: fit.principal_sigma" if is_stored else "principal_sigma"
+        raise InputError(what, where=where, fix="leave it out, or give a file for each object")
+    return common
+
+
 def _write_scene(
     command: Fit,
     folder: Path,
@@ -282,12 +301,13 @@ def _write_scene(
     """Write the files of the scene; returns the texts of its objects."""
     make_folder(folder)
     texts, entries = [], []
-    for each, seen, result in zip(objects, observations, scene.results, strict=True):
+    stems = file_stems(["scene.json", *(each.name for each in objects)], "object")[1:]
+    for each, seen, result, stem in zip(objects, observations, scene.results, stems, strict=True):
         if isinstance(result, CadalignError):
             texts.append(f"{each.name}: {result}")
             entries.append({"name": each.name, "error": str(result)})
             continue
-        own = folder / file_stem(each.name, "object")
+        own = folder / stem
         make_folder(own)
         seen.save(own / "observation.json")
         command.fitted(own / "observation.json", seen, result, (each.view,)).write(own)

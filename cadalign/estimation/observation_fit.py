@@ -227,13 +227,13 @@ class ObservationFit:
             return "the file's shape"
         if self.shape_sigma_of(observation) is not None:
             return "the file's shape_sigma"
-        if self.image:
-            return self.named("image")
+        if self.uses_photos(observation):
+            return self.named("image") if self.image else "the file's image"
         if observation.others:
             return "the file's views"
         if observation.depths is not None:
             return "the file's depth"
-        rest = "size" if observation.size else "init"
+        rest = "size" if observation.size else "init" if observation.init else "objects"
         return f"the file's {next(iter(observation.evidence.given), rest)}"
 
     def read(

@@ -388,6 +388,11 @@ def test_options_without_effect_are_refused(
     assert refusal_line(capsys, "fit", path, "--method", "aepnp") == (
         "--method: has no effect together with the file's up; leave out one of the two"
     )
+    path = write(tmp_path, observed())
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fit": {"image": True}}))
+    assert refusal_line(capsys, "fit", path, "--method", "aepnp") == (
+        "--method: has no effect together with the file's image; leave out one of the two"
+    )
 
 
 class TestPhotoAndMaskAlone:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.refusals import refusal_text
+from support.refusals import refusal_line, refusal_text
 
 from cadalign import (
     Camera,
@@ -357,3 +357,68 @@ def test_file_of_several_objects_names_what_is_wrong(
     path.write_text(json.dumps(data | {"share": ["colour"]}))
     assert main(["fit", str(path)]) == 1
     assert "share: ['colour'] is not what objects share" in capsys.readouterr().err
+
+
+def test_every_object_has_a_folder_of_its_own(tmp_path: Path) -> None:
+    path = write_scene(tmp_path, names=("a/b", "A_b"))
+    assert main(["fit", str(path)]) == 0
+    written = json.loads((tmp_path / "scene_fit" / "scene.json").read_text())
+    folders = {each["name"]: each["folder"] for each in written["objects"]}
+    assert folders == {"a/b": "a_b", "A_b": "A_b_2"}
+    for name, folder in folders.items():
+        seen = Observation.load(tmp_path / "scene_fit" / folder / "observation.json")
+        assert seen.object_name == name
+
+
+def test_no_object_is_written_outside_of_the_folder(tmp_path: Path) -> None:
+    path = write_scene(tmp_path, names=("..", "scene.json"))
+    assert main(["fit", str(path)]) == 0
+    written = json.loads((tmp_path / "scene_fit" / "scene.json").read_text())
+    assert [each["folder"] for each in written["objects"]] == ["object", "scene.json_2"]
+    assert not (tmp_path / "fit.json").exists()
+
+
+def test_options_that_hold_for_no_scene_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_scene(tmp_path)
+    assert refusal_line(capsys, "fit", path, "--method", "epnp") == (
+        "--method: has no effect together with the file's objects; leave out one of the two"
+    )
+    principal = "objects of one photo are aligned with a known principal point"
+    fix = "leave it out, or give a file for each object"
+    assert refusal_line(capsys, "fit", path, "--principal-sigma", 40) == (
+        f"--principal-sigma: {principal}; {fix}"
+    )
+    data = json.loads(path.read_text())
+    path.write_text(json.dumps(data | {"fit": {"principal_sigma": 40}}))
+    assert refusal_line(capsys, "fit", path) == f"left: fit.principal_sigma: {principal}; {fix}"
+    path.write_text(json.dumps(data | {"share": 5}))
+    assert refusal_line(capsys, "fit", path) == (
+        "share: 5 is not what objects share; give some of focal, gravity, ground"
+    )
+
+
+def test_options_of_one_object_alone_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_scene(tmp_path)
+    data = json.loads(path.read_text())
+    data["objects"][1]["fit"] = {"loss": "cauchy"}
+    path.write_text(json.dumps(data))
+    assert refusal_line(capsys, "fit", path) == (
+        "right: fit.loss: 'cauchy', but 'linear' for left; "
+        "give objects of one photo the same options, beside `objects`"
+    )
+    del data["objects"][1]["fit"]
+    path.write_text(json.dumps(data | {"fit": {"loss": "cauchy"}}))
+    assert main(["fit", str(path)]) == 0
+
+
+def test_calibrated_focal_length_of_a_file_is_estimated_where_asked(tmp_path: Path) -> None:
+    path = write_scene(tmp_path)
+    camera = CAMERA.with_focal(3 * FOCAL).to_dict()
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"camera": camera}))
+    assert main(["fit", str(path), "--focal", "estimate"]) == 0
+    written = json.loads((tmp_path / "scene_fit" / "scene.json").read_text())
+    assert abs(np.log(written["camera"]["params"][0] / FOCAL)) < 3 * written["focal_std"] < 0.6

@@ -223,6 +223,9 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
     from cadalign.estimation.scene_messages import SceneObject
 
     with named_as_flags(command, command.fitting, command.ransac):
+        if command.overlay is not None:
+            fix = "give it with an object's observation.json, which is written without it"
+            raise InputError("draws one object, the file has several", where="overlay", fix=fix)
         seen = _observations(command, path, data)
         problems = [command.problem(each, name) for name, each in seen.items()]
         given = {name: own for name, (_, _, own) in zip(seen, problems, strict=True)}

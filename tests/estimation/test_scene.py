@@ -385,6 +385,10 @@ def test_options_that_hold_for_no_scene_are_refused(
     assert refusal_line(capsys, "fit", path, "--method", "epnp") == (
         "--method: has no effect together with the file's objects; leave out one of the two"
     )
+    assert refusal_line(capsys, "fit", path, "--overlay", tmp_path / "drawn.png") == (
+        "--overlay: draws one object, the file has several; "
+        "give it with an object's observation.json, which is written without it"
+    )
     principal = "objects of one photo are aligned with a known principal point"
     fix = "leave it out, or give a file for each object"
     assert refusal_line(capsys, "fit", path, "--principal-sigma", 40) == (

@@ -52,13 +52,7 @@ class KeypointBatch:
         present: BoolArray,
         cameras: tuple[Camera, ...],
     ) -> KeypointBatch:
-        """The batch of checked arrays.
-
-        Raises InputError for wide lenses.
-        """
-        if any(each.is_wide for each in cameras):
-            what = "wide lenses have no gradients"
-            raise InputError(what, where="camera", fix="undistort keypoints and camera first")
+        """The batch of checked arrays, seen by cameras that `check_cameras` takes."""
         present = present & np.isfinite(pixels).all(axis=2) & np.isfinite(sigmas) & (sigmas > 0)
         pixels = np.where(present[..., None], pixels, 0.0)
         sigmas = np.where(present, sigmas, 1.0)
@@ -88,14 +82,37 @@ class KeypointBatch:
         return np.ascontiguousarray(np.array(rows).transpose(2, 3, 0, 1))
 
 
+def check_cameras(cameras: Sequence[Camera], *, focal: str = "known") -> None:
+    """Refuse cameras that the derivatives don't know."""
+    if any(each.is_wide for each in cameras):
+        what = "wide lenses have no gradients"
+        raise InputError(what, where="camera", fix="undistort keypoints and camera first")
+    if focal == "known":
+        for each in cameras:
+            each.require_focal()
+        return
+    if len({(each.width, each.height) for each in cameras}) > 1:
+        what = "with an unknown focal length all images must have one size"
+        raise InputError(what, where="camera", fix="call fit for each size")
+    if any(each.distortion for each in cameras):
+        what = "an unknown focal length and lens distortion have no gradients together"
+        raise InputError(what, where="focal", fix="undistort keypoints and camera first")
+
+
 @dataclass(frozen=True, eq=False)
 class FitTask:
-    """Input of a batch's fits beside arrays: one camera, or one for each problem."""
+    """Input of a batch's fits beside arrays: one camera, or one for each problem.
+
+    Raises InputError for cameras that the derivatives don't know.
+    """
 
     cameras: tuple[Camera, ...]
     options: FitOptions
     exact: bool
     workers: int
+
+    def __post_init__(self) -> None:
+        check_cameras(self.cameras, focal=self.options.focal)
 
 
 class BatchMinima(NamedTuple):
@@ -185,17 +202,10 @@ def fits_of(
 ) -> BatchFits:
     """The fits of a batch, from ``minima`` where these are known.
 
-    Points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n). Raises InputError for cameras that
-    the derivatives don't know.
+    Points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n).
     """
     options = task.options
     if options.focal == "estimate":
-        if len({(each.width, each.height) for each in task.cameras}) > 1:
-            what = "with an unknown focal length all images must have one size"
-            raise InputError(what, where="camera", fix="call fit for each size")
-        if any(each.distortion for each in task.cameras):
-            what = "an unknown focal length and lens distortion have no gradients together"
-            raise InputError(what, where="focal", fix="undistort keypoints and camera first")
         options = options.for_camera(task.cameras[0])
 
     @np.errstate(all="ignore")  # holds for one thread only

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.layers import BatchMinima, FitTask, FitValues, fits_of
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
+from cadalign.names import renamed
 from cadalign.torch.poses import cameras_of
 
 if TYPE_CHECKING:
@@ -46,6 +48,7 @@ class FitArrays(NamedTuple):
     valid: Array
 
 
+@renamed(scale_prior_sigma="stretch_sigma")
 def fit(
     points_3d: ArrayLike,
     points_2d: ArrayLike,
@@ -53,9 +56,15 @@ def fit(
     *,
     sigma: ArrayLike = 1.0,
     mask: ArrayLike | None = None,
+    loss: str = FitOptions.loss,
+    loss_scale: float = FitOptions.loss_scale,
+    stretch: str | None = FitOptions.stretch,
+    stretch_sigma: float | None = FitOptions.stretch_sigma,
+    known_axis: str = FitOptions.known_axis,
+    focal: str = FitOptions.focal,
+    focal_prior: PriorOption = FitOptions.focal_prior,
     exact: bool = True,
     workers: int = -1,
-    **options: Any,
 ) -> FitArrays:
     """Fit a batch of models to their keypoints, as `cadalign.fit` does, with gradients.
 
@@ -66,9 +75,8 @@ def fit(
     ----------
     points_3d, points_2d, camera, sigma, mask, exact, workers
         As for `cadalign.torch.fit`, arrays in the place of tensors.
-    **options
-        As for `cadalign.fit`: ``loss``, ``loss_scale``, ``stretch``, ``stretch_sigma``,
-        ``known_axis``, ``focal`` and ``focal_prior``.
+    loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
+        As for `cadalign.torch.fit`.
 
     Returns
     -------
@@ -77,7 +85,8 @@ def fit(
     Raises
     ------
     InputError
-        If a shape or an option is wrong, or a lens is a wide one.
+        If a type, a shape or an option is wrong, a focal length is unknown, or a lens is a wide
+        one.
     CadalignError
         If JAX is not installed.
 
@@ -94,10 +103,22 @@ def fit(
     (1, 8, 2)
     """
     jnp = _jax().numpy
-    pixels = jnp.asarray(points_2d)
+    pixels = _array(points_2d, "points_2d")
+    if not jnp.issubdtype(pixels.dtype, jnp.floating):  # the estimates are of its type
+        what = f"expected floating point numbers, got {pixels.dtype}"
+        raise InputError(what, where="points_2d", fix="give points_2d.astype(float)")
     if pixels.ndim != 3 or pixels.shape[2] != 2:
         raise InputError(f"shape {pixels.shape}, expected (B, n, 2)", where="points_2d")
-    task = FitTask(cameras_of(camera, len(pixels)), FitOptions(**options), exact, workers)
+    options = FitOptions(
+        loss=loss,
+        loss_scale=loss_scale,
+        stretch=stretch,
+        stretch_sigma=stretch_sigma,
+        known_axis=known_axis,
+        focal=focal,
+        focal_prior=focal_prior,
+    )
+    task = FitTask(cameras_of(camera, len(pixels)), options, exact, workers)
     present = True if mask is None else mask
     given = [
         _expanded(points_3d, (*pixels.shape[:2], 3), "points_3d").astype(pixels.dtype),
@@ -117,11 +138,18 @@ def _jax() -> Any:
     return jax
 
 
-def _expanded(values: ArrayLike, shape: tuple[int, ...], where: str) -> Any:
-    jnp = _jax().numpy
-    array = jnp.asarray(values)
+def _array(values: ArrayLike, where: str) -> Any:
     try:
-        return jnp.broadcast_to(array, shape)
+        return _jax().numpy.asarray(values)
+    except (TypeError, ValueError) as error:
+        what = f"not an array of numbers ({str(error)[:200]})"
+        raise InputError(what, where=where, fix="give an array of JAX or NumPy") from None
+
+
+def _expanded(values: ArrayLike, shape: tuple[int, ...], where: str) -> Any:
+    array = _array(values, where)
+    try:
+        return _jax().numpy.broadcast_to(array, shape)
     except ValueError:
         what = f"shape {array.shape}, expected one that broadcasts to {shape}"
         raise InputError(what, where=where) from None

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import InputError
+from cadalign.errors import InputError, require_kind
 from cadalign.estimation.focal import PriorOption
-from cadalign.estimation.layers import FitTask, KeypointBatch, fits_of
+from cadalign.estimation.layers import FitTask, KeypointBatch, check_cameras, fits_of
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import in_threads, whitening_by
@@ -84,7 +84,8 @@ def fit(
     Raises
     ------
     InputError
-        If a shape or an option is wrong, or a lens is a wide one.
+        If a type, a shape or an option is wrong, a focal length is unknown, or a lens is a wide
+        one.
 
     Examples
     --------
@@ -204,7 +205,8 @@ def align(
     Raises
     ------
     InputError
-        If a shape or an option is wrong, a keypoint is unknown, or a lens is a wide one.
+        If a type, a shape or an option is wrong, a keypoint or a focal length is unknown, or a
+        lens is a wide one.
 
     Examples
     --------
@@ -217,8 +219,11 @@ def align(
     >>> round(float(found.points_3d[0, 1, 0] - found.points_3d[0, 0, 0]), 2)
     2.4
     """
+    fix = "points of a Model go to cadalign.torch.fit"
+    require_kind(model, ShapeModel, "model", fix=fix)
     options = FitOptions(loss=loss, loss_scale=loss_scale)
     sigmas, present, cameras = checked(points_2d, camera, sigma, mask)
+    check_cameras(cameras)
     names = tuple(model.ids if ids is None else ids)
     if len(names) != points_2d.shape[1]:
         what = f"{len(names)} ids for {points_2d.shape[1]} keypoints"

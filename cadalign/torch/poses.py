@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, InputError
+from cadalign.arrays import FloatArray, is_number
+from cadalign.errors import CadalignError, InputError, require_kind
 from cadalign.geometry.camera import Camera
 
 if TYPE_CHECKING:
@@ -91,9 +91,10 @@ class PoseBatch:
         Raises
         ------
         InputError
-            If a camera has distortion.
+            If a camera has distortion, or no focal length where the poses have none.
         """
-        calibration = calibrations(camera, len(self.scale)).to(self.scale)
+        calibration = calibrations(camera, len(self.scale), own_focals=self.focal is not None)
+        calibration = calibration.to(self.scale)
         ratio = None if self.focal is None else (self.focal / calibration[:, 0])[:, None, None]
         return self.project_by(calibration[:, None], points_3d, ratio)
 
@@ -108,12 +109,17 @@ class PoseBatch:
         return (plane if ratio is None else plane * ratio) + calibration[..., 2:]
 
 
-def calibrations(camera: Camera | Sequence[Camera], count: int) -> Tensor:
+def calibrations(
+    camera: Camera | Sequence[Camera], count: int, *, own_focals: bool = False
+) -> Tensor:
     """Focal lengths and principal points of ``count`` cameras, (B, 4) or (1, 4) tensor.
 
-    Raises InputError if one has distortion.
+    With ``own_focals`` those of poses take the place of the cameras'. Raises InputError if a camera
+    has distortion, or no focal length that is needed.
     """
     cameras = cameras_of(camera, count)
+    for each in () if own_focals else cameras:
+        each.require_focal()
     if any(each.distortion or each.is_wide for each in cameras):
         what = "projections in PyTorch know no lens distortion"
         raise InputError(what, where="camera", fix="undistort keypoints and camera first")
@@ -126,7 +132,9 @@ def cameras_of(camera: Camera | Sequence[Camera], count: int) -> tuple[Camera, .
 
     Raises InputError if it is neither one nor as many.
     """
-    cameras = (camera,) if isinstance(camera, Camera) else tuple(camera)
+    cameras = tuple(camera) if isinstance(camera, Iterable) else (camera,)
+    for each in cameras:
+        require_kind(each, Camera, "camera")
     if len(cameras) not in (1, count):
         what = f"{len(cameras)} cameras for {count} problems"
         raise InputError(what, where="camera", fix="give one, or one for each problem")
@@ -141,24 +149,39 @@ def checked(
 ) -> tuple[Tensor, Tensor, tuple[Camera, ...]]:
     """Sigmas (B, n), the mask (B, n) on the processor, and the cameras of keypoints (B, n, 2).
 
-    Raises InputError if a shape is wrong.
+    Raises InputError if a type or a shape is wrong.
     """
+    require_tensor(points_2d, "points_2d")
+    if not points_2d.is_floating_point():  # the estimates are of its type
+        what = f"expected floating point numbers, got {points_2d.dtype}"
+        raise InputError(what, where="points_2d", fix="give points_2d.double()")
     if points_2d.ndim != 3 or points_2d.shape[2] != 2:
         what = f"shape {tuple(points_2d.shape)}, expected (B, n, 2)"
         raise InputError(what, where="points_2d")
     shape = tuple(points_2d.shape[:2])
-    if not isinstance(sigma, torch.Tensor):
-        sigma = points_2d.new_full((), sigma)
-    mask = torch.tensor(True) if mask is None else mask.detach().to("cpu", torch.bool)
-    cameras = cameras_of(camera, len(points_2d))
-    return expanded(sigma, shape, "sigma"), expanded(mask, shape, "mask"), cameras
+    if is_number(sigma):
+        sigma = points_2d.new_full((), float(sigma))
+    require_tensor(sigma, "sigma", fix="give a number or a tensor, standard deviations in pixels")
+    mask = torch.tensor(True) if mask is None else mask
+    present = expanded(mask, shape, "mask").detach().to("cpu", torch.bool)
+    return expanded(sigma, shape, "sigma"), present, cameras_of(camera, len(points_2d))
+
+
+def require_tensor(
+    value: object, where: str, *, fix: str = "torch.as_tensor makes one of an array"
+) -> None:
+    """Refuse what is no tensor."""
+    if not isinstance(value, torch.Tensor):
+        what = f"expected a tensor, got {type(value).__name__}"
+        raise InputError(what, where=where, fix=fix)
 
 
 def expanded(tensor: Tensor, shape: tuple[int, ...], where: str) -> Tensor:
     """The tensor expanded to a shape.
 
-    Raises InputError if that is not possible.
+    Raises InputError if that is not possible, or it is no tensor.
     """
+    require_tensor(tensor, where)
     try:
         return tensor.expand(shape)
     except RuntimeError:

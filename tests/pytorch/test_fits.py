@@ -20,6 +20,7 @@ from cadalign.torch import PoseBatch, align, fit  # noqa: E402
 
 pytestmark = pytest.mark.slow
 COUNT, POINTS = 40, 10
+UNKNOWN = Camera.without_focal(640, 480)
 
 
 def tensors(count: int = COUNT, **options: Any) -> tuple[Any, Any, Camera]:
@@ -223,6 +224,49 @@ def test_align_marks_what_has_too_few_keypoints() -> None:
         (
             lambda p, x, c: fit(p, x, [c, c]),
             "camera: 2 cameras for 3 problems; give one, or one for each problem",
+        ),
+        (
+            lambda p, x, c: fit(p, x.round().long(), c),
+            "points_2d: expected floating point numbers, got torch.int64; give points_2d.double()",
+        ),
+        (
+            lambda p, x, c: fit(p, x.numpy(), c),
+            "points_2d: expected a tensor, got ndarray; torch.as_tensor makes one of an array",
+        ),
+        (
+            lambda p, x, c: fit(p.numpy(), x, c),
+            "points_3d: expected a tensor, got ndarray; torch.as_tensor makes one of an array",
+        ),
+        (
+            lambda p, x, c: fit(p, x, c, mask=[True] * POINTS),
+            "mask: expected a tensor, got list; torch.as_tensor makes one of an array",
+        ),
+        (
+            lambda p, x, c: fit(p, x, c, sigma=None),
+            "sigma: expected a tensor, got NoneType; give a number or a tensor, standard "
+            "deviations in pixels",
+        ),
+        (
+            lambda p, x, c: fit(p, x, None),
+            "camera: expected a cadalign.Camera, got NoneType",
+        ),
+        (
+            lambda p, x, c: fit(p, x, Camera(640, 480, 500, 500, 319.5, 239.5, lens="fisheye")),
+            "camera: wide lenses have no gradients; undistort keypoints and camera first",
+        ),
+        (
+            lambda p, x, c: align(cadalign.Model(points_3d=p[0]), x, c),
+            "model: expected a cadalign.ShapeModel, got Model; points of a Model go to "
+            "cadalign.torch.fit",
+        ),
+        (
+            lambda p, x, c: align(shapes()[0], shapes()[1].long(), c),
+            "points_2d: expected floating point numbers, got torch.int64; give points_2d.double()",
+        ),
+        (
+            lambda p, x, c: align(*shapes()[:2], UNKNOWN),
+            'camera: the focal length is unknown; estimate it with focal="estimate", or give it: '
+            "camera.with_focal(...)",
         ),
         (
             lambda p, x, c: PoseBatch(*fit(p, x, c).__dict__.values()).project(p, LENS),

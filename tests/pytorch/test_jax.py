@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -122,12 +123,28 @@ def test_single_precision_vmap_masks_and_failures(doubles: Any) -> None:
         ({"mask": np.ones(3)}, "mask: shape (3,), expected one that broadcasts to (6, 10)"),
         ({"cameras": 2}, "camera: 2 cameras for 6 problems; give one, or one for each problem"),
         ({"loss": "l1"}, "loss: "),
+        (
+            {"points_2d": np.zeros((6, 10, 2), dtype=int)},
+            "points_2d: expected floating point numbers, got int64; give points_2d.astype(float)",
+        ),
+        ({"points_3d": "chair"}, "points_3d: not an array of numbers ("),
+        ({"sigma": None}, "sigma: not an array of numbers ("),
+        ({"camera": Camera.without_focal(640, 480)}, "camera: the focal length is unknown; "),
     ],
 )
 def test_refusals(doubles: Any, change: dict[str, Any], message: str) -> None:
     points, pixels, camera = arrays()
     given: dict[str, Any] = {"points_3d": points, "points_2d": pixels} | change
-    cameras = [camera] * given.pop("cameras", 1)
+    given["camera"] = given.get("camera", [camera] * given.pop("cameras", 1))
     with pytest.raises(InputError) as refused:
-        cadalign.jax.fit(camera=cameras, **given)
+        cadalign.jax.fit(**given)
     assert str(refused.value).startswith(message)
+
+
+@pytest.mark.parametrize("option", [{"method": "epnp"}, {"principal_sigma": 40.0}])
+def test_options_without_gradients_are_none_of_its_own(option: dict[str, Any]) -> None:
+    """Those of PyTorch's layer are the same."""
+    with pytest.raises(TypeError, match="unexpected keyword argument"):
+        cadalign.jax.fit(*arrays(), **option)
+    options, of_torch = (signature(each.fit).parameters for each in (cadalign.jax, cadalign.torch))
+    assert list(options) == list(of_torch)

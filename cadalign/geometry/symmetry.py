@@ -96,7 +96,13 @@ class Symmetry:
         """Rotations about one axis: ``fold`` of them, by equal angles, or any where it is None.
 
         ``direction`` and ``offset`` are those of `SymmetryAxis`.
+
+        Raises
+        ------
+        InputError
+            If ``fold`` is no positive whole number, or the axis is none.
         """
+        _check_fold(fold, "fold")
         axis = SymmetryAxis(np.asarray(direction), np.asarray(offset))
         if fold is None:
             return cls(np.empty((0, 4, 4)), (axis,))
@@ -136,11 +142,9 @@ class Symmetry:
             raise InputError(what, where="symmetry", fix=_FORMS)
         names = set(data)
         if names <= {"axis", "fold", "offset"} and {"axis", "fold"} <= names:
-            fold = data["fold"]
-            if not (fold is None or (is_whole(fold) and fold > 0)):
-                what, fix = f"{quote(str(fold))} is no number of rotations", "give 1, 2, 3 ..."
-                raise InputError(what, where="symmetry.fold", fix=f"{fix}, or null for any angle")
-            return cls.around(_vector(data, "axis"), fold=fold, offset=_vector(data, "offset"))
+            _check_fold(data["fold"], "symmetry.fold")
+            axis, offset = _vector(data, "axis"), _vector(data, "offset")
+            return cls.around(axis, fold=data["fold"], offset=offset)
         if not names or not names <= {_DISCRETE, _CONTINUOUS}:
             what = f"the fields {', '.join(sorted(map(str, names)))} are no symmetry's"
             raise InputError(what, where="symmetry", fix=_FORMS)
@@ -202,6 +206,14 @@ def symmetric_rotation_error(*, est: Alignment, gt: Alignment, symmetry: Symmetr
         angle = np.arctan2(np.trace(between @ cross), -np.trace(between @ cross @ cross))
         candidates.append(gt.rotation @ axis.turned(float(angle))[:3, :3] @ motion)
     return min(angle_between(est.rotation, each) for each in candidates)
+
+
+def _check_fold(fold: Any, where: str) -> None:
+    """Refuse what is no number of rotations, without which there would be no symmetry."""
+    if fold is not None and not (is_whole(fold) and fold > 0):
+        what = f"{quote(str(fold))} is no number of rotations"
+        fix = "give 1, 2, 3 ..., or None (null in a file) for any angle"
+        raise InputError(what, where=where, fix=fix)
 
 
 def _vector(data: Any, name: str) -> FloatArray:

@@ -30,6 +30,12 @@ def test_rotations_by_equal_angles_are_a_group(fold):
             assert gaps.min() < 1e-12
 
 
+@pytest.mark.parametrize("fold", [0, -3, True, 2.5, "2"])
+def test_what_is_no_number_of_rotations_is_refused(fold):
+    with pytest.raises(InputError, match=rf"^fold: '{fold}' is no number of rotations; give"):
+        Symmetry.around((0, 1, 0), fold=fold)
+
+
 def test_axes_are_taken_in_steps_with_every_discrete_motion():
     """ceil(pi / 0.1) = 32 steps, each after the identity and after the flip."""
     symmetry = Symmetry(FLIP[None], (SymmetryAxis(np.array([0, 1.0, 0]), np.zeros(3)),))

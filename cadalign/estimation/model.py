@@ -128,10 +128,13 @@ def check_axis(axis: object) -> None:
 def checked_ids(ids: Iterable[Any] | None, count: int) -> tuple[Hashable, ...]:
     """Ids of ``count`` keypoints, each once; their numbers where none are given.
 
-    Raises InputError if there are more or fewer, or one occurs twice.
+    Raises InputError if there are more or fewer, one occurs twice, or they are no sequence.
     """
     if ids is None:
         return tuple(range(count))
+    if isinstance(ids, str | bytes) or not isinstance(ids, Iterable):
+        what = f"expected a sequence of numbers or names, got {type(ids).__name__}"
+        raise InputError(what, where="ids", fix="give the id of each keypoint")
     listed = tuple(ids.tolist() if isinstance(ids, np.ndarray) else ids)
     if len(listed) != count:
         raise InputError(f"{len(listed)} ids for {count} keypoints", where="ids")

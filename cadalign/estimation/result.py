@@ -42,7 +42,7 @@ class Result(ResultData):
         Raises
         ------
         InputError
-            If the result was read from a file, which does not hold the evidence.
+            If the result was read from a file, which does not hold the evidence, or has a motion.
 
         Examples
         --------
@@ -58,6 +58,10 @@ class Result(ResultData):
         if self.statistics.basis is None:
             if self.method != "align":
                 return ()
+            if self.trajectory is not None:
+                what = "an estimate with a motion has none"
+                fix = "align its frames without `motion`"
+                raise InputError(what, where="contributions", fix=fix)
             what = "the result holds no evidence: it was read from a file"
             raise InputError(what, where="contributions", fix="align again")
         from cadalign.estimation.uncertainty.evidence import contributions_of
@@ -264,7 +268,7 @@ class Result(ResultData):
         """
         try:
             data = json.loads(text)
-        except (ValueError, RecursionError) as error:
+        except (TypeError, ValueError, RecursionError) as error:
             what = f"not valid JSON: {str(error)[:200]}"
             raise InputError(what, where="result") from None
         return cls.from_dict(data)

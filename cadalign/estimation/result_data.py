@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import InputError
+from cadalign.arrays import BoolArray, FloatArray, is_number
+from cadalign.errors import InputError, quote
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
@@ -304,10 +304,10 @@ class ResultData:
         """
         from cadalign.shapes.parts import radius_of
 
-        if not 0 < probability < 1:
-            raise InputError(f"{probability!r} is not between 0 and 1", where="probability")
-        if dimension < 1:
-            raise InputError(f"{dimension!r} is not a positive number", where="dimension")
+        if not is_number(probability) or not 0 < probability < 1:
+            raise InputError(f"{quote(probability)} is not between 0 and 1", where="probability")
+        if not is_number(dimension) or dimension < 1:
+            raise InputError(f"{quote(dimension)} is not a positive number", where="dimension")
         return radius_of(probability, dimension, self.degrees_of_freedom)
 
     def mesh(self, mesh: Mesh | str | os.PathLike[str] | None = None) -> Mesh:

@@ -30,6 +30,7 @@ POINTS, TRUTH = keypoints(), truth_of((1.0, 0.7, 1.9))
 MODEL = Model(points_3d=POINTS)
 VIEW = View(CAMERA, CAMERA.project(TRUTH.apply(POINTS)))
 BOX = Mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), [[0, 2, 1], [0, 1, 3]])
+EACH_ID = "give the id of each keypoint"
 VIEWS_FIRST = "give the model first, then the views"
 GIVEN: list[tuple[Callable[..., Any], str]] = [
     (
@@ -56,6 +57,30 @@ GIVEN: list[tuple[Callable[..., Any], str]] = [
     (
         lambda: align(Model(mesh=BOX), VIEW),
         "views[0].ids: the model has no keypoint 0, 1, 2, 3, 4; give the model points_3d=",
+    ),
+    (
+        lambda: Model(points_3d=POINTS, ids=5),  # type: ignore[arg-type]
+        f"ids: expected a sequence of numbers or names, got int; {EACH_ID}",
+    ),
+    (
+        lambda: View(CAMERA, [[9, 20], [300, 4]], ids="ab"),
+        f"ids: expected a sequence of numbers or names, got str; {EACH_ID}",
+    ),
+    (
+        lambda: align(MODEL, VIEW).radius("a"),  # type: ignore[arg-type]
+        "probability: 'a' is not between 0 and 1",
+    ),
+    (
+        lambda: align(MODEL, VIEW).radius(0.9, dimension="a"),  # type: ignore[arg-type]
+        "dimension: 'a' is not a positive number",
+    ),
+    (
+        lambda: align(MODEL, VIEW).sensitivity(view="a"),  # type: ignore[arg-type]
+        "view: 'a' is none of the result's 1 views; give 0 to 0",
+    ),
+    (
+        lambda: Result.from_json(None),  # type: ignore[arg-type]
+        "result: not valid JSON: the JSON object must be str, bytes or bytearray, not NoneType",
     ),
     (
         lambda: Tracker(MODEL).update(VIEW.points_2d),  # type: ignore[arg-type]

@@ -244,6 +244,12 @@ def test_what_is_no_motion_is_refused(change: dict[str, object], message: str) -
         align(CATEGORY, track_of(0, frames=3).views, **change)  # type: ignore[arg-type]
 
 
+def test_contributions_are_refused_as_what_a_motion_does_not_have() -> None:
+    result = align(CATEGORY, track_of(0, frames=3).views, motion="smooth")
+    with pytest.raises(InputError, match="contributions: an estimate with a motion has none"):
+        result.contributions()
+
+
 def test_times_that_do_not_tell_the_frames_are_refused() -> None:
     views = track_of(0, frames=3).views
     with pytest.raises(InputError, match=r"views\[1\].time: only some views have a time"):

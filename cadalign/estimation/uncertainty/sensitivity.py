@@ -11,8 +11,8 @@ from typing import cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import InputError
+from cadalign.arrays import FloatArray, IntArray, is_whole
+from cadalign.errors import InputError, quote
 from cadalign.estimation.estimates import mean_state, placed_box, poses_of
 from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.focal import log_focal_range
@@ -110,8 +110,8 @@ class Sensitivity:
 
 def sensitivity_of(result: ResultData, *, exact: bool, view: int) -> Sensitivity:
     """The sensitivity of a result; see `cadalign.Result.sensitivity`."""
-    if not 0 <= view < len(result.views):
-        what = f"{view} is none of the result's {len(result.views)} views"
+    if not is_whole(view) or not 0 <= view < len(result.views):
+        what = f"{quote(view)} is none of the result's {len(result.views)} views"
         raise InputError(what, where="view", fix=f"give 0 to {len(result.views) - 1}")
     statistics = result.statistics
     if isinstance(statistics, KeypointStatistics) and not result.camera.is_wide:

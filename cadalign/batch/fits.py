@@ -10,16 +10,18 @@ from contextlib import ExitStack
 from dataclasses import fields, replace
 from itertools import chain, count, islice, starmap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import msgspec
 import pyarrow.compute as pc
 
+from cadalign.arrays import is_number
 from cadalign.batch.experiment import ManyEstimates, plan_run
 from cadalign.batch.options import FitRunOptions, ManyOptions
 from cadalign.batch.sources import ObservationTask
 from cadalign.batch.table import write_csv
 from cadalign.errors import CadalignError, DataError, InputError, require_kind
+from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result import Result
@@ -29,6 +31,8 @@ from cadalign.evaluation.runs.parallel import Chunk, Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
 from cadalign.evaluation.runs.work import OK
+from cadalign.io.documents import convert
+from cadalign.io.evidence import Size
 from cadalign.io.files import as_path, write_whole
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 
@@ -82,7 +86,10 @@ def fit_many(
         Fields of `cadalign.estimation.observation_fit.ObservationFit`, such as ``similar``,
         ``robust``, ``shape``; of `FitOptions`, such as ``method``, ``loss``, ``stretch``; of
         `cadalign.batch.DetectorOptions`, such as ``model``, ``images``; and ``camera``, the file of
-        a camera for all. What an observation stores holds where an option is at its default.
+        a camera for all. A number as ``focal`` is the focal length [px] of all images. What an
+        observation stores holds where an option is at its default or None: unlike those of
+        `cadalign.fit`, ``sigma=None`` and ``focal_prior=None`` mean the observation's, or the
+        default; ``similar=True`` estimates sigma, ``focal_prior="none"`` takes no prior.
 
     Returns
     -------
@@ -116,7 +123,7 @@ def fit_many(
             out = stack.enter_context(tempfile.TemporaryDirectory(prefix="cadalign-"))
         folder = RunFolder(as_path(out, "out"))
         chosen = replace(options_of(options), inputs=_inputs(observations, folder))
-        chosen = replace(chosen, pictures=pictures)
+        chosen = replace(chosen, pictures=_as_declared(pictures, ManyOptions, "pictures"))
         run_many(chosen, folder, workers=workers, dask=dask, on_progress=on_progress)
         return Results.open(folder.path, in_memory=not is_kept)
 
@@ -189,13 +196,18 @@ def options_of(given: dict[str, Any]) -> FitRunOptions:
     names = [(field.name, kind) for kind in kinds for field in fields(kind)]
     owners = {name: kind for name, kind in reversed(names) if name != "fitting"}
     parts: dict[Any, dict[str, Any]] = {kind: {} for kind in kinds}
+    prior = given.get("focal_prior")
+    if isinstance(prior, FocalPrior):
+        given = {"focal_prior_sigma": prior.relative_sigma} | given | {"focal_prior": prior.focal}
     for name, value in given.items():
         if name not in owners:
             listed = ", ".join(dict.fromkeys(each for each, _ in names if each != "fitting"))
             raise InputError("not a known option", where=name, fix=f"known are {listed}")
-        is_path = name in ("shape", "model", "images", "camera") and value is not None
-        parts[owners[name]][name] = Path(value) if is_path else value
-    if parts[ObservationFit].get("ransac") is not None:
+        if value is not None:
+            is_length = name == "focal" and is_number(value)
+            owner = ObservationChanges if is_length else owners[name]
+            parts[owner][name] = _as_declared(value, owner, name)
+    if "ransac" in parts[ObservationFit]:
         parts[ObservationFit].setdefault("robust", True)
     return FitRunOptions(
         inputs=(),
@@ -203,6 +215,25 @@ def options_of(given: dict[str, Any]) -> FitRunOptions:
         changes=ObservationChanges(**parts[ObservationChanges]),
         detector=DetectorOptions(**parts[DetectorOptions]),
     )
+
+
+def _as_declared(value: Any, kind: type, name: str) -> Any:
+    """A value of the type that the option's dataclass declares, of which paths may be texts.
+
+    Raises InputError if it is of another one.
+    """
+    if kind is FitOptions:  # which checks its values itself
+        return value
+    if name == "size":  # whose lengths are arrays, too
+        require_kind(value, Size, name)
+        return value
+    declared = get_type_hints(kind, include_extras=True)[name]
+    if Path in get_args(declared):
+        return as_path(value, name)
+    try:
+        return convert(value, declared, name)
+    except DataError as error:
+        raise InputError(error.what, where=error.where, fix=error.fix) from None
 
 
 def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:

@@ -19,7 +19,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.documents import in_file, path_from, read_json, within, written_path
+from cadalign.io.documents import Positive, in_file, path_from, read_json, within, written_path
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
 from cadalign.io.files import as_path, write_json
 from cadalign.io.observation_file import (
@@ -219,8 +219,8 @@ class ObservationChanges:
     pixel_origin: PixelOrigin | None = None  # of that camera
     evidence: Mapping[str, Any] = field(default_factory=dict)  # fields of `ImageEvidence`
     size: Size | None = None
-    focal: float | None = None  # focal length of all cameras [px]
-    fov: float | None = None  # or their horizontal field of view [degrees]
+    focal: Positive | None = None  # focal length of all cameras [px]
+    fov: Positive | None = None  # or their horizontal field of view [degrees]
 
     def read_camera(self, size: tuple[int, int] | None) -> Camera | None:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import cadalign
-from cadalign import Alignment, CadalignError, Camera, Observation, Result, Results
+from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
 from cadalign.batch.fits import options_of, run_many
 from cadalign.batch.options import FitRunOptions
 from cadalign.batch.table import COLUMNS
@@ -219,7 +220,23 @@ def test_another_input_or_option_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("options", "where"),
-    [({"colour": 1}, "colour"), ({"method": "magic"}, "method"), ({"pictures": -1}, "pictures")],
+    [
+        ({"colour": 1}, "colour"),
+        ({"method": "magic"}, "method"),
+        ({"pictures": -1}, "pictures"),
+        ({"pictures": "all"}, "pictures"),
+        ({"robust": "no"}, "robust"),
+        ({"focal": "guess"}, "focal"),
+        ({"focal": -5.0}, "focal"),
+        ({"focal_prior": "foo"}, "focal_prior"),
+        ({"sigma": np.ones(8)}, "sigma"),
+        ({"camera": CAMERA}, "camera"),
+        ({"shape": 3}, "shape"),
+        ({"images": 5}, "images"),
+        ({"size": 3}, "size"),
+        ({"ransac": True}, "ransac"),
+        ({"workers": "a"}, "workers"),
+    ],
 )
 def test_wrong_options_are_refused_before_the_run(
     tmp_path: Path, options: dict[str, Any], where: str
@@ -229,6 +246,26 @@ def test_wrong_options_are_refused_before_the_run(
         cadalign.fit_many(source, out=tmp_path / "run", **options)
     assert caught.value.where == where
     assert not (tmp_path / "run").exists()
+
+
+def test_numbers_as_focal_are_the_focal_length_of_all_cameras() -> None:
+    unknown = Camera.without_focal(640, 480)
+    seen = [replace(each, camera=unknown) for each in observations(2)]
+    cameras = [each.camera.fx for each in cadalign.fit_many(seen, focal=650)]  # type: ignore[union-attr]
+    assert cameras == [650.0, 650.0]
+    streamed = cadalign.stream_fits(seen, focal=650.0)
+    assert [found.camera.fx for _, found in streamed] == cameras  # type: ignore[union-attr]
+
+
+def test_priors_of_focal_lengths_are_taken_as_such_and_none_is_the_default() -> None:
+    given, usual = (
+        next(iter(cadalign.stream_fits(observations(1), focal="estimate", focal_prior=prior)))[1]
+        for prior in (FocalPrior(900.0, 0.1), None)
+    )
+    assert isinstance(given, Result)
+    assert given.focal_prior == FocalPrior(900.0, 0.1)
+    assert isinstance(usual, Result)
+    assert usual.focal_prior == FocalPrior.of_usual_lenses(640, 480)
 
 
 def test_what_is_no_observation_is_refused() -> None:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import cloudpickle
 import numpy as np
@@ -317,8 +318,8 @@ def test_a_tables_bytes_do_not_show_its_pieces(tmp_path: Path) -> None:
     assert pq.read_metadata(tmp_path / "whole.parquet").num_row_groups == 2
 
 
-@pytest.mark.parametrize("count", [-2, -10])
-def test_a_wrong_number_of_workers_is_an_error(count: int) -> None:
+@pytest.mark.parametrize("count", [-2, -10, "a", 1.5])
+def test_a_wrong_number_of_workers_is_an_error(count: Any) -> None:
     with pytest.raises(InputError, match="not a number of processes"):
         workers_of(count, None)
     assert str(workers_of(-1, None)) == str(partial(in_processes, count=-1))

@@ -22,7 +22,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from cadalign.errors import InputError
+from cadalign.arrays import is_whole as is_integer
+from cadalign.errors import InputError, quote
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Workers, in_processes, in_this_process, on_dask
 from cadalign.evaluation.runs.tables import is_whole, read_table, write_rows, write_tables
@@ -76,9 +77,9 @@ def workers_of(count: int, dask: str | None, *, threads: int = 1) -> Workers:
     """
     if dask is not None:
         return partial(on_dask, address=dask)
-    if count < -1:
+    if not is_integer(count) or count < -1:
         raise InputError(
-            f"{count} is not a number of processes",
+            f"{quote(count)} is not a number of processes",
             where="workers",
             fix="give 1 or more, -1 for one for each core, 0 for none",
         )

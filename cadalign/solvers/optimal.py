@@ -14,6 +14,7 @@ from cadalign.solvers.alignment import (
     with_points,
 )
 from cadalign.solvers.constants import (
+    CAUCHY,
     DEGENERATE,
     LINEAR,
     NOT_FOUND,
@@ -166,7 +167,7 @@ def _search_from_all_starts(
     points, rays, free = objective.keypoints.points, objective.keypoints.rays, objective.free
     if free[6] == 0.0 and free[7] == 0.0 and objective.keypoints.loss == LINEAR:
         return _search_rigid(objective, minima)
-    subset_count, refined = _effort(points.shape[0])
+    subset_count, refined = _effort(points.shape[0], objective.keypoints.loss)
     starts = np.empty((subset_count * MAX_SOLUTIONS + 1 + _GRID_ROTATIONS, POSE_SIZE))
     count = 0
     if points.shape[0] >= 4:
@@ -229,11 +230,15 @@ def _search_from(objective: Objective, starts: FloatArray, refined: int, minima:
 
 
 @kernel
-def _effort(points: int) -> tuple[int, int]:
+def _effort(points: int, loss: int) -> tuple[int, int]:
     """Numbers of 4-subsets to solve and of starts to refine.
 
-    Measured on random problems: the optimum is missed in less than 0.1 % of them.
+    Measured on random problems: the optimum is missed in less than 0.1 % of them. Cauchy's loss
+    does not follow outliers, of which few subsets of few keypoints are free: with 2 among 10 it is
+    missed in less than 0.3 %, with 3 in 4 %.
     """
+    if loss == CAUCHY:
+        return (70, 12) if points < 17 else (12, 8)
     if points < 8:
         return 35, 12
     if points < 9:

@@ -251,6 +251,21 @@ def test_invariance_to_the_points_order(method: str, seed: int, points: int) -> 
     np.testing.assert_allclose(after.residuals, before.residuals[order], rtol=0, atol=1e-3)
 
 
+def test_cauchys_optimum_does_not_depend_on_where_outliers_stand() -> None:
+    differences = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        problem = problem_of(seed, points=10, noise_px=1.0)
+        pixels = problem.points_2d.copy()
+        pixels[:2] += rng.normal(0, 40, (2, 2))
+        costs = []
+        for order in (rng.permutation(10) for _ in range(4)):
+            given = problem.points_3d[order], pixels[order], problem.camera
+            costs.append(fit(*given, loss="cauchy").cost)
+        differences.append(np.ptp(costs))
+    assert np.mean(np.array(differences) > 1e-3) < 0.05
+
+
 @given(seed=SEEDS, points=COUNTS)
 def test_duplicating_every_point_halves_the_variance(seed: int, points: int) -> None:
     problem = problem_of(seed, points=points, noise_px=0.5)

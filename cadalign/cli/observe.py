@@ -11,7 +11,15 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from cadalign.cli.common import answer, exit_code, file_stem, make_folder, new_console, say
+from cadalign.cli.common import (
+    answer,
+    exit_code,
+    file_stem,
+    file_stems,
+    make_folder,
+    new_console,
+    say,
+)
 from cadalign.cli.options import CameraOptions, EvidenceOptions, named_as_flags
 from cadalign.datasets import (
     ImageKeypoints,
@@ -232,4 +240,4 @@ def _slugs(texts: Sequence[str | None]) -> list[str]:
     for stem in stems:
         names.append(stem if counts[stem] == 1 else f"{stem}_{seen[stem]}")
         seen[stem] += 1
-    return names
+    return file_stems(names, "track")

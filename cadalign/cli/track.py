@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.common import answer, exit_code, file_stem, make_folder, say, waiting
+from cadalign.cli.common import answer, exit_code, file_stems, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import RansacOptions
@@ -188,8 +188,8 @@ class TrackCommand(CameraOptions):
         from cadalign.render.drawing.movie import write_movie
         from cadalign.report.track_page import write_track_page
 
-        for each in found:
-            stem = file_stem(each.track.name, "track")
+        stems = file_stems((each.track.name for each in found), "track")
+        for each, stem in zip(found, stems, strict=True):
             write_tum(folder / f"{stem}.tum", each.path.times, each.path.poses)
             write_kitti(folder / f"{stem}.txt", each.path.poses)
         rows = [row for each in found for row in rows_of(each)]

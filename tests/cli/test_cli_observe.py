@@ -16,6 +16,7 @@ from support.refusals import refusal_line
 
 from cadalign import Alignment, Camera, FocalPrior, Result, fit
 from cadalign.cli import main
+from cadalign.cli.observe import _slugs
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.simulation.problems import Problem, random_rotation
 from cadalign.io.observation import Observation
@@ -393,3 +394,7 @@ def test_the_photos_of_a_track_are_views_of_one_observation(
 def test_tracks_are_for_all_objects(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = refusal_line(capsys, *observing(folder, "--tracks"))
     assert "--tracks: given without --every; give both" in line
+
+
+def test_files_of_names_that_read_alike_stay_apart() -> None:
+    assert _slugs(["a", "a", "a_0", "A/b", "a_b"]) == ["a_0", "a_1", "a_0_2", "A_b", "a_b_2"]

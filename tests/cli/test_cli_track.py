@@ -196,10 +196,12 @@ def test_csv_with_tracks_is_read(video: tuple[Path, list[SimulatedTrack]], tmp_p
         for name, (u, v) in zip(view.keypoint_ids, np.asarray(view.points_2d), strict=True)
     ]
     path = tmp_path / "found.csv"
-    path.write_text("\n".join(["image,track,name,u,v", *rows]))
+    of_both = [row.replace(",a,", f",{name},") for name in ("a/b", "a_b") for row in rows]
+    path.write_text("\n".join(["image,track,name,u,v", *of_both]))
     files = ["--shape", str(folder / "thing.shape"), "--camera", str(folder / "camera.json")]
     assert main(["track", str(path), *files]) == 0
-    assert (tmp_path / "found_tracks" / "a.tum").is_file()
+    for name in ("a_b.tum", "a_b_2.tum", "a_b.txt", "a_b_2.txt"):
+        assert (tmp_path / "found_tracks" / name).is_file()
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,8 @@ def joint_mistake(problem: JointProblem, best: Minimum, ransac: RansacOptions | 
     """
     if ransac is None:
         return _mistake_in_all(problem, best)
+    if not len(best.inliers):  # masks or photos alone
+        return None
     are_few = best.inliers.mean() > _FEW_REJECTED
     if are_few and (is_exact(best.evidence) or _misfit(best) < _LEAST_UNCERTAIN_MISFIT):
         return None

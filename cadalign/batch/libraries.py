@@ -29,7 +29,6 @@ The records hold all matches as JSON (`cadalign.Match.to_dict`) in the column ``
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -124,12 +123,13 @@ def build_library(
 
     A finished run in the ``folder`` is done anew; further arguments are those of
     `cadalign.fit_many`. Also returns rows of the models that are left out, or whose mesh is. Raises
-    DataError if there are no models, or the folder cannot be written or holds another run.
+    DataError if there are no models, or the folder cannot be written or holds something else.
     """
     tasks = [_task(dataset, key) for key in dataset.ids()]
     run = RunFolder(folder)
+    run.refuse_foreign()
     if run.is_finished and (run.read_config() or {}).get("experiment") == _EXPERIMENT:
-        shutil.rmtree(folder)
+        run.remove()
     config = {"experiment": _EXPERIMENT, "contents": _contents(tasks)}
     size = max(1, min(_LARGEST_CHUNK, len(tasks) // _LARGEST_CHUNK))
     execute(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,6 +44,7 @@ class LibraryBuild:
         from cadalign.batch.libraries import build_library
         from cadalign.cli.runs import run_progress
         from cadalign.datasets import KeypointNet
+        from cadalign.evaluation.runs.folder import RunFolder
 
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
         dataset = dataset.subset(categories=self.categories, split=self.split)
@@ -66,7 +66,7 @@ class LibraryBuild:
         if troubles:
             say(f"Rows: {folder / 'results.parquet'}")
         else:
-            shutil.rmtree(folder)
+            RunFolder(folder).remove()
         return 0
 
 

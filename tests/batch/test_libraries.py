@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from support.refusals import refusal_line
 
 import cadalign.batch.libraries as module
 from cadalign import Library
@@ -83,6 +84,27 @@ def test_a_folder_of_another_run_is_refused(
     (tmp_path / "lib_build" / "run.json").write_text('{"experiment": "fit"}')
     assert main(["library", "build", str(root), "--out", str(tmp_path / "lib")]) == 1
     assert 'experiment is "fit" there and "library" now' in capsys.readouterr().err
+
+
+def test_a_folder_of_other_files_is_kept(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = tmp_path / "lib_build" / "src" / "notes.txt"
+    notes.parent.mkdir(parents=True)
+    notes.write_text("work")
+    line = refusal_line(capsys, "library", "build", root, "--out", tmp_path / "lib")
+    fix = "rename it, or give another --out"
+    assert line == f"{tmp_path / 'lib_build'}: holds files that are no run's; {fix}"
+    assert [path.name for path in (tmp_path / "lib_build").iterdir()] == ["src"]
+    assert notes.read_text() == "work"
+
+
+def test_files_that_others_put_into_the_run_are_kept(root: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "lib_build"
+    build_library(KeypointNet(root), folder)
+    (folder / "notes.txt").write_text("work")
+    assert main(["library", "build", str(root), "--out", str(tmp_path / "lib")]) == 0
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 
 def test_the_columns_are_documented() -> None:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import fcntl
 import json
 import platform
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,12 +17,14 @@ from msgspec import Meta, field
 
 from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file
-from cadalign.io.files import made_folder, read_text, refuse_nul, write_json, writing
+from cadalign.io.files import made_folder, read_text, reading, refuse_nul, write_json, writing
 
 _FORMAT = 2
 _LONGEST_VALUE = 80
 _MOST_DIFFERENCES = 6
 _FIX = "give another folder (--out), or remove this one"
+_FIX_FOREIGN = "rename it, or give another --out"
+_LOCK = ".lock"
 
 
 class _Inside:
@@ -73,6 +76,23 @@ class RunFolder:
         """Make the folder."""
         made_folder(self.path)
 
+    def refuse_foreign(self) -> None:
+        """Raise a DataError for a folder of other files; what is hidden may be a killed run's."""
+        with reading(self.path):
+            found = list(self.path.iterdir()) if self.path.is_dir() else []
+        if not self.config_file.exists() and any(each.name[0] != "." for each in found):
+            raise DataError("holds files that are no run's", where=str(self.path), fix=_FIX_FOREIGN)
+
+    def remove(self) -> None:
+        """Remove a run without pictures; the folder stays where something else is in it."""
+        tables = self.results, self.timings, self.records
+        with self.locked():
+            shutil.rmtree(self.parts, ignore_errors=True)
+            for path in (*tables, self.progress, self.config_file, self.path / _LOCK):
+                path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.path.rmdir()
+
     def made_for_pictures(self) -> RunFolder:
         """Make the folder and those in it that pictures go to; returns it by its full path."""
         self.make()
@@ -88,7 +108,7 @@ class RunFolder:
     def locked(self) -> Iterator[None]:
         """Keep other processes out; a killed process holds no lock."""
         with writing(self.path):
-            lock = (self.path / ".lock").open("a")
+            lock = (self.path / _LOCK).open("a")
         with lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

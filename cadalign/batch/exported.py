@@ -55,7 +55,9 @@ def read_exported(
         result = Result.from_dict(data)
     shape = shape or _stored(fit, data, "shape")
     how = {"world_from_cam": world_from_cam, "metres": metres}
-    return exported_object(result, seen, path, shape=shape, **how)
+    exported = exported_object(result, seen, path, shape=shape, **how)
+    sources = fit, path, *seen.files, *([] if shape is None else [shape])
+    return replace(exported, sources=sources)
 
 
 def exported_object(

@@ -29,7 +29,7 @@ from cadalign.export.formats import export_object, format_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import join
 from cadalign.io.documents import parse_json
-from cadalign.io.files import made_folder, write_json
+from cadalign.io.files import keeping, made_folder, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model
@@ -37,6 +37,7 @@ from cadalign.render.scene import LIGHT_GREY
 
 _MILLIMETRES = 1e-3
 _SAME = 1e-9  # of the model's size
+_FIX = "do the run again"
 _SCENE = "1"
 _NOT_MOVED = Alignment(np.eye(3), np.zeros(3), np.ones(3))
 _Stored = tuple[Path, int, Observation, Result]
@@ -106,14 +107,16 @@ def export_run(
         fix = f"of a run, give one of {', '.join(known)}"
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
     left_out: list[CadalignError] = []
-    results = _run_results(RunFolder(run), rows)
+    folder = RunFolder(run)
+    results = _run_results(folder, rows)
     made_folder(to.parent)
-    if name == DOCUMENTS:
-        count = _write_documents(to, results)
-    else:
-        objects = _run_objects(results, metres, left_out)
-        write = RUN_FORMATS[name] if style is None else partial(_write_overlays, style=style)
-        count = write(to, objects, left_out)
+    with keeping(_inputs(folder)):
+        if name == DOCUMENTS:
+            count = _write_documents(to, results)
+        else:
+            objects = _run_objects(results, metres, left_out)
+            write = RUN_FORMATS[name] if style is None else partial(_write_overlays, style=style)
+            count = write(to, objects, left_out)
     if not count:
         if left_out:
             raise left_out[0]
@@ -128,23 +131,41 @@ def _made_file(path: Path, name: str) -> Path:
     return file
 
 
+def _inputs(folder: RunFolder) -> Iterator[Path]:
+    """The files of a run, and those that its observations lie in and name."""
+    yield from folder.path.glob("*.*")
+    for _, _, seen, _ in _records(folder):
+        yield from seen.files
+    for table in read_groups(folder.results, fix=_FIX):
+        for source in table["source"].to_pylist():
+            # The file, or "<file>, line 3" and "<file>: annotations[3]"
+            yield from map(Path, (source, source.partition(", ")[0], source.partition(": ")[0]))
+
+
 def _run_results(folder: RunFolder, rows: Collection[int]) -> Iterator[_Stored]:
     """The results of a finished run with their observations, one at a time; all without ``rows``.
 
     Each comes with its name in messages and its number.
     """
+    for where, row, seen, result in _records(folder):
+        if result and (not rows or row in rows):
+            yield where, row, seen, Result.from_json(result)
+
+
+def _records(folder: RunFolder) -> Iterator[tuple[Path, int, Observation, str]]:
+    """As `_run_results`, of all observations that could be read, with the results' text."""
     if not folder.is_finished:
         fix = "start the command that made it again: it goes on"
         raise DataError("not a finished run of fits", where=str(folder.path), fix=fix)
-    for table in read_groups(folder.records, fix="do the run again"):
+    for table in read_groups(folder.records, fix=_FIX):
         if not {name for name, _ in RECORD_COLUMNS} <= set(table.column_names):
             raise DataError("not a run of fits", where=str(folder.path))
         for record in table.to_pylist():
             row = record["row"]
-            if record["result"] and (not rows or row in rows):
+            if record["observation"]:
                 where = Path(f"{folder.path}, row {row}")
                 seen = Observation.from_dict(parse_json(record["observation"], str(where)))
-                yield where, row, seen, Result.from_json(record["result"])
+                yield where, row, seen, record["result"]
 
 
 def _run_objects(

@@ -35,7 +35,7 @@ from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
-from cadalign.io.files import write_json
+from cadalign.io.files import keeping, write_json
 from cadalign.io.observation import (
     Observation,
     ObservationChanges,
@@ -209,7 +209,12 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         """The result of the observation in a file, with its pictures; see `FittedFile.drawn`."""
         shape = self.shape_of(observation)
         sources = {"observation": path} | ({} if shape is None else {"shape": shape})
-        found = FittedFile(result, sources, is_tabulated=views is not None)
+        found = FittedFile(
+            result,
+            sources,
+            is_tabulated=views is not None,
+            inputs=(*observation.files, *sources.values()),
+        )
         return found.drawn(observation, views=views, picture=self.picture, style=style)
 
 
@@ -247,7 +252,8 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
                 ransac=command.ransac if command.robust else None,
             )
     folder = command.out or path.with_name(f"{path.stem}_fit")
-    texts = _write_scene(command, folder, scene, objects, list(seen.values()))
+    with keeping([path, *(file for each in seen.values() for file in each.files)]):
+        texts = _write_scene(command, folder, scene, objects, list(seen.values()))
     if command.json:
         print_json(scene.to_dict())
     else:

@@ -12,7 +12,7 @@ import numpy as np
 from cadalign.cli.common import make_folder
 from cadalign.errors import InputError
 from cadalign.io.documents import written_path
-from cadalign.io.files import finite, write_text
+from cadalign.io.files import finite, keeping, write_text
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
@@ -31,8 +31,9 @@ class FittedFile:
     """Result of a fit of one file, and pictures of each view.
 
     ``sources`` are the files of the observation and of the learned shape, which fit.json states;
-    ``overlays`` are those of the model that were asked for. ``is_tabulated`` adds the contributions
-    of the pieces of evidence.
+    ``inputs`` those and what the observation names, which are not written over. ``overlays`` are
+    those of the model that were asked for. ``is_tabulated`` adds the contributions of the pieces of
+    evidence.
     """
 
     result: Result
@@ -40,6 +41,7 @@ class FittedFile:
     is_tabulated: bool = False
     pictures: tuple[ByteImage, ...] = ()
     overlays: tuple[ByteImage, ...] = ()
+    inputs: tuple[Path, ...] = ()
 
     @property
     def table(self) -> str:
@@ -61,9 +63,11 @@ class FittedFile:
         The ``overlays`` go to ``overlay``, those of further views beside it.
         """
         make_folder(out)
-        write_text(out / "fit.json", self.text(out))
-        paths = _write_pictures(out / "overlay.png", self.pictures)
-        return paths if overlay is None else paths + _write_pictures(overlay, self.overlays)
+        with keeping(self.inputs):
+            # First what somebody names, which may be refused.
+            further = [] if overlay is None else _write_pictures(overlay, self.overlays)
+            write_text(out / "fit.json", self.text(out))
+            return _write_pictures(out / "overlay.png", self.pictures) + further
 
     def drawn(
         self,

@@ -33,6 +33,7 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.evidence import ObservedImage
+from cadalign.io.files import keeping
 from cadalign.io.images import photo_size, write_image
 from cadalign.io.observation import Observation, with_lens
 
@@ -85,6 +86,13 @@ class Observe(CameraOptions, EvidenceOptions):
             raise InputError("given without --every", where="--tracks", fix="give both")
         objects = read_image_keypoints(self.keypoints)
         model = ModelKeypoints.load(self.model_keypoints)
+        inputs = [self.keypoints, self.model_keypoints, model.model, self.camera, self.image]
+        inputs += [value for value in self.given.values() if isinstance(value, Path)]
+        with keeping(inputs):
+            return self._observe(objects, model)
+
+    def _observe(self, objects: Sequence[ImageKeypoints], model: ModelKeypoints) -> int:
+        """Write the observation, or those of all objects; returns the exit code."""
         if self.every:
             return _observe_all(self, objects, model)
         name = None if self.image is None else self.image.name

@@ -14,6 +14,7 @@ from cadalign.cli.options import CameraOptions, FlaggedOptions, ManyCommand, nam
 from cadalign.errors import InputError
 from cadalign.estimation.options import Sigma
 from cadalign.io.documents import read_json
+from cadalign.io.files import keeping
 from cadalign.io.images import read_image
 from cadalign.io.observation import is_of_many, refuse_photo_or_mesh
 from cadalign.retrieval.options import RetrievalOptions
@@ -112,15 +113,16 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
                 say(absent)
         if self.out is not None:
             make_folder(self.out)
-            page = write_retrieval(
-                self.out,
-                matches,
-                found or camera,
-                query=query,
-                title=f"Models for {path.name}",
-                library=f"{self.library.name} ({len(library):,} models)",
-                image=photo,
-            )
+            with keeping([path, *query.files, self.mask, self.library]):
+                page = write_retrieval(
+                    self.out,
+                    matches,
+                    found or camera,
+                    query=query,
+                    title=f"Models for {path.name}",
+                    library=f"{self.library.name} ({len(library):,} models)",
+                    image=photo,
+                )
             say(f"Page: {page}")
         return 0
 

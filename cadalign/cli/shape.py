@@ -12,6 +12,7 @@ import tyro
 from cadalign.cli.common import JsonOption, answer, group_of, make_folder, print_json, say
 from cadalign.cli.runs import run_progress
 from cadalign.datasets import KeypointNet
+from cadalign.io.files import keeping
 from cadalign.render.drawing.shape_picture import draw_shape
 from cadalign.shapes.model import ShapeModel
 
@@ -60,23 +61,26 @@ class ShapeLearn:
 
 @dataclass(frozen=True)
 class ShapeShow(JsonOption):
-    """Describe a shape model and draw its mean and its first modes."""
+    """Describe a shape model; with --out, draw its mean and its first modes."""
 
     shape: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SHAPE")]
     """File that `cadalign shape learn` wrote."""
     out: Path | None = None
-    """Picture to write; by default <shape>.png beside the file."""
+    """Picture to write; by default none is written."""
 
     def run(self) -> int:
         """Open the model and describe it; returns the exit code."""
         model = ShapeModel.open(self.shape)
-        out = self.shape.with_suffix(".png") if self.out is None else self.out
-        make_folder(out.absolute().parent)
-        draw_shape(out, model)
+        if self.out is not None:
+            make_folder(self.out.absolute().parent)
+            with keeping([self.shape]):
+                draw_shape(self.out, model)
         if self.json:
-            print_json({**_summary(model), "picture": str(out)})
+            picture = {} if self.out is None else {"picture": str(self.out)}
+            print_json(_summary(model) | picture)
         else:
-            answer(f"{_text(model)}\nWritten: {out}")
+            written = "" if self.out is None else f"\nWritten: {self.out}"
+            answer(f"{_text(model)}{written}")
         return 0
 
 

@@ -109,6 +109,8 @@ class AlignedObject:
         The model's name.
     metres : float
         Length of one unit of the camera frame [m].
+    sources : tuple of Path
+        The files that it was read from, which no export writes over; nor over its photos.
 
     Raises
     ------
@@ -124,6 +126,7 @@ class AlignedObject:
     world_from_cam: FloatArray | None = None
     name: str = "model"
     metres: float = 1.0
+    sources: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.views:

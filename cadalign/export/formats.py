@@ -23,7 +23,7 @@ from cadalign.export.usd import write_usd
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import written_path
-from cadalign.io.files import as_path, printable, refuse_nul, write_json
+from cadalign.io.files import as_path, keeping, printable, refuse_input, refuse_nul, write_json
 from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
 
 _SAME = 1e-9
@@ -286,7 +286,8 @@ def export_object(
     InputError
         If the format or frame is not known, or the object lacks what the format needs.
     DataError
-        If a photo cannot be read, or the file cannot be written.
+        If a photo cannot be read, or the file cannot be written or is one that the object was read
+        from.
     """
     path = as_path(path)
     refuse_nul(path)
@@ -299,5 +300,8 @@ def export_object(
     except OSError as error:
         reason = error.strerror or error
         raise DataError(f"the folder cannot be made ({reason})", where=str(path.parent)) from None
-    FORMATS[name].write(path, exported, options or ExportOptions())
+    photos = (view.image for view in exported.views if isinstance(view.image, Path))
+    with keeping([*exported.sources, *photos]):
+        refuse_input(path)  # first: files beside it are written before it
+        FORMATS[name].write(path, exported, options or ExportOptions())
     return path

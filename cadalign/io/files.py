@@ -9,8 +9,9 @@ import math
 import os
 import stat
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,16 +24,19 @@ MOST_BYTES = 2**32
 """Size of the largest file that is read where its reader states no other."""
 # Opening a pipe would wait for its other end; Windows has none of this kind.
 _NOT_WAITING = getattr(os, "O_NONBLOCK", 0)
+_kept: ContextVar[frozenset[str]] = ContextVar("kept", default=frozenset())
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file such that, killed at any moment, it is there whole or as it was.
 
-    ``write`` writes the file that it is given the name of, in the same folder.
+    ``write`` writes the file that it is given the name of, in the same folder. Raises DataError if
+    it cannot be written, or something is made from it (`keeping`).
     """
     # The true ending stays last: some writers go by it.
     name = path.name if len(path.name) <= _MAX_NAME else f"{hash(path.name):x}{path.suffix}"
     with writing(path):
+        refuse_input(path)
         unfinished = path.with_name(f".unfinished-{os.getpid()}-{name}")
         try:
             write(unfinished)
@@ -40,6 +44,29 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
         except BaseException:
             unfinished.unlink(missing_ok=True)
             raise
+
+
+@contextmanager
+def keeping(inputs: Iterable[Path | None]) -> Iterator[None]:
+    """Refuse, within the block, to write over the files that something is made from.
+
+    Whatever writes files goes by it: also those beside the one that somebody names.
+    """
+    named = {path for path in inputs if path is not None}
+    for path in named:
+        refuse_nul(path)
+    token = _kept.set(_kept.get() | {os.path.realpath(path) for path in named})
+    try:
+        yield
+    finally:
+        _kept.reset(token)
+
+
+def refuse_input(path: Path) -> None:
+    """Raise a DataError for a file that must not be written over; see `keeping`."""
+    if os.path.realpath(path) in _kept.get():
+        what = "what is to be written is made from this file"
+        raise DataError(what, where=printable(path), fix="give another name")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -88,6 +88,15 @@ class Observation(ObservedImage):
         return (self, *self.others)
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that it names, and the materials beside the model."""
+        materials = None if self.model is None else self.model.with_suffix(".mtl")
+        named: list[Any] = [self.model, materials, self.shape]
+        for view in self.views:
+            named += [view.image, *view.evidence.given.values()]
+        return tuple(each for each in named if isinstance(each, Path))
+
+    @property
     def is_plain(self) -> bool:
         """True where nothing but keypoints in one image is known."""
         return not (self.others or self.size or self.init or self.has_more)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,12 @@ def pose(turn: float) -> Alignment:
     return Alignment(upright @ about_y, [-0.3, 0.3, 5.0], [1, 1.2, 0.8])
 
 
+def box_in(photo: Path, number: int, model: Path) -> Observation:
+    """A box in a photo, in a pose of its own."""
+    pixels = CAMERA.project(pose(0.3 + 0.5 * number).apply(CORNERS))
+    return Observation(CORNERS, pixels, CAMERA, image=photo, model=model)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run over three boxes in two photos, and an observation that fails."""
@@ -40,16 +47,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_obj_mesh(folder / "box.obj", Mesh(CORNERS, FACES))
     for name in ("000004.png", "000007.png"):
         Image.new("RGB", (640, 480), (90, 120, 90)).save(folder / name)
-    seen = [
-        Observation(
-            CORNERS,
-            CAMERA.project(pose(0.3 + 0.5 * k).apply(CORNERS)),
-            CAMERA,
-            image=folder / ("000004.png" if k < 2 else "000007.png"),
-            model=folder / "box.obj",
-        )
-        for k in range(3)
-    ]
+    photos = [folder / name for name in ("000004.png", "000004.png", "000007.png")]
+    seen = [box_in(photo, k, folder / "box.obj") for k, photo in enumerate(photos)]
     few = Observation(CORNERS[:2], seen[0].points_2d[:2], CAMERA)
     cadalign.fit_many([*seen, few], out=folder / "run")
     return folder / "run"
@@ -129,6 +128,19 @@ def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
         export_run(run, tmp_path / "out.usdz")
     with pytest.raises(DataError, match="not a finished run of fits"):
         export_run(tmp_path, tmp_path / "out.csv")
+
+
+def test_photos_of_a_run_and_its_files_are_not_written_over(run: Path, tmp_path: Path) -> None:
+    photo = tmp_path / "000001.png"  # which the second one's overlay would be called
+    shutil.copy(run.parent / "000004.png", photo)
+    seen = [box_in(photo, number, run.parent / "box.obj") for number in range(2)]
+    cadalign.fit_many(seen, out=tmp_path / "run")
+    before = photo.read_bytes()
+    found = export_run(tmp_path / "run", tmp_path, format="overlay")
+    assert (found.objects, photo.read_bytes()) == (1, before)
+    assert [error.where for error in found.left_out] == [str(photo)]
+    with pytest.raises(DataError, match="what is to be written is made from this file"):
+        export_run(tmp_path / "run", tmp_path / "run" / "results.csv", format="bop-results")
 
 
 def test_a_fit_remembers_its_observation(run: Path, tmp_path: Path) -> None:

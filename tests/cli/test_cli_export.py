@@ -96,6 +96,29 @@ def test_the_command_says_what_is_missing(
     assert "no such file" in refusal(capsys, tmp_path / "gone.json", *to, *given)
 
 
+@pytest.mark.parametrize(
+    ("name", "format"),
+    [
+        ("wedge.obj", "obj"),
+        ("wedge.mtl", "ply"),
+        ("000007.png", "glb"),
+        ("photo.json", "coco"),
+        ("photo_fit/fit.json", "nerfstudio"),
+        ("wedge.png", "obj"),  # which writes wedge.mtl, too
+    ],
+)
+def test_what_is_exported_is_not_written_over(
+    tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str], name: str, format: str
+) -> None:
+    (tmp_path / "wedge.mtl").write_text("newmtl cloth\n")
+    assert main(["fit", str(observed), "--no-picture"]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    fit = tmp_path / "photo_fit" / "fit.json"
+    said = refusal(capsys, fit, "--to", tmp_path / name, "--format", format)
+    assert "what is to be written is made from this file; give another name" in said
+    assert before == {path: path.read_bytes() for path in before}
+
+
 def test_an_observation_that_was_changed_is_refused(
     tmp_path: Path, observed: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -265,6 +265,17 @@ def test_photo_and_model_are_drawn(tmp_path: Path) -> None:
 # --- what it refuses -------------------------------------------------------------------------
 
 
+def test_the_photo_is_not_drawn_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo = tmp_path / "photo.png"
+    cv2.imwrite(str(photo), np.zeros((480, 640, 3), dtype=np.uint8))
+    before = photo.read_bytes()
+    (tmp_path / "model.obj").write_text(TETRAHEDRON)
+    path = write_observation(tmp_path / "chair.json", image=photo, model=tmp_path / "model.obj")
+    line = refusal_line(capsys, "fit", path, "--overlay", photo)
+    assert line == f"{photo}: what is to be written is made from this file; give another name"
+    assert photo.read_bytes() == before
+
+
 def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "nothing.json"
     assert refusal_line(capsys, "fit", str(path)) == f"{path}: no such file"

@@ -81,6 +81,16 @@ def test_photo_and_detection_become_an_observation(
     assert json.loads(out.read_text())["image"] == "photo.jpg"
 
 
+def test_the_detectors_file_is_not_written_over(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found, photo = folder / "found.json", folder / "photo.jpg"
+    before = found.read_bytes()
+    line = refusal_line(capsys, *observing(folder, "--image", str(photo), "--out", str(found)))
+    assert line == f"{found}: what is to be written is made from this file; give another name"
+    assert found.read_bytes() == before
+
+
 @pytest.mark.slow
 def test_fit_of_a_photo_without_focal_length_takes_exif_into_account(
     folder: Path, capsys: pytest.CaptureFixture[str]

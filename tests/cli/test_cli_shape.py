@@ -29,12 +29,18 @@ def test_learn_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert model.training is not None
     assert model.training.mesh_paths[0] is not None
 
+    drawn = out.with_suffix(".png")
+    drawn.write_text("mine")
     assert main(["shape", "show", str(out)]) == 0
+    assert drawn.read_text() == "mine"
+    assert main(["shape", "show", str(out), "--out", str(drawn)]) == 0
     shown = capsys.readouterr().out
     assert f"chair: {len(model.ids)} keypoints, learned from {len(model.training)} models" in shown
     assert "component 1" in shown
-    with Image.open(out.with_suffix(".png")) as picture:
+    with Image.open(drawn) as picture:
         assert picture.width > 400
+    line = refusal_line(capsys, "shape", "show", out, "--out", out)
+    assert line == f"{out}: what is to be written is made from this file; give another name"
 
     picture_path = tmp_path / "other.png"
     assert main(["shape", "show", str(out), "--json", "--out", str(picture_path)]) == 0

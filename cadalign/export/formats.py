@@ -109,8 +109,9 @@ def _bop(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
     folder = path.parent if path.name == bop_files.TRUTH else path
     mesh, poses = _bop_mesh(exported), _bop_poses(exported, options)
     cameras = {each.image: view.camera for each, view in zip(poses, exported.views, strict=True)}
-    bop.write_scene(folder, poses, cameras)
+    table = bop.scene_cameras(folder, cameras)
     _write_bop_model(folder, mesh, options)
+    bop.write_scene(folder, poses, table)
 
 
 def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[PoseEstimate]:

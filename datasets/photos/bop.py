@@ -25,6 +25,7 @@ from cadalign.datasets.photos.bop_files import (
     object_name,
     read_bop_results,
     read_scene_gt,
+    stored_table,
     write_model,
     write_models_info,
     write_scene_gt,
@@ -251,9 +252,9 @@ def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> lis
     entries, problems = converted(numbered, partial(_written, folder))
     poses = [pose for pose, *_ in entries]
     write_models_info(folder, {int(pose.model_id): model for pose, _, model, _ in entries})
-    cameras = {pose.image: camera for pose, camera, *_ in entries}
-    write_scene(folder / _WRITTEN_SCENE, poses, cameras)
-    write_json(folder / _WRITTEN_SCENE / _INFO, {pose.image: [info] for pose, *_, info in entries})
+    scene = folder / _WRITTEN_SCENE
+    write_scene(scene, poses, scene_cameras(scene, {pose.image: c for pose, c, *_ in entries}))
+    write_json(scene / _INFO, {pose.image: [info] for pose, *_, info in entries})
     return problems
 
 
@@ -273,20 +274,35 @@ def _written(
     return estimate, placed.camera, write_model(folder, mesh, model_id), info
 
 
-def write_scene(folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, Camera]) -> None:
-    """Write ``scene_gt.json`` and ``scene_camera.json`` of photos named by their numbers.
+def scene_cameras(folder: Path, cameras: Mapping[str, Camera]) -> dict[str, dict[str, Any]]:
+    """The entries of ``scene_camera.json`` with those of photos named by their numbers.
 
-    Raises InputError if a camera has lens distortion, or a pose a stretch, which the format lacks.
+    Raises InputError if a camera has lens distortion, which the format lacks, DataError if a photo
+    is there with another camera.
     """
-    table = {}
+    path = folder / _CAMERAS
+    table = stored_table(path, dict[str, Any])
     for number, (image, camera) in enumerate(cameras.items()):
         if camera.distortion:
             fix = "undistort the photo and fit again, or export the result CSV alone"
             what = "BOP's camera files have no place for lens distortion"
             raise InputError(what, where=f"views[{number}].camera", fix=fix)
-        table[image] = {"cam_K": camera.matrix.ravel().tolist(), "depth_scale": 1.0}
+        entry = {"cam_K": camera.matrix.ravel().tolist(), "depth_scale": 1.0}
+        if table.setdefault(image, entry).get("cam_K") != entry["cam_K"]:
+            fix = "give another image_id, or another folder"
+            raise DataError(f"photo {image} has another camera", where=str(path), fix=fix)
+    return table
+
+
+def write_scene(
+    folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, dict[str, Any]]
+) -> None:
+    """Write ``scene_gt.json``, where other objects are kept, and ``scene_camera.json``.
+
+    Raises InputError if a pose has a stretch, which the format lacks.
+    """
     made_folder(folder)
-    write_json(folder / _CAMERAS, table)
+    write_json(folder / _CAMERAS, cameras)
     write_scene_gt(folder / TRUTH, poses)
 
 

@@ -37,8 +37,15 @@ from cadalign.io.documents import (
     read_json,
     within,
 )
-from cadalign.io.files import made_folder, read_text, write_json, write_text
-from cadalign.io.meshes.files import write_ply_mesh
+from cadalign.io.files import (
+    made_folder,
+    read_bytes,
+    read_text,
+    write_json,
+    write_text,
+    write_whole,
+)
+from cadalign.io.meshes.files import ply_mesh
 
 TRUTH = "scene_gt.json"
 RESULT_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -96,14 +103,31 @@ def write_bop_results(path: Path, poses: Iterable[PoseEstimate]) -> None:
 
 
 def write_scene_gt(path: Path, poses: Iterable[PoseEstimate]) -> None:
-    """Write poses of one scene as ``scene_gt.json``; see `write_bop_results`."""
-    table: dict[int, list[dict[str, Any]]] = {}
+    """Write poses of one scene as ``scene_gt.json``; see `write_bop_results`.
+
+    In a file that is there, they take the place of the same objects' in the same photos.
+    """
+    added: dict[str, list[dict[str, Any]]] = {}
     for number, each in enumerate(poses):
         rotation, translation = _rigid(each, number)
         obj_id, image = _numbers(each, number, "model_id", "image")
         pose = {"cam_R_m2c": rotation.tolist(), "cam_t_m2c": translation.tolist()}
-        table.setdefault(image, []).append({**pose, "obj_id": obj_id})
-    write_json(path, {str(image): table[image] for image in sorted(table)})
+        added.setdefault(str(image), []).append({**pose, "obj_id": obj_id})
+    table = stored_table(path, list[dict[str, Any]])
+    for key, new in added.items():
+        written = {each["obj_id"] for each in new}
+        table[key] = [e for e in table.get(key, ()) if e.get("obj_id") not in written] + new
+    write_json(path, {key: table[key] for key in sorted(table, key=lambda key: (len(key), key))})
+
+
+def stored_table(path: Path, kind: Any) -> dict[str, Any]:
+    """The entries, by their numbers, of a file that is added to; none where there is no file.
+
+    Raises DataError if the file is no such table.
+    """
+    with in_file(path):
+        table: dict[str, Any] = convert(read_json(path) if path.exists() else {}, dict[str, kind])
+    return table
 
 
 def read_bop_results(path: Path) -> Estimates:
@@ -327,8 +351,16 @@ class BopModels:
 
 
 def write_model(folder: Path, mesh: Mesh, number: int) -> dict[str, float]:
-    """Write a mesh [mm] into ``models``; returns its entry for `write_models_info`."""
-    write_ply_mesh(folder / _MODEL_FOLDERS[0] / f"{object_name(number)}.ply", mesh)
+    """Write a mesh [mm] into ``models``; returns its entry for `write_models_info`.
+
+    Raises DataError if another mesh has this number: poses that are there are of that one.
+    """
+    path, data = folder / _MODEL_FOLDERS[0] / f"{object_name(number)}.ply", ply_mesh(mesh)
+    if path.exists() and read_bytes(path) != data:
+        fix = "give another object_id, or another folder"
+        raise DataError("holds another mesh", where=str(path), fix=fix)
+    made_folder(path.parent)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
     low, high = mesh.bounds
     info = {"diameter": _diameter(mesh)}
     for axis, least, size in zip("xyz", low.tolist(), (high - low).tolist(), strict=True):
@@ -342,9 +374,7 @@ def write_models_info(folder: Path, entries: Mapping[int, dict[str, float]]) -> 
     Raises DataError if the file with the other models cannot be read.
     """
     path = folder / _MODEL_FOLDERS[0] / _MODELS_INFO
-    table = read_json(path) if path.exists() else {}
-    if not isinstance(table, dict):
-        raise DataError("is not a table of models", where=str(path))
+    table = stored_table(path, Any)
     made_folder(path.parent)
     write_json(path, table | {str(number): each for number, each in entries.items()})
 

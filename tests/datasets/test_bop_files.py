@@ -20,7 +20,7 @@ from cadalign.datasets.photos.bop_files import (
 )
 from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.errors import DataError, InputError
-from cadalign.export import export_object
+from cadalign.export import ExportOptions, export_object
 from cadalign.geometry.rotations import rotation_from_vector
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
@@ -100,13 +100,32 @@ def test_a_stretch_without_a_mesh_is_refused(tmp_path: Path) -> None:
 
 
 def test_models_of_other_objects_are_kept(tmp_path: Path) -> None:
-    from cadalign.export import ExportOptions
-
     for number in (1, 2):
         options = ExportOptions(object_id=number)
         export_object(tmp_path / "a.csv", aligned(tmp_path), options=options)
     info = json.loads((tmp_path / "models" / "models_info.json").read_text())
     assert set(info) == {"1", "2"}
+
+
+def test_a_second_object_changes_nothing_of_the_first(tmp_path: Path) -> None:
+    folder, first = tmp_path / "scene", aligned(tmp_path)
+    for _ in range(2):  # the same once more is no other object
+        export_object(folder, first, format="bop")
+    before = {path: path.read_bytes() for path in folder.rglob("*.*")}
+    (pose,) = read_scene_gt(folder / "scene_gt.json")[0]
+    second = replace(first, metres=0.5)
+    for format, to in (("bop", folder), ("bop-results", folder / "b.csv")):
+        with pytest.raises(DataError, match="holds another mesh; give another object_id"):
+            export_object(to, second, format=format)
+    assert before == {path: path.read_bytes() for path in folder.rglob("*.*")}
+    export_object(folder, second, format="bop", options=ExportOptions(object_id=2))
+    both = read_scene_gt(folder / "scene_gt.json")[0]
+    assert [each.model_id for each in both] == ["obj_000001", "obj_000002"]
+    np.testing.assert_array_equal(both[0].cam_from_model.packed, pose.cam_from_model.packed)
+    (view,) = first.views
+    other = replace(first, views=(replace(view, camera=replace(view.camera, fx=300.0)),))
+    with pytest.raises(DataError, match="photo 7 has another camera; give another image_id"):
+        export_object(folder, other, format="bop")
 
 
 @pytest.mark.parametrize(

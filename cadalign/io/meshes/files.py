@@ -190,13 +190,19 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
 
     Raises DataError if the file cannot be written.
     """
+    data = ply_mesh(mesh)
+    made_folder(path.parent)
+    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
+
+
+def ply_mesh(mesh: Mesh) -> bytes:
+    """The content of a file of `write_ply_mesh`."""
     import trimesh  # takes long to import, which OBJ files need not
 
-    made_folder(path.parent)
     colors = np.round(255 * spread_colors(mesh, _palette(mesh))).astype(np.uint8)
     plain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
-    data = trimesh.exchange.ply.export_ply(plain, vertex_normal=False)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
+    data: bytes = trimesh.exchange.ply.export_ply(plain, vertex_normal=False)
+    return data
 
 
 def _palette(mesh: Mesh) -> FloatArray:

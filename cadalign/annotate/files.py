@@ -44,7 +44,7 @@ from cadalign.io.documents import (
     within,
 )
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import checksum, read_bytes, write_json, writing
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SeenKeypoint
 
@@ -131,11 +131,13 @@ class Stored:
         return Priors(options.get("stretch_sigma"), focal)
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class AnnotationFiles:
     """Files of one object; the observation, which names photos and mesh, need not exist yet."""
 
     observation: Path
+    _known: bytes | None = field(default=None, init=False, repr=False)
+    """Checksum of the observation as it was last read or written; None before."""
 
     @property
     def fit(self) -> Path:
@@ -145,6 +147,7 @@ class AnnotationFiles:
     def read(self, photo: Path, model: OpenedModel, shape: ObjectShape) -> Stored:
         """Read an earlier session's annotation; new model points are added to the registry."""
         registry, stored = model.registry, Stored()
+        self._known = self._checksum()
         parts = []
         if self.observation.exists():
             observation = self._load()
@@ -172,10 +175,13 @@ class AnnotationFiles:
     def write(self, observation: Observation) -> None:
         """Write the observation as a whole; raises DataError on failure.
 
-        Killed at any moment, the file has everything of before or of now.
+        Killed at any moment, the file has everything of before or of now. A file that was changed
+        by others is refused.
         """
+        self._refuse_changed()
         earlier = self._earlier_unfinished()
         observation.save(self.observation)
+        self._known = self._checksum()
         if earlier is not None:
             _remove(earlier_unfinished_file(self.observation))
 
@@ -190,10 +196,21 @@ class AnnotationFiles:
 
     def remove(self) -> None:
         """Remove the files of a deleted object; raises DataError on failure."""
+        self._refuse_changed()
         for path in (self.observation, self.fit):
             _remove(path)
         with suppress(OSError):  # something else is in it
             self.fit.parent.rmdir()
+
+    def _refuse_changed(self) -> None:
+        if self._checksum() not in (None, self._known):
+            what = "was changed by another program since the annotator read or wrote it"
+            fix = "rename it to have all marks saved, or start anew to go on with that file"
+            raise DataError(what, where=str(self.observation), fix=fix)
+
+    def _checksum(self) -> bytes | None:
+        """The checksum of the observation's file; None where there is none."""
+        return checksum(read_bytes(self.observation)) if self.observation.exists() else None
 
     def _load(self) -> Observation:
         data = read_json(self.observation)

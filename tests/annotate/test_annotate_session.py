@@ -193,6 +193,25 @@ def test_errors_of_saving_are_shown_and_nothing_is_lost(
     assert len(page_state(case.open(), 0)["pairs"]) == 2
 
 
+def test_an_observation_that_others_changed_is_not_written_over(case: Case) -> None:
+    session = case.open(prepared=False)
+    place(session, 0, [10, 20])
+    data = json.loads(case.observation.read_text()) | {"object": "seat"}
+    case.observation.write_text(json.dumps(data))
+    for action in ({"do": "place_uv", "uv": [30, 40]}, {"do": "delete_object"}):
+        perform(session, 0, action)
+        assert page_state(session, 0)["saved"]["trouble"] == (
+            f"{case.observation}: was changed by another program since the annotator read or wrote "
+            "it; rename it to have all marks saved, or start anew to go on with that file"
+        )
+        assert json.loads(case.observation.read_text()) == data
+    perform(session, 0, {"do": "undo"})
+    case.observation.rename(case.folder / "theirs.json")
+    perform(session, 0, {"do": "place_uv", "uv": [50, 60]})
+    assert page_state(session, 0)["saved"]["trouble"] == ""
+    assert len(page_state(case.open(prepared=False), 0)["pairs"]) == 3
+
+
 def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
     instance = case.instance
     count = len(instance.points_3d)

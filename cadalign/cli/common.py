@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import tyro
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.io.files import finite, printable
+from cadalign.io.files import finite, printable, refuse_folder
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -164,6 +164,12 @@ def file_stems(names: Iterable[str | None], fallback: str) -> list[str]:
         chosen = next(each for each in chain([stem], numbered) if each.casefold() not in found)
         found[chosen.casefold()] = chosen
     return list(found.values())
+
+
+def make_folder_of(file: Path) -> None:
+    """Create the folder of an output file; raises DataError on failure, or if it is a folder."""
+    refuse_folder(file)
+    make_folder(file.absolute().parent)
 
 
 def make_folder(path: Path) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.common import answer, group_of, make_folder, say
+from cadalign.cli.common import answer, group_of, make_folder_of, say
 
 if TYPE_CHECKING:
     from cadalign.retrieval import Library
@@ -48,7 +48,7 @@ class LibraryBuild:
 
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
         dataset = dataset.subset(categories=self.categories, split=self.split)
-        make_folder(self.out.absolute().parent)
+        make_folder_of(self.out)
         folder = self.out.with_name(f"{self.out.stem}_build")
         with run_progress("reading models") as on_progress:
             library, troubles = build_library(

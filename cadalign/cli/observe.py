@@ -17,6 +17,7 @@ from cadalign.cli.common import (
     file_stem,
     file_stems,
     make_folder,
+    make_folder_of,
     new_console,
     say,
 )
@@ -114,7 +115,7 @@ class Observe(CameraOptions, EvidenceOptions):
     ) -> Observation:
         """Write the observation of one object in a photo."""
         observation = self._joined(found, model, image)
-        make_folder(out.parent)
+        make_folder_of(out)
         drawn = None if "mask" in self.given else self._write_mask(observation, found, out)
         observation = self.add_to(observation, mask=drawn)
         observation.save(out)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cadalign.cli.common import make_folder, new_console, say
+from cadalign.cli.common import make_folder_of, new_console, say
 from cadalign.cli.options import named_as_flags
 
 
@@ -61,7 +61,7 @@ class Render:
 
         with named_as_flags(self):
             job = RenderJob.of(self)
-        make_folder(self.out.absolute().parent)
+        make_folder_of(self.out)
         if self.out.suffix.lower() in MOVIES:
             frames, count = job.movie()
             shown = track(frames, "drawing", total=count, console=new_console(), transient=True)

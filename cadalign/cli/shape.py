@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from cadalign.cli.common import JsonOption, answer, group_of, make_folder, print_json, say
+from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
 from cadalign.cli.runs import run_progress
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping
@@ -43,6 +43,8 @@ class ShapeLearn:
         from cadalign.evaluation.runs.run import Progress
 
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
+        if self.out is not None:
+            make_folder_of(self.out)
         with run_progress(f"learning {self.category}") as on_progress:
             model = ShapeModel.from_dataset(
                 dataset,
@@ -53,7 +55,6 @@ class ShapeLearn:
                 on_progress=lambda done, total: on_progress(Progress(done, total)),
             )
         out = Path(f"{model.category}.shape") if self.out is None else self.out
-        make_folder(out.absolute().parent)
         model.save(out)
         say(f"{_text(model)}\nWritten: {out} ({out.stat().st_size / 1e6:.1f} MB)")
         return 0
@@ -72,7 +73,7 @@ class ShapeShow(JsonOption):
         """Open the model and describe it; returns the exit code."""
         model = ShapeModel.open(self.shape)
         if self.out is not None:
-            make_folder(self.out.absolute().parent)
+            make_folder_of(self.out)
             with keeping([self.shape]):
                 draw_shape(self.out, model)
         if self.json:

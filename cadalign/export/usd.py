@@ -18,7 +18,7 @@ from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, Frame
 from cadalign.export.scene_parts import PlacedPhoto, parts_of, placed_parts
 from cadalign.geometry.box import extent
-from cadalign.io.files import write_whole
+from cadalign.io.files import refuse_folder, write_whole
 from cadalign.io.images import ByteImage, write_image
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ def write_usd(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
         If a photo cannot be read.
     """
     _require_library()
+    refuse_folder(path)
     if path.suffix != ".usdz":
         _write_stage(path, exported, frame)
         return

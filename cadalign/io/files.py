@@ -36,6 +36,7 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     # The true ending stays last: some writers go by it.
     name = path.name if len(path.name) <= _MAX_NAME else f"{hash(path.name):x}{path.suffix}"
     with writing(path):
+        refuse_folder(path)
         refuse_input(path)
         unfinished = path.with_name(f".unfinished-{os.getpid()}-{name}")
         try:
@@ -67,6 +68,12 @@ def refuse_input(path: Path) -> None:
     if os.path.realpath(path) in _kept.get():
         what = "what is to be written is made from this file"
         raise DataError(what, where=printable(path), fix="give another name")
+
+
+def refuse_folder(path: Path) -> None:
+    """Raise a DataError for a folder in the place of a file that is to be written."""
+    if not path.name or path.is_dir():
+        raise DataError("is a folder", where=printable(path), fix="give a file's name")
 
 
 def write_text(path: Path, text: str) -> None:

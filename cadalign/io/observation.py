@@ -5,6 +5,7 @@ The file is described in docs/formats/observation.md.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -90,8 +91,9 @@ class Observation(ObservedImage):
     @property
     def files(self) -> tuple[Path, ...]:
         """The files that it names, and the materials beside the model."""
-        materials = None if self.model is None else self.model.with_suffix(".mtl")
-        named: list[Any] = [self.model, materials, self.shape]
+        named: list[Any] = [self.model, self.shape]
+        if self.model is not None:
+            named.append(Path(f"{os.path.splitext(self.model)[0]}.mtl"))
         for view in self.views:
             named += [view.image, *view.evidence.given.values()]
         return tuple(each for each in named if isinstance(each, Path))

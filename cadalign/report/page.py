@@ -60,7 +60,7 @@ from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.tables import Run
-from cadalign.io.files import as_path, dense_json, made_folder, write_text
+from cadalign.io.files import as_path, dense_json, made_folder, refuse_folder, write_text
 from cadalign.report.headline import Headline, headline_of
 from cadalign.report.instances import (
     INLINE_LIMIT,
@@ -123,6 +123,7 @@ def write_report(
     >>> write_report(["runs/before", "runs/after"], "compare.html")  # doctest: +SKIP
     """
     page = as_path(path)
+    refuse_folder(page)
     found = read_runs(runs)
     made_folder(page.parent)
     table, media, folder = None, {}, None

@@ -80,6 +80,27 @@ def test_observation_and_fit_are_told_apart(
     assert line == f"seen_fit/fit.json: the result of a fit, not an observation; {fix}"
 
 
+@pytest.mark.parametrize("out", [".", "..", "/", "", "sub"])
+def test_folder_is_no_file_to_write(
+    folder: Path, sample_root: Path, out: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("sub").mkdir()
+    assert main(["fit", "seen.json", "--no-picture"]) == 0
+    capsys.readouterr()
+    before = sorted(folder.rglob("*"))
+    for command in (
+        ["library", "build", str(sample_root), "--out"],
+        ["shape", "learn", str(sample_root), "--category", "chair", "--out"],
+        ["observe", "found.json", "model.keypoints.json", "--out"],
+        ["report", "none", "--out"],
+        ["export", "seen_fit", "--format", "obj", "--to"],
+        ["export", "seen_fit", "--format", "ply", "--to"],
+    ):
+        line = refusal_line(capsys, *command, out)
+        assert line == f"{out or '.'}: is a folder; give a file's name"
+    assert sorted(folder.rglob("*")) == before
+
+
 def test_folder_of_a_fit_is_exported(folder: Path) -> None:
     assert main(["fit", "seen.json"]) == 0
     assert main(["export", "seen_fit", "--to", "x.glb"]) == 0

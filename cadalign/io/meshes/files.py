@@ -10,7 +10,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh, spread_colors
-from cadalign.io.files import as_path, made_folder, write_text, write_whole
+from cadalign.io.files import as_path, made_folder, refuse_folder, write_text, write_whole
 from cadalign.io.images import write_image
 from cadalign.io.meshes.gltf_scene import read_gltf
 from cadalign.io.meshes.obj import read_obj
@@ -169,6 +169,7 @@ def write_obj_mesh(path: Path, mesh: Mesh) -> None:
 
     Raises DataError if a file cannot be written.
     """
+    refuse_folder(path)
     made_folder(path.parent)
     library = path.with_suffix(".mtl")
     names = [f"material_{number}" for number in range(len(mesh.materials))]

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from cadalign.errors import DataError
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import made_folder, write_json, write_text, writing
+from cadalign.io.documents import read_json
+from cadalign.io.files import made_folder, refuse_input, write_json, write_text, writing
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
@@ -18,6 +22,8 @@ from cadalign.render.scene import LIGHT_GREY
 from cadalign.retrieval.by_mask import cast_match
 from cadalign.retrieval.match import Match
 from cadalign.web import asset, fill
+
+_MATCHES = "matches.json"
 
 
 def write_retrieval(
@@ -34,21 +40,21 @@ def write_retrieval(
 
     The library is described by text. Without a photo the overlays are drawn on grey. For a query,
     ``match_01.json`` and so on are the observation of each match's model, and
-    ``match_01_fit/fit.json`` its result, which `cadalign export` takes.
+    ``match_01_fit/fit.json`` its result, which `cadalign export` takes. Those of an earlier
+    retrieval in the folder are removed.
     """
     if image is None:
         image = np.full((camera.height, camera.width, 3), LIGHT_GREY, dtype=np.uint8)
-    with writing(folder):  # overlays of an earlier retrieval, but no files with similar names
-        for path in folder.glob("overlay_*.png"):
-            number = path.stem.removeprefix("overlay_")
-            if number.isdecimal() and path.name == overlay_name(int(number)):
-                path.unlink()
+    _remove_earlier(folder)
+    # First, since it says which of the files are a retrieval's.
+    write_json(folder / _MATCHES, [match.to_dict() for match in matches])
     for rank, match in enumerate(matches, start=1):
-        write_image(folder / overlay_name(rank), draw_match(image, camera, match))
+        overlay, observation, fit = _files(folder, rank)
+        write_image(overlay, draw_match(image, camera, match))
         if query is not None:
-            match.observation(query).save(folder / f"match_{rank:02d}.json")
-            match.result.save(made_folder(folder / f"match_{rank:02d}_fit") / "fit.json")
-    write_json(folder / "matches.json", [match.to_dict() for match in matches])
+            match.observation(query).save(observation)
+            made_folder(fit.parent)
+            match.result.save(fit)
     none = none_text(matches)
     html = fill(
         "retrieval.html",
@@ -62,6 +68,29 @@ def write_retrieval(
     page = folder / "index.html"
     write_text(page, html)
     return page
+
+
+def _remove_earlier(folder: Path) -> None:
+    """Remove the files of an earlier retrieval's matches, but none with similar names."""
+    earlier: Any = None
+    with suppress(DataError):  # there is none
+        earlier = read_json(folder / _MATCHES)
+    count = len(earlier) if isinstance(earlier, list) else 0
+    files = [path for rank in range(1, count + 1) for path in _files(folder, rank)]
+    for path in files:
+        refuse_input(path)
+    for path in files:
+        with writing(folder):
+            path.unlink(missing_ok=True)
+        if path.parent != folder:
+            with suppress(OSError):  # something else is in it
+                path.parent.rmdir()
+
+
+def _files(folder: Path, rank: int) -> tuple[Path, Path, Path]:
+    """A match's overlay, observation and fit."""
+    name = f"match_{rank:02d}"
+    return folder / overlay_name(rank), folder / f"{name}.json", folder / f"{name}_fit" / "fit.json"
 
 
 def overlay_name(rank: int) -> str:

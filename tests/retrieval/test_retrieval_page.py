@@ -432,26 +432,34 @@ def test_a_page_shows_the_matches_side_by_side(
             page.close()
 
 
-@pytest.mark.long
-def test_fewer_matches_leave_no_old_overlays(case: Case, tmp_path: Path) -> None:
-    for top in (3, 2):
-        write_retrieval(
-            tmp_path, case.retrieve(top=top), CAMERA, title="t", library="l", image=None
-        )
-    assert len(list(tmp_path.glob("overlay_*.png"))) == 2
-
-
 @pytest.mark.slow
-def test_only_overlays_of_a_retrieval_are_removed(case: Case, tmp_path: Path) -> None:
-    mine = ["overlay_mine.png", "overlay_1.png", "overlay_007.png", "overlay_12_old.png"]
-    for name in (*mine, "overlay_12.png", "overlay_100.png"):
-        (tmp_path / name).touch()
-    write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l", image=None)
-    left = sorted(path.name for path in tmp_path.glob("overlay_*.png"))
-    assert left == sorted([*mine, "overlay_01.png"])
+def test_fewer_matches_leave_nothing_of_more(case: Case, tmp_path: Path) -> None:
+    mine = ["match_03_fit", "match_04.json", "overlay_03_old.png", "overlay_04.png"]
+    for top in (3, 1):
+        arguments = [*case.arguments, "--top", str(top), "--out", str(tmp_path)]
+        assert main(["retrieve", *arguments]) == 0
+        for name in mine[1:]:
+            (tmp_path / name).touch()
+        (tmp_path / "match_03_fit").mkdir(exist_ok=True)
+        (tmp_path / "match_03_fit" / "notes.txt").touch()
+    own = ["match_01.json", "match_01_fit", "overlay_01.png"]
+    assert sorted(path.name for path in tmp_path.glob("*_*")) == sorted([*own, *mine])
+    assert [path.name for path in (tmp_path / "match_03_fit").iterdir()] == ["notes.txt"]
+
+
+def test_an_observation_is_not_retrieved_into_its_own_folder(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["retrieve", *case.arguments, "--top", "2", "--out", str(tmp_path)]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
+    query = tmp_path / "match_02.json"
+    assert main(["retrieve", str(query), *case.arguments[1:], "--out", str(tmp_path)]) == 1
+    assert f"{query}: what is to be written is made from this file" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
 def test_an_old_overlay_that_cannot_be_removed_is_one_line(case: Case, tmp_path: Path) -> None:
+    (tmp_path / "matches.json").write_text("[{}, {}]")
     (tmp_path / "overlay_02.png").mkdir()
     with pytest.raises(DataError, match=f"{tmp_path}: cannot be written"):
         write_retrieval(tmp_path, case.retrieve(top=1), CAMERA, title="t", library="l", image=None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterable, Sequence
 
 from cadalign.datasets.photos import bop, kitti, objectron, pascal3d, pix3d, posed_photos, scan2cad
@@ -120,7 +121,11 @@ def write_photos(
             raise DataError("the folder is not empty", where=str(folder), fix="give a new one")
         folder.mkdir(parents=True, exist_ok=True)
     problems: list[InputError] = []
-    problems += writers[form](folder, placed_objects(photos, problems))
-    if len(problems) == count:
-        raise problems[0]
+    try:
+        problems += writers[form](folder, placed_objects(photos, problems))
+        if len(problems) == count:
+            raise problems[0]
+    except BaseException:  # what is half written would be in the way of another try
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
     return tuple(problems)

@@ -171,6 +171,8 @@ def test_what_objects_lack_is_told_and_the_others_are_written(tmp_path: Path) ->
     aside = replace(photo, camera=Camera(320, 240, 300, 300, 140, 119.5))
     with pytest.raises(InputError, match="Pix3D has the principal point in the image's middle"):
         write_photos(tmp_path / "aside", [aside], "pix3d")
+    # Nothing is in the way of another try.
+    assert [name for name in ("none", "boxes", "aside") if (tmp_path / name).exists()] == []
     escaping = replace(photo, objects=(replace(photo.objects[0], category="../../x"),))
     write_photos(tmp_path / "inside" / "set", [photo, escaping], "pix3d")
     assert not (tmp_path / "x").exists()

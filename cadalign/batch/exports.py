@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from cadalign.export.camera_files import write_nerf
 from cadalign.export.formats import export_object, format_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import join
-from cadalign.io.documents import parse_json
+from cadalign.io.documents import parse_json, written_path
 from cadalign.io.files import keeping, made_folder, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
@@ -83,8 +84,10 @@ def export_run(
         - ``json``: the observation of each, and its ``fit.json`` in a folder beside it;
         - ``overlay``: each model drawn over its photo, further views as ``000000_1.png``;
         - ``glb``: one file of each object, in a folder; or all in one, in the camera's frame;
-        - ``coco``: keypoints and poses as COCO's annotations;
-        - ``bop-results``: poses as BOP's CSV, each object's stretched mesh beside it;
+        - ``coco``: keypoints and poses as COCO's annotations, photos of several folders by their
+          paths in the one that holds them;
+        - ``bop-results``: poses as BOP's CSV, each object's stretched mesh beside it; photos have
+          the numbers that their names are, those without one, or with another's, the free ones;
         - ``colmap``, ``nerfstudio``: the cameras in the frame of the object that each sees;
         - ``bop``, ``kitti``, ``pix3d``, ``scan2cad``, ``objectron``: a data set with its photos.
     metres : float
@@ -234,8 +237,7 @@ def _write_overlays(
                     size = (camera.height, camera.width, 3)
                     photo = np.full(size, LIGHT_GREY, dtype=np.uint8)
                 drawn = overlay_model(photo, camera, scene, view.cam_from_model, style=style)
-                ending = f"_{number}" if number else ""
-                write_image(folder / f"{each.row:06d}{ending}.png", drawn)
+                write_image(folder / _png_name(each.row, number), drawn)
         except (InputError, DataError, RenderError) as error:
             left_out.append(error)
         else:
@@ -244,24 +246,33 @@ def _write_overlays(
 
 
 def _write_coco(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-    photos: dict[tuple[str, object], Photo] = {}
+    photos: dict[Path | str, Photo] = {}
     count = 0
     for photo in _photos(objects):
-        known = photos.setdefault((photo.name, photo.image), photo)
+        key = photo.image if isinstance(photo.image, Path) else photo.name
+        known = photos.setdefault(key, photo)
         if known is not photo:
-            more = replace(known, objects=known.objects + photo.objects)
-            photos[photo.name, photo.image] = more
+            photos[key] = replace(known, objects=known.objects + photo.objects)
         count += 1
-    write_coco_keypoints(_made_file(path, "keypoints.json"), list(photos.values()))
+    names = _names(photos)
+    named = [replace(photo, name=names.get(key, photo.name)) for key, photo in photos.items()]
+    write_coco_keypoints(_made_file(path, "keypoints.json"), named)
     return count
+
+
+def _names(photos: Iterable[Path | str]) -> dict[Path | str, str]:
+    """Names of the photos that are files, relative to the folder that holds them all."""
+    paths = {photo: Path(os.path.abspath(photo)) for photo in photos if isinstance(photo, Path)}
+    root = os.path.commonpath([path.parent for path in paths.values()]) if paths else ""
+    return {photo: path.relative_to(root).as_posix() for photo, path in paths.items()}
 
 
 def _photos(objects: Iterator[RunObject]) -> Iterator[Photo]:
     """The photos of objects, each object named after its row."""
     for each in objects:
-        for photo in photos_of(each.exported, category=each.category):
+        for number, photo in enumerate(photos_of(each.exported, category=each.category)):
             named = (replace(found, object_id=str(each.row)) for found in photo.objects)
-            name = photo.name if photo.image is not None else f"{each.row:06d}.png"
+            name = photo.name if photo.image is not None else _png_name(each.row, number)
             yield replace(photo, name=name, objects=tuple(named))
 
 
@@ -270,27 +281,29 @@ def _write_bop_results(
 ) -> int:
     """Poses of the stretched meshes, which stand beside them as ``obj_<row + 1>.ply``."""
     file = _made_file(path, "results.csv")
-    poses, entries, numbers = [], {}, dict[str, int]()
+    poses, photos, entries = [], list[Path | str](), {}
     for each in objects:
-        exported, number = each.exported, each.row + 1
+        exported, model = each.exported, each.row + 1
         scale = exported.views[0].cam_from_model.scale * exported.metres / _MILLIMETRES
         if exported.mesh is not None:
-            entries[number] = bop_files.write_model(
-                file.parent, exported.mesh.stretched(scale), number
+            entries[model] = bop_files.write_model(
+                file.parent, exported.mesh.stretched(scale), model
             )
         elif np.abs(scale - 1).max() > _SAME:
             what = "BOP's poses have no stretch, and there is no mesh to stretch instead"
             left_out.append(InputError(what, where=f"row {each.row}"))
             continue
-        for view in exported.views:
-            stem = Path(view.image_name or "").stem
-            image = int(stem) if stem.isdecimal() else numbers.setdefault(stem, len(numbers))
+        for number, view in enumerate(exported.views):
             rigid = _rigid(view.cam_from_model, exported.metres / _MILLIMETRES)
-            poses.append(PoseEstimate(_SCENE, str(image), str(number), rigid))
+            poses.append(PoseEstimate(_SCENE, "", str(model), rigid))
+            photos.append(_photo(view, _png_name(each.row, number)))
     if entries:
         bop_files.write_models_info(file.parent, entries)
     if poses:
-        bop_files.write_bop_results(file, poses)
+        numbers = bop_files.photo_numbers(photos)
+        numbered = zip(poses, photos, strict=True)
+        found = [replace(pose, image=str(numbers[photo])) for pose, photo in numbered]
+        bop_files.write_bop_results(file, found)
     return len({each.model_id for each in poses})
 
 
@@ -299,30 +312,55 @@ def _rigid(pose: Alignment, unit: float) -> Alignment:
     return Alignment(pose.rotation, pose.translation * unit, np.ones(3))
 
 
-def _write_cameras(
-    path: Path,
-    objects: Iterator[RunObject],
-    left_out: list[CadalignError],
-    *,
-    write: Callable[[Path, Sequence[CameraView]], None],
-) -> int:
-    """Write the cameras in the frame of the object that each sees [m], with names of their own."""
-    found, names = [], set[str]()
+def _photo(view: ExportView, name: str) -> Path | str:
+    """The file of a view's photo; the name of the view where it has none."""
+    return view.image if isinstance(view.image, Path) else name
+
+
+def _png_name(row: int, number: int) -> str:
+    """The name of the picture of an object's view."""
+    return f"{row:06d}_{number}.png" if number else f"{row:06d}.png"
+
+
+def _cameras(objects: Iterator[RunObject]) -> list[tuple[CameraView, Path | str]]:
+    """The cameras in the frame of the object that each sees [m], and their photos."""
+    found = []
     for each in objects:
         for number, view in enumerate(each.exported.views):
-            name = view.image_name or f"{each.row:06d}_{number}.png"
-            if name in names:
-                name = f"{each.row:06d}_{number}_{name}"
-            names.add(name)
             placed = _rigid(view.cam_from_model, each.exported.metres)
-            found.append(CameraView(view.camera, placed, name))
+            name = f"{each.row:06d}_{number}.png"
+            found.append((CameraView(view.camera, placed, name), _photo(view, name)))
+    return found
+
+
+def _write_colmap(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+    """Write the cameras with names of their own: a photo's first one has that of the photo."""
+    found, views = _cameras(objects), {}
+    names = _names(photo for _, photo in found)
+    for view, photo in found:
+        name = names.get(photo, view.name)
+        if name in views:
+            name = f"{Path(view.name).stem}_{name}"
+        views[name] = replace(view, name=name)
+    if views:
+        write_colmap(path, list(views.values()))
+    return len(views)
+
+
+def _write_nerf(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+    """Write the cameras with the paths of their photos."""
+    found = _cameras(objects)
     if found:
-        write(path, found)
+        file = _made_file(path, "transforms.json")
+        folder = file.parent.absolute()
+        views = [
+            replace(view, name=written_path(photo.absolute(), folder=folder))
+            if isinstance(photo, Path)
+            else view
+            for view, photo in found
+        ]
+        write_nerf(file, views)
     return len(found)
-
-
-def _write_nerf(path: Path, cameras: Sequence[CameraView]) -> None:
-    write_nerf(_made_file(path, "transforms.json"), cameras)
 
 
 def _write_data_set(
@@ -340,8 +378,8 @@ RUN_FORMATS: dict[str, Callable[[Path, Iterator[RunObject], list[CadalignError]]
     "overlay": _write_overlays,
     "glb": _write_glb,
     "coco": _write_coco,
-    "colmap": partial(_write_cameras, write=write_colmap),
-    "nerfstudio": partial(_write_cameras, write=_write_nerf),
+    "colmap": _write_colmap,
+    "nerfstudio": _write_nerf,
     "bop-results": _write_bop_results,
     **{form: partial(_write_data_set, form=form) for form in FORMS},
 }

@@ -117,17 +117,18 @@ def _bop(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
 def _bop_poses(exported: AlignedObject, options: ExportOptions) -> list[PoseEstimate]:
     """The poses of an object in its photos, in millimetres, of its stretched mesh.
 
-    A photo's number is that of its file's name, where that is one, or else its view's; the given
-    one is that of the first view.
+    Photos have the numbers of `bop_files.photo_numbers`; a given one is that of the first view.
     """
     poses = []
-    for number, view in enumerate(exported.views):
+    photos = [
+        view.image if isinstance(view.image, Path) else number
+        for number, view in enumerate(exported.views)
+    ]
+    numbers = bop_files.photo_numbers(photos)
+    for number, (photo, view) in enumerate(zip(photos, exported.views, strict=True)):
         pose = view.cam_from_model
         shift = pose.translation * exported.metres / bop.MILLIMETRES
-        stem = Path(view.image_name).stem
-        image = int(stem) if stem.isdecimal() else number
-        if options.image_id is not None:
-            image = options.image_id + number
+        image = numbers[photo] if options.image_id is None else options.image_id + number
         rigid = Alignment(pose.rotation, shift, np.ones(3))
         ids = str(options.scene_id), str(image), str(options.object_id)
         poses.append(PoseEstimate(*ids, rigid))

@@ -10,8 +10,9 @@ from __future__ import annotations
 import csv
 import io
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -82,6 +83,22 @@ Estimates = tuple[tuple[PoseEstimate, ...], tuple[DataError, ...]]
 def object_name(number: int) -> str:
     """The name of a model's files, as ``obj_000001``."""
     return f"obj_{number:06d}"
+
+
+def photo_numbers(photos: Iterable[Hashable]) -> dict[Hashable, int]:
+    """The numbers of different photos by their paths, or by what else stands for one.
+
+    A photo's number is its file's name, where that is one that no photo before it has; the others
+    have those that are left, from 0.
+    """
+    known = dict.fromkeys(photos)
+    named: dict[int, Hashable] = {}
+    for photo in known:
+        if isinstance(photo, Path) and photo.stem.isdecimal():
+            named.setdefault(int(photo.stem), photo)
+    numbers = {photo: number for number, photo in named.items()}
+    free = (number for number in count() if number not in named)
+    return numbers | {photo: next(free) for photo in known if photo not in numbers}
 
 
 def write_bop_results(path: Path, poses: Iterable[PoseEstimate]) -> None:

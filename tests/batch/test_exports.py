@@ -123,6 +123,27 @@ def test_glb_is_one_file_of_each_or_one_of_all(
     assert len(load_mesh(Path("all.glb")).faces) == 3 * len(FACES)
 
 
+def test_photos_of_one_name_are_told_apart(run: Path, tmp_path: Path) -> None:
+    names = ["a/0.jpg", "b/x.jpg", "a/img.jpg", "b/img.jpg", "b/0.jpg", "b/0.jpg"]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        Image.new("RGB", (640, 480)).save(tmp_path / name)
+    seen = [box_in(tmp_path / name, k, run.parent / "box.obj") for k, name in enumerate(names)]
+    cadalign.fit_many(seen, out=tmp_path / "run")
+    out = {form: tmp_path / form for form in ("bop-results", "coco", "colmap", "nerfstudio")}
+    for form, folder in out.items():
+        assert export_run(tmp_path / "run", folder, format=form).objects == 6
+    _, *rows = (out["bop-results"] / "results.csv").read_text().splitlines()
+    assert [row.split(",")[1] for row in rows] == ["0", "1", "2", "3", "4", "4"]
+    coco = json.loads((out["coco"] / "keypoints.json").read_text())
+    assert [image["file_name"] for image in coco["images"]] == names[:5]
+    assert [each["image_id"] for each in coco["annotations"]] == [0, 1, 2, 3, 4, 4]
+    cameras = {image.id for image in Colmap(out["colmap"])}
+    assert cameras == {*names[:5], "000005_0_b/0.jpg"}
+    frames = json.loads((out["nerfstudio"] / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"../{name}" for name in names]
+
+
 def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format: the format 'usd' holds one fit; of a run, give"):
         export_run(run, tmp_path / "out.usdz")

@@ -13,6 +13,7 @@ from support.exported import POSE, aligned, wedge
 from cadalign import Alignment
 from cadalign.datasets import Bop, load_mesh
 from cadalign.datasets.photos.bop_files import (
+    photo_numbers,
     read_bop_results,
     read_scene_gt,
     write_bop_results,
@@ -105,6 +106,13 @@ def test_models_of_other_objects_are_kept(tmp_path: Path) -> None:
         export_object(tmp_path / "a.csv", aligned(tmp_path), options=options)
     info = json.loads((tmp_path / "models" / "models_info.json").read_text())
     assert set(info) == {"1", "2"}
+
+
+def test_photos_of_one_name_have_numbers_of_their_own() -> None:
+    photos = [Path("a/x.png"), Path("a/7.png"), Path("b/0007.png"), Path("a/0.png"), 5]
+    assert list(photo_numbers(photos).items()) == [
+        *((photos[1], 7), (photos[3], 0), (photos[0], 1), (photos[2], 2), (5, 3))
+    ]
 
 
 def test_a_second_object_changes_nothing_of_the_first(tmp_path: Path) -> None:

@@ -172,6 +172,14 @@ def make_folder_of(file: Path) -> None:
     make_folder(file.absolute().parent)
 
 
+def beside(given: Path, ending: str) -> Path:
+    """An output folder beside an input, by its name; `.` and `..` have none of their own."""
+    if given.is_dir():
+        given = given.resolve()
+        return given.with_name(given.name + ending)
+    return given.with_name(given.stem + ending)
+
+
 def make_folder(path: Path) -> None:
     """Create an output folder; raises DataError on failure."""
     try:

@@ -13,6 +13,7 @@ import tyro
 from cadalign.cli.common import (
     NOTHING_WORKED,
     answer,
+    beside,
     exit_code,
     file_stems,
     make_folder,
@@ -131,7 +132,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
 
     def _write(self, fitted: FittedFile, path: Path) -> int:
         """Write and print what was fitted of a file; returns the exit code."""
-        out = self.out or path.with_name(f"{path.stem}_fit")
+        out = self.out or beside(path, "_fit")
         paths = fitted.write(out, overlay=self.overlay)
         if self.json:
             sys.stdout.write(fitted.text(out))
@@ -251,7 +252,7 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
                 loss_scale=options.loss_scale,
                 ransac=command.ransac if command.robust else None,
             )
-    folder = command.out or path.with_name(f"{path.stem}_fit")
+    folder = command.out or beside(path, "_fit")
     with keeping([path, *(file for each in seen.values() for file in each.files)]):
         texts = _write_scene(command, folder, scene, objects, list(seen.values()))
     if command.json:

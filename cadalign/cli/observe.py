@@ -13,6 +13,7 @@ import tyro
 
 from cadalign.cli.common import (
     answer,
+    beside,
     exit_code,
     file_stem,
     file_stems,
@@ -199,7 +200,7 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
     if command.image is not None and not command.image.is_dir():
         what = f"{command.image} is not a folder of photos"
         raise InputError(what, where="--image", fix="give the photos' folder, or leave out --every")
-    folder = command.out or command.keypoints.with_name(f"{command.keypoints.stem}_observations")
+    folder = command.out or beside(command.keypoints, "_observations")
     make_folder(folder)
     console = new_console()
     failed = 0

@@ -19,7 +19,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from cadalign.cli.common import exit_code, new_console, print_json, print_table, say
+from cadalign.cli.common import beside, exit_code, new_console, print_json, print_table, say
 from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
@@ -147,10 +147,7 @@ def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:
         return RunFolder(command.out)
     if len(command.observations) > 1 or not first.exists():
         return RunFolder(first.parent / kind)
-    if first.is_dir():  # resolved, since `.` and `..` have no name of their own
-        first = first.resolve()
-        return RunFolder(first.parent / f"{first.name}_{kind}")
-    return RunFolder(first.with_name(f"{first.stem}_{kind}"))
+    return RunFolder(beside(first, f"_{kind}"))
 
 
 def write_overlays(run: RunFolder, to: Path, style: OverlayStyle | None) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cadalign.cli.common import answer, exit_code, file_stems, make_folder, say, waiting
+from cadalign.cli.common import answer, beside, exit_code, file_stems, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import RansacOptions
@@ -107,7 +107,7 @@ class TrackCommand(CameraOptions):
                 fix = "give --video"
                 raise InputError("pictures as evidence need the video", where="--image", fix=fix)
             tracks = with_pictures(tracks, video, first=self.first_frame)
-        folder = self.out or self.detections.with_name(f"{self.detections.stem}_tracks")
+        folder = self.out or beside(self.detections, "_tracks")
         make_folder(folder)
         found, failures = self._estimate(tracks, shape, motion)
         if found:

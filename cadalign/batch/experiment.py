@@ -129,8 +129,10 @@ class ManyEstimates:
 def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     """Plan the estimates of the observations of all inputs.
 
-    Raises CadalignError if an input cannot be read, or what a detector's file needs is missing.
+    Raises CadalignError if an input or the camera cannot be read, or what a detector's file needs
+    is missing.
     """
+    options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
     tasks = read_sources(options.inputs)
     model = _model_keypoints(options) if tasks.has_detections else None
     config = {

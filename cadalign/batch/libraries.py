@@ -226,8 +226,8 @@ class RetrieveRunOptions(ManyOptions):
         return Estimated(best.observation(seen), best.result, cells, record)
 
     def contents(self) -> dict[str, Any]:
-        library, _ = self.estimate.opened()
-        return {"library_contents": library.fingerprint}
+        self.estimate.opened()  # which refuses what cannot be read
+        return super().contents()
 
 
 SPEC = replace(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -14,8 +15,9 @@ from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated
 from cadalign.evaluation.options import ExperimentOptions
-from cadalign.evaluation.runs.work import Columns, Row
+from cadalign.evaluation.runs.work import Columns, Row, fingerprint
 from cadalign.io.evidence import ObservedImage
+from cadalign.io.files import read_bytes
 from cadalign.io.images import photo_size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 from cadalign.shapes.model import ShapeModel
@@ -70,15 +72,20 @@ class ManyOptions(ExperimentOptions):
 
     def contents(self) -> dict[str, Any]:
         """Entries of a run's configuration that change with the contents of the options' files."""
-        raise NotImplementedError
+        paths = (path for path in _paths({**self._given(), "inputs": ()}) if path.is_file())
+        found = {str(path.absolute()): fingerprint(read_bytes(path)) for path in paths}
+        return {"files": found} if found else {}
 
     def as_config(self) -> dict[str, Any]:
         """The options in a run's configuration, without those that are at their defaults."""
+        return {name: _plain(value) for name, value in self._given().items()}
+
+    def _given(self) -> dict[str, Any]:
         given: dict[str, Any] = {}
         for each in fields(self):
             value = getattr(self, each.name)
             given |= _changed(value) if is_dataclass(value) else {each.name: value}
-        return {name: _plain(value) for name, value in given.items()}
+        return given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +117,8 @@ class FitRunOptions(ManyOptions):
 
     def contents(self) -> dict[str, Any]:
         shape, noise = self.estimate.shape, self.estimate.noise
-        found = {"shapes": None if shape is None else ShapeModel.open(shape).category}
+        category = None if shape is None else ShapeModel.open(shape).category
+        found = super().contents() | {"shapes": category}
         return found if noise is None else found | {"noise": str(opened_noise(noise))}
 
 
@@ -140,6 +148,15 @@ def _changed(part: Any) -> dict[str, Any]:
         if values[each.name] != plain:
             found[each.name] = values[each.name]
     return found
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """All paths in mappings and lists."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from _paths(each)
 
 
 def _plain(value: Any) -> Any:

@@ -16,6 +16,7 @@ from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import in_file, within
+from cadalign.io.files import time_of
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
@@ -339,7 +340,7 @@ class ObservationFit:
                     where=f"{where}: symmetry",
                     fix="leave out one of the two",
                 )
-            return _opened(shape)
+            return _opened(shape, time_of(shape))
         from cadalign.estimation.observed import model_of
         from cadalign.io.meshes.files import load_mesh
 
@@ -362,7 +363,7 @@ class ObservationFit:
 
 
 @lru_cache(maxsize=4)
-def _opened(path: Path) -> ShapeModel:
+def _opened(path: Path, _written: int) -> ShapeModel:
     """Open a learned shape, which runs use again and again."""
     from cadalign.shapes.model import ShapeModel
 

@@ -171,6 +171,14 @@ def open_input(path: Path, *, most: int = MOST_BYTES) -> Iterator[InputFile]:
         yield file
 
 
+def time_of(path: Path) -> int:
+    """Time at which a file was written, by which caches read it anew; 0 where there is none."""
+    try:
+        return path.stat().st_mtime_ns
+    except (OSError, ValueError):
+        return 0
+
+
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:
     """Read a regular file of at most ``most`` bytes; see `open_input`."""
     with open_input(path, most=most) as file:

@@ -15,6 +15,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
+from cadalign.io.files import time_of
 from cadalign.io.images import is_grey, open_photo, read_image, read_mask
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
@@ -53,8 +54,8 @@ class ObservationRetrieval:
         InputError
             If two shapes are of the same category.
         """
-        shapes = tuple((path, _time_of(path)) for path in self.shape)
-        return _opened_library(self.library, _time_of(self.library)), _opened_shapes(shapes)
+        shapes = tuple((path, time_of(path)) for path in self.shape)
+        return _opened_library(self.library, time_of(self.library)), _opened_shapes(shapes)
 
     def retrieve(
         self, seen: Observation, where: str, *, mask: BoolArray | None = None, workers: int = -1
@@ -97,14 +98,6 @@ class ObservationRetrieval:
             image=read_opacity(seen.image, camera) if self.silhouette else None,
             workers=workers,
         )
-
-
-def _time_of(path: Path) -> int:
-    """Time at which a file was written, so that it is read anew then; 0 where there is none."""
-    try:
-        return path.stat().st_mtime_ns
-    except (OSError, ValueError):
-        return 0
 
 
 @lru_cache(maxsize=4)

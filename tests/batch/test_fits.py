@@ -27,6 +27,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.io.observation import DetectorOptions, ObservationChanges
 
 CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 POINTS = np.random.default_rng(1).uniform(-1, 1, (8, 3))
@@ -322,6 +323,22 @@ def test_the_configuration_says_what_is_not_at_its_default() -> None:
     assert config["similar"] is True
     assert config["fitting"]["loss"] == "cauchy"
     assert config["camera"] == str(Path("K.txt").absolute())
+
+
+def test_the_contents_are_those_of_every_file_that_options_name(tmp_path: Path) -> None:
+    names = ("K.txt", "mask.png", "depth.npy", "model.keypoints.json")
+    camera, mask, depth, model = paths = [tmp_path / name for name in names]
+    changes = ObservationChanges(camera=camera, evidence={"mask": mask, "depth": depth})
+    detector = DetectorOptions(model=model, images=tmp_path)
+    options = FitRunOptions(inputs=(tmp_path / "o.json",), changes=changes, detector=detector)
+    seen = [options.contents()]
+    assert "files" not in seen[0]
+    for path in paths:
+        for text in ("1", "2"):  # of the same size, written in the same moment
+            path.write_text(text)
+            seen.append(options.contents())
+            assert seen[-1] != seen[-2]
+    assert set(seen[-1]["files"]) == set(map(str, paths))
 
 
 def test_failures_are_counted_by_reason(tmp_path: Path) -> None:

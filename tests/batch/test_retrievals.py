@@ -185,7 +185,7 @@ def test_another_library_is_another_run(
     assert main(["retrieve", str(case.queries), *run]) == 0
     Library.from_models(list(case.library)[:5]).save(path)
     assert main(["retrieve", str(case.queries), *run]) == 1
-    assert "another configuration: library_contents is" in capsys.readouterr().err
+    assert f"another configuration: files.{path} is" in capsys.readouterr().err
 
 
 def test_a_match_is_a_result(case: Case, tmp_path: Path) -> None:

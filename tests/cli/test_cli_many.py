@@ -104,6 +104,39 @@ def test_a_detectors_file_needs_no_observations(
     assert "--model: the keypoints of the model are not known; give the" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["K.txt", "model.keypoints.json"])
+def test_a_run_does_not_go_on_with_another_camera_or_model(
+    folder: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    arguments = ["fit", str(folder / "found.json"), "--camera", str(folder / "K.txt")]
+    arguments += ["--model", str(folder / "model.keypoints.json"), "--no-picture"]
+    assert main([*arguments, "--out", str(folder / "out")]) == 0
+    if name == "K.txt":
+        np.savetxt(folder / name, np.diag([2, 2, 1]) @ CAMERA.matrix)
+    else:
+        rows = zip(NAMES, (1.5 * POINTS).tolist(), strict=True)
+        moved = (ModelKeypoint(each, tuple(xyz)) for each, xyz in rows)
+        ModelKeypoints(tuple(moved)).save(folder / name)
+    capsys.readouterr()
+    assert main([*arguments, "--out", str(folder / "out")]) == 1
+    text = capsys.readouterr().err
+    assert f"holds a run with another configuration: files.{folder / name} is " in text
+    main([*arguments, "--out", str(folder / "again")])  # what this process has read is not kept
+    row = next(csv.DictReader((folder / "again" / "results.csv").open()))
+    assert float(row["focal_length"]) == (1400 if name == "K.txt" else 700)
+
+
+def test_a_camera_that_cannot_be_read_is_refused_before_the_run(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "K.txt").write_text("1 2 3")
+    model = ["--model", str(folder / "model.keypoints.json"), "--out", str(folder / "out")]
+    camera = ["--camera", str(folder / "K.txt")]
+    assert main(["fit", str(folder / "found.json"), *camera, *model]) == 1
+    assert f"{folder / 'K.txt'}: not a calibration matrix; give" in capsys.readouterr().err
+    assert not (folder / "out").exists()
+
+
 def test_what_is_wrong_with_the_inputs_is_one_line(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

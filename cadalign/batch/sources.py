@@ -21,7 +21,7 @@ import msgspec
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
-from cadalign.evaluation.runs.work import fingerprint
+from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
 from cadalign.io.files import open_input, read_bytes
 from cadalign.io.observation import (
     DETECTOR,
@@ -70,15 +70,7 @@ class Files(list[Path]):
         return [ObservationTask(row, str(path), None, _folder(path)) for row, path in chosen]
 
     def fingerprint(self) -> str:
-        """Names, sizes and times of the files: to read thousands would take as long as the run."""
-        lines = []
-        for path in self:
-            try:
-                status = path.stat()
-            except (OSError, ValueError):
-                continue  # its row says so
-            lines.append(f"{path.name} {status.st_size} {status.st_mtime_ns}\n")
-        return fingerprint(*lines)
+        return fingerprint_of_files(self)
 
 
 class Lines:

@@ -150,6 +150,11 @@ class Bop(PhotoDataset):
     """
 
     kind = "BOP"
+    patterns = (
+        *(f"{level}scene_*.json" for level in ("", "*/", "*/*/")),
+        *(f"{level}{_CAMERA}" for level in ("../../", "../", "", "*/", "*/*/")),
+        *(f"{level}models*/models_info.json" for level in ("../../../", "../../", "../", "")),
+    )
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")

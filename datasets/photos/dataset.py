@@ -87,6 +87,8 @@ class PhotoDataset(ABC):
 
     kind: str = "photos"
     """Name of the format."""
+    patterns: tuple[str, ...] = ("*.json",)
+    """Patterns of the annotations' files, below the folder."""
 
     def __init__(
         self, root: Path, names: Iterable[str], problems: dict[str, DataError] | None = None
@@ -134,6 +136,11 @@ class PhotoDataset(ABC):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({str(self.root)!r}): {len(self)} photos"
+
+    def annotation_files(self) -> list[Path]:
+        """List the files of the annotations, by which a run knows those that it began with."""
+        found = (path for pattern in self.patterns for path in self.root.glob(pattern))
+        return sorted({path for path in found if path.is_file()})
 
     def open_poses(self, path: Path) -> PoseFile:
         """Open a file of poses that were estimated on this data set.

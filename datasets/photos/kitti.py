@@ -106,6 +106,10 @@ class KittiCars(PhotoDataset):
     """
 
     kind = "KITTI"
+    patterns = (
+        *("*.json", "label_*/*.txt", "calib/*.txt"),
+        *("training/label_*/*.txt", "training/calib/*.txt"),
+    )
 
     def __init__(
         self, root: str | os.PathLike[str], *, categories: Iterable[str] = ("Car",)

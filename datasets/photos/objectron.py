@@ -45,6 +45,10 @@ from cadalign.io.images import ByteImage
 ANNOTATIONS = "annotations"
 _GEOMETRY = "geometry.pbdata"
 _LEVELS = ("", "*/", "*/*/", "*/*/*/")
+_PATTERNS = (
+    *(f"{level}*.pbdata" for level in _LEVELS),
+    *(f"{ANNOTATIONS}/{level}*.json" for level in _LEVELS),
+)
 # Objects come first in a JSON file, and there are few.
 _BEGINNING = 2**16
 _BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
@@ -108,6 +112,7 @@ class Objectron(PhotoDataset):
     """
 
     kind = "Objectron"
+    patterns = _PATTERNS
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")
@@ -164,8 +169,7 @@ class Objectron(PhotoDataset):
 
 def list_annotations(folder: Path) -> list[Path]:
     """List the annotation files: ``.pbdata``, and ``.json`` in ``annotations``; four levels."""
-    found = [path for level in _LEVELS for path in folder.glob(f"{level}*.pbdata")]
-    found += [path for level in _LEVELS for path in (folder / ANNOTATIONS).glob(f"{level}*.json")]
+    found = (path for pattern in _PATTERNS for path in folder.glob(pattern))
     return sorted(path for path in found if path.name != _GEOMETRY)
 
 

@@ -53,6 +53,7 @@ _FIRST_PIXEL = 1.0
 _VIEWPORT = 3000.0
 _VISIBLE = 1
 _CAD_FOLDERS = ("CAD", "CAD/mat", "cad")
+_CAD = "[Cc][Aa][Dd]/**/*.mat"  # files in any of these
 _IMAGE_FOLDERS = ("Images", "images")
 _IMAGES = (".jpg", ".JPEG", ".jpeg", ".png")
 _FLAGS = ("truncated", "occluded", "difficult")
@@ -77,6 +78,7 @@ class Pascal3D(PhotoDataset):
     """
 
     kind = "PASCAL3D+"
+    patterns = (f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat", _CAD)
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")
@@ -276,6 +278,7 @@ class Pascal3DDetections(PhotoDataset):
     """
 
     kind = "PASCAL3D+ photos with detected keypoints"
+    patterns = (f"{DETECTED}/*.mat", f"{_OBSERVATIONS}/*.json", _CAD)
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")

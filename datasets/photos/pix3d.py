@@ -82,6 +82,7 @@ class Pix3D(PhotoDataset):
     """
 
     kind = "Pix3D"
+    patterns = (ANNOTATIONS, "model/**/*.txt")
 
     def __init__(self, root: str | os.PathLike[str]) -> None:
         folder = as_path(root, "root")

@@ -130,6 +130,12 @@ class Scan2CAD(PhotoDataset):
     """
 
     kind = "Scan2CAD"
+    patterns = (
+        *("*.json", "samples/*.json"),
+        *(f"{folder}/*/pose/*.txt" for folder in _FRAME_FOLDERS),
+        *(f"{folder}/*/intrinsic/*.txt" for folder in _FRAME_FOLDERS),
+        *(f"{folder}/scannet_*.txt" for folder in _FRAME_FOLDERS),
+    )
 
     def __init__(
         self,

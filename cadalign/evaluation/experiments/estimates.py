@@ -87,6 +87,7 @@ def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
     from cadalign.evaluation.photos.given import estimates_benchmark, opened_estimates
     from cadalign.evaluation.photos.target import PhotoTasks, opened
 
+    opened.cache_clear()  # of a session that has changed its files
     dataset = opened(options.root)
     methods = method_names(options.estimates)
     tasks = PhotoTasks(dataset, options.max_photos)

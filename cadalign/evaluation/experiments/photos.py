@@ -215,6 +215,7 @@ def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     from cadalign.evaluation.photos.target import PhotoTasks, opened
     from cadalign.evaluation.shape_files import shapes_fingerprint, shapes_of
 
+    opened.cache_clear()  # of a session that has changed its files
     dataset = opened(options.root)
     protocol = protocols.protocol_of(dataset.kind)
     shapes = shapes_of(options.shape, dataset.root)

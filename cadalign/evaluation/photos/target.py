@@ -17,7 +17,13 @@ from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoOb
 from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import Case, Tasks
 from cadalign.evaluation.instances.record import box_alignment
-from cadalign.evaluation.runs.work import UNREADABLE, LeftOutError, Row, fingerprint
+from cadalign.evaluation.runs.work import (
+    UNREADABLE,
+    LeftOutError,
+    Row,
+    fingerprint,
+    fingerprint_of_files,
+)
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -50,6 +56,7 @@ class PhotoTasks(Tasks[PhotoTask]):
         self._names = dataset.names[:max_photos]
         bad = dataset.problems.items() if max_photos is None else ()
         self._bad = tuple((name, str(error)) for name, error in bad)
+        self._annotations = fingerprint_of_files(dataset.annotation_files())
         if not len(self):
             raise DataError("there are no photos", where=str(dataset.root))
 
@@ -63,8 +70,8 @@ class PhotoTasks(Tasks[PhotoTask]):
         return PhotoTask(-1, *self._bad[index - len(self._names)])
 
     def fingerprint(self) -> str:
-        """Hash of the photos' names: a run must not go on with others."""
-        return fingerprint("\0".join(self._names), repr(self._bad))
+        """Hash of the photos' names and annotations: a run must not go on with others."""
+        return fingerprint("\0".join(self._names), repr(self._bad), self._annotations)
 
 
 opened = lru_cache(maxsize=1)(open_photos)

@@ -31,7 +31,7 @@ from cadalign.evaluation.api import evaluate, run
 from cadalign.evaluation.experiments.photos import SPEC, PhotosOptions
 from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.photos.given import score_poses, summarize_rows
-from cadalign.evaluation.photos.target import farthest_points, opened
+from cadalign.evaluation.photos.target import PhotoTasks, farthest_points, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
@@ -328,6 +328,32 @@ class TestRuns:
         options = PhotosOptions(root, methods=("rigid",), similar_sigma=0.1)
         text = refusal_text(lambda: run(options, RunFolder(tmp_path / "run"), workers=0, dask=None))
         assert "similar_sigma is 0.04 there and 0.1 now" in text
+
+    def test_changed_annotations_are_refused(self, tmp_path: Path) -> None:
+        root = write_kitti(tmp_path / "data")
+        done(root, tmp_path / "run", methods=("rigid",))
+        cars = json.loads((root / "cars.json").read_text())
+        for car in cars:
+            car["rotation_y"] += 0.5
+        write_json(root / "cars.json", cars)
+        options = PhotosOptions(root, methods=("rigid",))
+        text = refusal_text(lambda: run(options, RunFolder(tmp_path / "run"), workers=0, dask=None))
+        assert "holds a run with another configuration: annotations is" in text
+        run(options, RunFolder(tmp_path / "again"), workers=0, dask=None)
+        errors = SPEC.open(tmp_path / "again").results["yaw_error_deg"].to_numpy()
+        assert (errors > 20).all()  # of the changed file, which is read anew
+
+    @pytest.mark.parametrize("kind", WRITERS)
+    def test_every_file_of_annotations_counts(self, tmp_path: Path, kind: str) -> None:
+        WRITERS[kind](tmp_path / "data")
+        dataset = opened(tmp_path / "data")
+        seen = {PhotoTasks(dataset, None).fingerprint()}
+        ends = (".json", ".txt", ".mat")
+        files = [path for path in dataset.root.rglob("*") if path.suffix in ends]
+        for path in files:
+            path.write_bytes(path.read_bytes() + b"\n")
+            seen.add(PhotoTasks(dataset, None).fingerprint())
+        assert len(seen) == len(files) + 1
 
     def test_as_one_call(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data", photos=2)

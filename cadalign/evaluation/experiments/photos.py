@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from cadalign.evaluation.metrics.bop import BOP
 from cadalign.evaluation.metrics.photos import DEPTH as DEPTH_ERROR
 from cadalign.evaluation.metrics.photos import IOU_3D, KITTI, NINE_DOF, ROTATION, VIEWPOINT
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.metrics.sets import medians_of, score_columns, shares_of
+from cadalign.evaluation.metrics.sets import measured_columns, medians_of, score_columns, shares_of
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
 from cadalign.evaluation.options import FunctionOptions, PhotoOptions
 from cadalign.evaluation.photos import protocols
@@ -122,7 +122,8 @@ def summarize_cells(
 ) -> list[Summary]:
     """Summaries of the columns of a result table; see `summarize`."""
     marked = {**cells, "category": _categories(cells)}
-    found = summaries_of(marked, methods, _summarize, further=further)
+    summarize = partial(_summarize, measured=measured_columns(protocols.SETS, cells))
+    found = summaries_of(marked, methods, summarize, further=further)
     names = dict.fromkeys(each.group for each in found if each.group not in (ALL, UNREADABLE))
     if len(names) < 2:
         return found
@@ -164,7 +165,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     )
 
 
-def _summarize(category: str, method: str, cells: Cells) -> Summary:
+def _summarize(category: str, method: str, cells: Cells, *, measured: Collection[str]) -> Summary:
     chosen = where(cells, cells["method"] == method)
     left_out = chosen["status"] == LEFT_OUT
     rated = where(chosen, ~left_out)
@@ -175,7 +176,7 @@ def _summarize(category: str, method: str, cells: Cells) -> Summary:
         metrics.LEFT_OUT.key: int(left_out.sum()),
         "keypoints": mean_of(solved["keypoints"]),
         **medians_of(protocols.SETS, solved, metrics.RMS),
-        **shares_of(protocols.SETS, rated, solved),
+        **shares_of(protocols.SETS, rated, solved, measured=measured),
         "milliseconds": milliseconds(solved),
     }
     return Summary(category, {"category": category, "method": method}, values)

@@ -6,7 +6,7 @@ is a module, and its place in `cadalign.evaluation.photos.protocols`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -88,17 +88,33 @@ def medians_of(sets: Sequence[MetricSet], solved: Cells, *further: Metric) -> di
     return found
 
 
-def shares_of(sets: Sequence[MetricSet], rated: Cells, solved: Cells) -> dict[str, float]:
-    """Shares of all objects whose truth is known, of which failures count as misses."""
+def measured_columns(sets: Sequence[MetricSet], cells: Cells) -> frozenset[str]:
+    """The columns that have a value in some row of a whole table: what its truth allows."""
+    names = (name for each in sets for name in each.columns)
+    return frozenset(name for name in names if len(known(cells[name])))
+
+
+def shares_of(
+    sets: Sequence[MetricSet], rated: Cells, solved: Cells, *, measured: Collection[str] = ()
+) -> dict[str, float]:
+    """Shares of all objects whose truth is known, of which failures count as misses.
+
+    Columns that were ``measured`` elsewhere have a share where nothing was solved, too.
+    """
     failures = int((rated["status"] == FAILED).sum())
+    may_be_all = failures > 0 and not len(solved["status"])
+
+    def share(total: float, count: int, column: Metric) -> float:
+        is_known = count > 0 or (may_be_all and column.key in measured)
+        return total / (count + failures) if is_known else np.nan
+
     found = {}
     for rate in (rate for each in sets for rate in each.rates):
         count = int(np.isfinite(solved[rate.column.key].astype(float)).sum())
-        within = float(rate.is_within(solved).sum())
-        found[rate.metric.key] = _share(within, count, failures)
+        found[rate.metric.key] = share(float(rate.is_within(solved).sum()), count, rate.column)
     for metric in (metric for each in sets for metric in each.shares):
         values = known(solved[metric.key])
-        found[metric.key] = _share(float(values.sum()), len(values), failures)
+        found[metric.key] = share(float(values.sum()), len(values), metric)
     for metric, parts in (pair for each in sets for pair in each.means):
         shares = [found[part.key] for part in parts]
         found[metric.key] = float(np.nanmean(shares)) if np.isfinite(shares).any() else np.nan
@@ -108,8 +124,3 @@ def shares_of(sets: Sequence[MetricSet], rated: Cells, solved: Cells) -> dict[st
 def numbers(cells: Cells, metric: Metric) -> Any:
     """A column of numbers, NaN where one is missing."""
     return cells[metric.key].astype(float)
-
-
-def _share(total: float, count: int, failures: int) -> float:
-    """A mean over values and failures, which count as 0; NaN where no value is known."""
-    return total / (count + failures) if count else np.nan

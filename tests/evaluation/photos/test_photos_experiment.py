@@ -144,6 +144,17 @@ class TestMadeUpErrors:
             "poses: the data set has no object '0' with a pose in the photo 'test/000001/7'"
         )
 
+    def test_a_category_where_everything_failed_counts(self, tmp_path: Path) -> None:
+        dataset = cadalign.datasets.open(write_bop(tmp_path / "data"))
+        found = dataset[0].objects[0].truth.cam_from_model
+        solved, failed = score_poses(dataset, {("test/000001/0", "0"): found})
+        lines = summarize_rows([solved, failed, {**failed, "category": "other"}])
+        shares = {line.group: line.values["mssd_recall"] for line in lines}
+        own = solved["category"]
+        assert shares == {own: 0.5, "other": 0, "all": 1 / 3, "mean of categories": 0.25}
+        others = {line.group: line.values["scan2cad_aligned"] for line in lines}
+        assert np.isnan(list(others.values())).all()  # of another data set's protocol
+
     def test_scan2cad_wants_all_three_thresholds(self, tmp_path: Path) -> None:
         """Scales are off by 18 and 30 % of one axis: the mean is within 20 %, the axis is not."""
         dataset = cadalign.datasets.open(write_scan2cad(tmp_path / "data"))

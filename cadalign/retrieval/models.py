@@ -25,7 +25,7 @@ import pyarrow.compute as pc
 
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_points, read_only
 from cadalign.datasets import AnnotatedModel, Circle, RotationalSymmetry, Symmetries, load_mesh
-from cadalign.errors import DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.box import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import Seal, as_path
@@ -61,7 +61,8 @@ class LibraryModel:
     Raises
     ------
     InputError
-        If shapes don't match, a value is NaN or infinite, or a semantic id occurs twice.
+        If shapes don't match, a value is NaN, infinite or beyond 1e50, or a semantic id occurs
+        twice.
     """
 
     category: str
@@ -80,6 +81,8 @@ class LibraryModel:
         where = f"{self.category}, model {self.model_id}"
         xyz = as_points(self.xyz, name=f"{where}, xyz", dimension=3)
         bounds = as_floats(self.bounds, name=f"{where}, bounds", shape=(2, 3))
+        if not max(np.abs(xyz).max(initial=0), np.abs(bounds).max()) < _LARGEST:
+            raise InputError(f"a coordinate exceeds {_LARGEST:g}", where=where)
         ids = check_semantic_ids(self.ids, len(xyz), where=f"{where}, ids")
         for name, value in (("xyz", xyz), ("bounds", bounds), ("ids", ids)):
             object.__setattr__(self, name, read_only(value))
@@ -254,10 +257,10 @@ class ModelTable:
 
 
 def read_annotated(model: AnnotatedModel) -> tuple[LibraryModel, str]:
-    """A data set's model, and why its bounds are the keypoints' where the mesh cannot be read."""
+    """A data set's model, and why its bounds are the keypoints' where the mesh cannot be used."""
     try:
         return LibraryModel.of_annotated(model), ""
-    except DataError as error:
+    except CadalignError as error:
         return LibraryModel.of_annotated(model, with_mesh=False), str(error)
 
 

@@ -19,7 +19,6 @@ from cadalign.io.documents import (
     Count,
     ForeignDocument,
     Id,
-    NotNegative,
     Point3,
     convert,
     read_json,
@@ -32,6 +31,9 @@ _FIX = "repair or remove this model's annotation"
 # Real barycentric coordinates sum to 0.999 ... 1.001.
 _SUM_TOLERANCE = 0.01
 _NO_POINT = -1
+# Whose powers are numbers, also in single precision.
+_Coordinate = Annotated[float, Meta(ge=-1e30, le=1e30)]
+_Place = tuple[_Coordinate, _Coordinate, _Coordinate]
 
 
 @renamed(semantic_ids="ids")
@@ -136,7 +138,7 @@ class _CloudInfo(ForeignDocument):
 
 
 class _Keypoint(ForeignDocument):
-    xyz: Point3
+    xyz: _Place
     semantic_id: Count
     mesh_info: _MeshInfo
     pcd_info: _CloudInfo | None = None
@@ -144,8 +146,8 @@ class _Keypoint(ForeignDocument):
 
 
 class _Circle(ForeignDocument):
-    center: Point3
-    radius: NotNegative
+    center: _Place
+    radius: Annotated[float, Meta(ge=0, le=1e30)]
     normal: Point3
 
     def __post_init__(self) -> None:

@@ -249,6 +249,7 @@ def _set(path: str, value: object):
         ("keypoints.1.xyz", KeyError, "keypoints[1].xyz: missing"),
         ("keypoints.1.xyz", [0, float("nan"), 0], "keypoints[1].xyz[1]: nan is not a finite"),
         ("keypoints.1.xyz", [0, 10**400, 0], "keypoints[1].xyz"),
+        ("keypoints.1.xyz", [0, -1e300, 0], "keypoints[1].xyz[1]: -1e+300 is not a"),
         ("keypoints.1.xyz", [0, "1", 0], "keypoints[1].xyz"),
         ("keypoints.1.xyz", [0, True, 0], "keypoints[1].xyz"),
         ("keypoints.1.xyz", [0, 1], "keypoints[1].xyz"),

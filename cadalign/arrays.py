@@ -84,9 +84,14 @@ def is_masked(value: object) -> bool:
     return isinstance(value, np.ndarray) and bool(np.any(getattr(value, "mask", False)))
 
 
+def is_real(value: Any) -> bool:
+    """True for a real number, of NumPy or not, finite or not."""
+    return isinstance(value, _NUMBERS) and not isinstance(value, bool | np.timedelta64)
+
+
 def is_number(value: Any) -> bool:
     """True for a finite real number, of NumPy or not."""
-    if not isinstance(value, _NUMBERS) or isinstance(value, bool | np.timedelta64):
+    if not is_real(value):
         return False
     try:
         return math.isfinite(value)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError, unknown
 from cadalign.evaluation.methods.registry import register_method
-from cadalign.evaluation.metrics.registry import register_metric
+from cadalign.evaluation.metrics.registry import refuse_taken, register_metric
 from cadalign.evaluation.options import ExperimentOptions, tuples
 from cadalign.evaluation.portable import names_of
 from cadalign.evaluation.registry import spec_named
@@ -167,4 +167,6 @@ def prepared(
     """The plan and the workers of `run`."""
     count = options.default_workers if workers is None else workers
     pool = workers_of(count, dask, threads=options.threads)
-    return spec_named(options.experiment).plan(options, folder), pool
+    spec = spec_named(options.experiment)
+    refuse_taken(getattr(options, "metrics", ()), [column.key for column in spec.columns])
+    return spec.plan(options, folder), pool

@@ -117,8 +117,14 @@ def test_what_a_broken_metric_raises_is_the_reason_of_its_rows() -> None:
     assert set(table.reason) == {"metric broken: RuntimeError: divided"}
     register_metric("text", lambda *, est: "far")
     assert set(simulate(metrics=["text"]).reason) == {"metric text: it returned str, no number"}
-    register_metric("nothing", lambda *, est: None)
-    assert simulate(metrics=["nothing"]).nothing.isna().all()
+    for value, text in ((float("inf"), "inf"), (10**400, "1000")):
+        register_metric("endless", lambda *, est, value=value: value)
+        (reason,) = set(simulate(metrics=["endless"]).reason)
+        assert reason.startswith(f"metric endless: it returned {text}")
+        assert reason.endswith(", which is not finite")
+    for value in (None, float("nan")):
+        register_metric("nothing", lambda *, est, value=value: value)
+        assert simulate(metrics=["nothing"]).nothing.isna().all()
 
 
 def test_a_run_does_not_go_on_without_its_metrics(tmp_path: Path) -> None:
@@ -154,6 +160,13 @@ def test_names_that_are_unknown_or_taken_are_refused() -> None:
     register_metric("rotation_error_deg", depth_error)
     with pytest.raises(InputError, match="the table has a column 'rotation_error_deg'"):
         simulate(metrics=["rotation_error_deg"])
+
+
+@pytest.mark.parametrize("name", ["failed", "instances", "success_5deg_5pct", "over_limit"])
+def test_names_of_the_summary_are_refused(sample_root: Path, name: str) -> None:
+    register_metric(name, depth_error)
+    with pytest.raises(InputError, match=f"the table has a column '{name}'; register the"):
+        cadalign.evaluate(sample_root, metrics=[name], workers=0)
 
 
 @pytest.mark.slow

@@ -13,11 +13,11 @@ On the command line it is ``--plugin my_metrics --metrics flipped``, where the m
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from cadalign.arrays import is_number
+from cadalign.arrays import is_number, is_real
 from cadalign.errors import InputError, quote, unknown
 from cadalign.evaluation.methods.method import MethodInput
 from cadalign.evaluation.metrics.table import Metric
@@ -77,11 +77,12 @@ class RegisteredMetric:
             value = self.function(**arguments)
         except Exception as error:
             raise InputError(f"{type(error).__name__}: {error}", where=where) from None
-        if value is None or (is_number(value) and value != value):
+        if value is None or (is_real(value) and value != value):
             return None
         if not is_number(value):
-            kind = type(value).__name__
-            raise InputError(f"it returned {kind}, no number", where=where)
+            of_kind = f"{type(value).__name__}, no number"
+            what = f"{quote(value)}, which is not finite" if is_real(value) else of_kind
+            raise InputError(f"it returned {what}", where=where)
         return float(value)
 
 
@@ -165,17 +166,23 @@ def choose_metrics(names: Iterable[str], columns: Columns = ()) -> tuple[Registe
 
     Raises InputError if one is unknown, or has the name of a column that is there already.
     """
-    chosen = []
+    chosen, names = [], tuple(names)
     for name in dict.fromkeys(names):
         if name not in _REGISTERED:
             known = ", ".join(_REGISTERED) or "none before register_metric is called"
             what, fix = f"unknown metric {quote(name)}", f"known are {known}"
             raise InputError(what, where="metrics", fix=fix)
-        if name in ("seconds", *dict(columns)):
+        chosen.append(_REGISTERED[name])
+    refuse_taken(names, ("seconds", *dict(columns)))
+    return tuple(chosen)
+
+
+def refuse_taken(names: Iterable[str], taken: Container[str]) -> None:
+    """Raise InputError for a metric with the name of a column that is there already."""
+    for name in names:
+        if name in taken:
             fix = "register the function by another name"
             raise InputError(f"the table has a column {quote(name)}", where="metrics", fix=fix)
-        chosen.append(_REGISTERED[name])
-    return tuple(chosen)
 
 
 def metrics_config(metrics: Sequence[RegisteredMetric]) -> dict[str, Any]:

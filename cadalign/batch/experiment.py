@@ -91,6 +91,8 @@ class ManyEstimates:
 
     def _observation(self, task: ObservationTask) -> Observation:
         folder, shape = Path(task.folder), self.options.learned
+        if isinstance(task.content, DataError):
+            raise task.content
         if isinstance(task.content, ImageKeypoints):
             seen = self._detected(task.content, folder)
         else:

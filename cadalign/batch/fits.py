@@ -283,7 +283,7 @@ def _tally(folder: RunFolder) -> Tally:
         total += len(table)
         failed = table.filter(pc.not_equal(table["status"], OK))
         for row in failed.select(["source", "reason"]).to_pylist():
-            reason = row["reason"].removeprefix(row["source"]).lstrip(": ,")
+            reason = row["reason"].removeprefix(row["source"]).lstrip(": ,.")
             counts[reason] += 1
             whole[reason] = row["reason"]
     reasons = [(whole[each] if count == 1 else each, count) for each, count in counts.most_common()]

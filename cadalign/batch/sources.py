@@ -22,6 +22,7 @@ from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
+from cadalign.io.documents import read_json
 from cadalign.io.files import open_input, read_bytes
 from cadalign.io.observation import (
     DETECTOR,
@@ -43,8 +44,9 @@ class ObservationTask(NamedTuple):
     """Its number in the run."""
     name: str
     """Its file, with the line or the object where the file holds several."""
-    content: bytes | ImageKeypoints | None
-    """Its JSON, or a detector's keypoints; None to read the file ``name``."""
+    content: bytes | ImageKeypoints | DataError | None
+    """Its JSON, or a detector's keypoints, or why these cannot be read; None to read the file
+    ``name``."""
     folder: str
     """The folder that paths in it are relative to."""
 
@@ -111,11 +113,15 @@ class Lines:
 
 
 class Detections:
-    """A detector's file, which memory holds whole."""
+    """A detector's file, which memory holds whole; objects that cannot be read come last."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._objects: Sequence[ImageKeypoints] = read_image_keypoints(path)
+        bad: dict[str, DataError] = {}
+        good = read_image_keypoints(path, problems=bad)
+        self._objects: list[tuple[str, ImageKeypoints | DataError]] = []
+        self._objects += [(found.source, found) for found in good]
+        self._objects += bad.items()
 
     def __len__(self) -> int:
         return len(self._objects)
@@ -123,7 +129,7 @@ class Detections:
     def tasks(self, first: int, last: int) -> list[ObservationTask]:
         chosen = enumerate(self._objects[first:last], start=first)
         folder = _folder(self._path)
-        return [ObservationTask(row, found.source, found, folder) for row, found in chosen]
+        return [ObservationTask(row, name, found, folder) for row, (name, found) in chosen]
 
     def fingerprint(self) -> str:
         return fingerprint(read_bytes(self._path))
@@ -221,9 +227,14 @@ def _folder(path: Path) -> str:
 
 
 def _kind_of_file(path: Path) -> str:
+    kinds = dict[str, msgspec.Raw] | list[msgspec.Raw]
     try:
-        content = read_bytes(path)
-        data = msgspec.json.decode(content, type=dict[str, msgspec.Raw] | list[msgspec.Raw])
-    except (DataError, msgspec.MsgspecError, UnicodeError, RecursionError):
+        return kind_of(msgspec.json.decode(read_bytes(path), type=kinds))
+    except msgspec.ValidationError:
         return _DAMAGED
-    return kind_of(data)
+    except (DataError, msgspec.MsgspecError, UnicodeError, RecursionError):
+        pass
+    try:
+        return kind_of(read_json(path))  # slower, but knows the NaN that Python's JSON has
+    except DataError:
+        return _DAMAGED

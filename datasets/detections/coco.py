@@ -6,8 +6,9 @@ The forms that are read are described in docs/formats/detections.md.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +18,7 @@ from msgspec import Meta, field
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.datasets.models.model_keypoints import FORMAT as MODEL_KEYPOINTS_FORMAT
+from cadalign.datasets.photos.dataset import leaving_out
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import DataError, InputError, quote
@@ -29,6 +31,8 @@ from cadalign.io.files import write_json
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keypoints of detectors"
 _OUTSIDE, _INFERRED, _OBSERVED = 0, 1, 2  # visibility flags
 _Id = int | str
+_Reader = tuple[str, Callable[[], ImageKeypoints | None]]
+"""The place of an object in its file, and what reads it."""
 _Size = Annotated[float, Meta(ge=1, le=2**31)]
 
 
@@ -78,27 +82,37 @@ class _Category(ForeignDocument):
 class _File(ForeignDocument):
     """COCO's annotations, or MMPose's predictions: the last two fields."""
 
-    annotations: list[_Object] = field(default_factory=list)
+    annotations: list[Any] = field(default_factory=list)
     images: list[_Image] | None = None
     categories: list[_Category] | None = None
     instance_info: list[_Object] = field(default_factory=list)
     meta_info: dict[str, Any] | None = None
 
 
-def read_coco_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read any of the four forms, one entry for each object in each image."""
+def read_coco_keypoints(
+    path: Path, problems: dict[str, DataError] | None = None
+) -> list[ImageKeypoints]:
+    """Read any of the four forms, one entry for each object in each image.
+
+    For ``problems`` see `cadalign.datasets.read_image_keypoints`.
+    """
     data = read_json(path)
     with in_file(path):
-        objects = _read(data)
+        readers = list(_readers(data))
+    objects = []
+    for where, read in readers:
+        with leaving_out(f"{path}: {where}", problems), in_file(path):
+            if (found := read()) is not None:
+                objects.append(replace(found, source=f"{path}: {where}"))
     if not objects:
-        raise DataError("there are no keypoints", where=str(path))
-    return [replace(found, source=f"{path}: {found.source}") for found in objects]
+        none = DataError("there are no keypoints", where=str(path))
+        raise next(iter((problems or {}).values()), none)
+    return objects
 
 
-def _read(data: Any) -> list[ImageKeypoints]:
+def _readers(data: Any) -> Iterable[_Reader]:
     if isinstance(data, list):
-        entries = enumerate(convert(data, list[_Object]))
-        return [_image_keypoints(entry, f"[{row}]", names=None) for row, entry in entries]
+        return ((f"[{row}]", partial(_bare, each, f"[{row}]")) for row, each in enumerate(data))
     if isinstance(data, dict) and "annotations" in data:
         return _from_annotations(convert(data, _File))
     if isinstance(data, dict) and "instance_info" in data:
@@ -110,47 +124,60 @@ def _read(data: Any) -> list[ImageKeypoints]:
     raise DataError("neither annotations nor instance_info", where="top level", fix=_FIX)
 
 
-def _from_annotations(data: _File) -> list[ImageKeypoints]:
+def _bare(data: Any, where: str) -> ImageKeypoints:
+    return _image_keypoints(convert(data, _Object, where), where, names=None)
+
+
+def _from_annotations(data: _File) -> Iterator[_Reader]:
     images = {image.id: image for image in data.images or []}
     names = {category.id: category.keypoints for category in data.categories or []}
-    objects = []
     for row, entry in enumerate(data.annotations):
-        if entry.num_keypoints == 0:
-            continue
         where = f"annotations[{row}]"
-        category = None if entry.category_id is None else names.get(entry.category_id)
-        found = _image_keypoints(entry, where, names=category)
-        if images:
-            if entry.image_id is None:
-                raise DataError("missing", where=f"{where}.image_id")
-            image = images.get(entry.image_id)
-            if image is None:
-                what = f"there is no image {quote(entry.image_id)}"
-                raise DataError(what, where=f"{where}.image_id")
-            size = None
-            if image.width is not None and image.height is not None:
-                size = int(image.width), int(image.height)
-            name = image.file_name or found.image
-            found = replace(found, image=name, size=size, images=len(images))
-        objects.append(found)
-    return objects
+        yield where, partial(_annotated, entry, where, images, names)
 
 
-def _from_predictions(data: _File) -> list[ImageKeypoints]:
+def _annotated(
+    data: Any, where: str, images: dict[_Id, _Image], names: dict[_Id, list[str] | None]
+) -> ImageKeypoints | None:
+    """The keypoints of an annotation; None where none of them is labelled."""
+    entry: _Object = convert(data, _Object, where)
+    if entry.num_keypoints == 0:
+        return None
+    category = None if entry.category_id is None else names.get(entry.category_id)
+    found = _image_keypoints(entry, where, names=category)
+    if not images:
+        return found
+    if entry.image_id is None:
+        raise DataError("missing", where=f"{where}.image_id")
+    image = images.get(entry.image_id)
+    if image is None:
+        raise DataError(f"there is no image {quote(entry.image_id)}", where=f"{where}.image_id")
+    size = None
+    if image.width is not None and image.height is not None:
+        size = int(image.width), int(image.height)
+    return replace(found, image=image.file_name or found.image, size=size, images=len(images))
+
+
+def _from_predictions(data: _File) -> Iterator[_Reader]:
     names, given = None, (data.meta_info or {}).get("keypoint_id2name")
     by_number = convert(given, dict[str, Text] | None, where="meta_info.keypoint_id2name")
     if by_number is not None:
         listed = [by_number.get(str(number)) for number in range(len(by_number))]
         names = convert(listed, list[Text], where="meta_info.names")
-    objects = []
     for row, entry in enumerate(data.instance_info):
-        where, frame = f"instance_info[{row}]", entry.frame_id
+        where = f"instance_info[{row}]"
         if entry.instances is None:
-            objects.append(_image_keypoints(entry, where, names=names))
-        for place, instance in enumerate(entry.instances or []):
-            found = _image_keypoints(instance, f"{where}.instances[{place}]", names=names)
-            objects.append(replace(found, image=found.image if frame is None else str(frame)))
-    return objects
+            yield where, partial(_image_keypoints, entry, where, names=names)
+        for number, instance in enumerate(entry.instances or []):
+            place = f"{where}.instances[{number}]"
+            yield place, partial(_in_frame, instance, place, names, entry.frame_id)
+
+
+def _in_frame(
+    entry: _Object, where: str, names: list[str] | None, frame: _Id | None
+) -> ImageKeypoints:
+    found = _image_keypoints(entry, where, names=names)
+    return found if frame is None else replace(found, image=str(frame))
 
 
 def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> ImageKeypoints:

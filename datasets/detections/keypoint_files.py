@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import os
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,14 @@ import numpy as np
 
 from cadalign.datasets.detections.coco import read_coco_keypoints
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
+from cadalign.datasets.photos.dataset import leaving_out
 from cadalign.datasets.photos.kitti_keypoints import TRACKS, read_track_keypoints
 from cadalign.errors import DataError, InputError, brief, quote
 from cadalign.io.documents import Finite, Text, convert, in_file
 from cadalign.io.files import as_path, read_text
 
+_Key = tuple[str | None, str | None]
+"""Image and track of an object."""
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _COLUMNS: dict[str, Any] = {
     "u": Finite,
@@ -32,7 +34,9 @@ _COLUMNS: dict[str, Any] = {
 }
 
 
-def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
+def read_image_keypoints(
+    path: str | os.PathLike[str], *, problems: dict[str, DataError] | None = None
+) -> list[ImageKeypoints]:
     """Read a file of keypoints: COCO's JSON and its relatives, CSV, or KITTI's tracks of cars.
 
     Parameters
@@ -40,6 +44,9 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
     path : str or path-like
         A .csv or JSON file as described in docs/formats/detections.md, or a folder with
         ``car_tracks.json``.
+    problems : dict of str to DataError, optional
+        Gets the reasons why objects of COCO's JSON and CSV could not be read, by their places;
+        without it, and where none could be read, the first is raised.
 
     Returns
     -------
@@ -57,28 +64,42 @@ def read_image_keypoints(path: str | os.PathLike[str]) -> list[ImageKeypoints]:
     if path.is_dir():
         fix = "give a file of a detector's keypoints, JSON or CSV"
         raise DataError(f"the folder has no {TRACKS}", where=str(path), fix=fix)
-    return read_csv_keypoints(path) if path.suffix.lower() == ".csv" else read_coco_keypoints(path)
+    read = read_csv_keypoints if path.suffix.lower() == ".csv" else read_coco_keypoints
+    return read(path, problems)
 
 
-def read_csv_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read a CSV file, one object for each image, or for each track in it."""
-    by_image: dict[tuple[str | None, str | None], list[dict[str, Any]]] = {}
+def read_csv_keypoints(
+    path: Path, problems: dict[str, DataError] | None = None
+) -> list[ImageKeypoints]:
+    """Read a CSV file, one object for each image, or for each track in it.
+
+    For ``problems`` see `read_image_keypoints`.
+    """
+    by_image: dict[_Key, list[dict[str, Any]]] = {}
+    bad: dict[_Key, DataError] | None = None if problems is None else {}
     try:
         lines = csv.reader(io.StringIO(read_text(path)), strict=True)
         header = _header(next(lines, []), f"{path}, line 1")
         for line in lines:
-            row = _row(header, line, f"{path}, line {lines.line_num}")
-            if row is not None:
-                key = row.get("image") or None, row.get("track") or None
-                by_image.setdefault(key, []).append(row)
+            cells = {name: cell.strip() for name, cell in zip(header, line, strict=False)}
+            key = cells.get("image") or None, cells.get("track") or None
+            with leaving_out(key, bad):
+                row = _row(header, line, cells, f"{path}, line {lines.line_num}")
+                if row is not None:
+                    by_image.setdefault(key, []).append(row)
     except csv.Error as error:
         raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
-    if not by_image:
-        raise DataError("there are no keypoints", where=str(path))
-    return [
-        replace(_object(path, image, rows), track=track)
-        for (image, track), rows in by_image.items()
-    ]
+    objects = []
+    for key, rows in by_image.items():
+        if key not in (bad or {}):
+            with leaving_out(key, bad):
+                objects.append(_object(path, key, rows))
+    if not objects:
+        none = DataError("there are no keypoints", where=str(path))
+        raise next(iter((bad or {}).values()), none)
+    if problems is not None and bad is not None:
+        problems |= {_place(path, key): error for key, error in bad.items()}
+    return objects
 
 
 def _header(cells: list[str], where: str) -> list[str]:
@@ -98,9 +119,10 @@ def _header(cells: list[str], where: str) -> list[str]:
     return names
 
 
-def _row(header: list[str], line: list[str], where: str) -> dict[str, Any] | None:
+def _row(
+    header: list[str], line: list[str], cells: dict[str, str], where: str
+) -> dict[str, Any] | None:
     """One line; None for one that is empty or has no pixel."""
-    cells = {name: cell.strip() for name, cell in zip(header, line, strict=False)}
     if not any(cells.values()):
         return None
     if len(line) != len(header):
@@ -128,7 +150,11 @@ def _value(name: str, cell: str) -> str | float:
     return number if np.isfinite(number) else cell
 
 
-def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageKeypoints:
+def _place(path: Path, key: _Key) -> str:
+    return ", ".join(map(str, filter(None, (path, *key))))
+
+
+def _object(path: Path, key: _Key, rows: list[dict[str, Any]]) -> ImageKeypoints:
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     scores = columns.get("score")
     if "visibility" in columns:
@@ -140,6 +166,7 @@ def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageK
         names=None if names is None else tuple(names),
         ids=None if ids is None or names is not None else tuple(map(int, ids)),
         sigma=None if sigma is None else np.array(sigma),
-        image=image,
-        source=str(path) if image is None else f"{path}, {image}",
+        image=key[0],
+        track=key[1],
+        source=_place(path, key),
     )

@@ -201,6 +201,82 @@ def test_duplicate_object_ids_are_rows_of_their_own(tmp_path: Path) -> None:
     assert "found.json: annotations[1], row 1" in page
 
 
+def coco(path: Path, *changes: dict[str, Any]) -> Path:
+    """A detector's file with an object for each change of its fields."""
+    flat = np.column_stack([PIXELS, np.full(8, 0.9)]).ravel().tolist()
+    image = {"id": 1, "file_name": "a.png", "width": 640, "height": 480}
+    entries = [{"image_id": 1, "category_id": 1, "keypoints": flat} | each for each in changes]
+    path.write_text(json.dumps({"images": [image], "annotations": entries, "categories": []}))
+    return path
+
+
+def detected(tmp_path: Path, source: Path) -> list[dict[str, Any]]:
+    """The rows of the fits to a detector's file."""
+    names = [str(number) for number in range(8)]
+    pairs = zip(names, POINTS.tolist(), strict=True)
+    model = tmp_path / "model.keypoints.json"
+    ModelKeypoints(tuple(ModelKeypoint(name, tuple(xyz)) for name, xyz in pairs)).save(model)
+    np.savetxt(tmp_path / "K.txt", CAMERA.matrix)
+    Image.new("RGB", (640, 480)).save(tmp_path / "a.png")
+    arguments = ["fit", str(source), "--model", str(model), "--camera", str(tmp_path / "K.txt")]
+    assert main([*arguments, "--no-picture", "--out", str(tmp_path / "run")]) in (0, 3)
+    return rows_of(tmp_path / "run")
+
+
+def test_objects_of_a_detector_that_cannot_be_read_fail_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = [
+        {"keypoints": [float("nan"), 2.0, 1.0]},
+        {"keypoints": [1.0] * 32},
+        {"keypoints": None},
+        {"keypoints": [1.0, 2.0, -0.5] * 8},
+        {"keypoints": [1.0, "12.5", 0.5] * 8},
+        {"image_id": 7},
+        {"score": "high"},
+    ]
+    source = coco(tmp_path / "found.json", {}, *bad, {"category_id": 5})
+    rows = detected(tmp_path, source)
+    assert [row["status"] for row in rows] == ["ok", "ok", *["failed"] * len(bad)]
+    assert [row["reason"].removeprefix(f"{source}: annotations") for row in rows[2:]] == [
+        "[1].keypoints[0]: nan is not a finite number",
+        "[2].keypoints: 32 numbers are not x, y and visibility of keypoints",
+        "[3].keypoints: missing; is it COCO's keypoint JSON, or a detector's? see cadalign's "
+        "page on keypoints of detectors",
+        "[4]: scores: keypoint 0 has the value -0.5, which is negative",
+        "[5].keypoints[1]: '12.5' is not a finite number",
+        "[6].image_id: there is no image 7",
+        "[7].score: 'high' is not a finite number",
+    ]
+    assert "failed 1: " in capsys.readouterr().err
+
+
+def test_a_bad_line_of_a_table_fails_its_object_alone(tmp_path: Path) -> None:
+    lines = ["image,name,u,v,score"]
+    for image in ("a.png", "b.png", "c.png"):
+        for name, (u, v) in enumerate(PIXELS.tolist()):
+            score = -1 if (image, name) == ("c.png", 3) else 0.5
+            u = float("nan") if (image, name) == ("b.png", 2) else u
+            lines.append(f"{image},{name},{u},{v},{score}")
+    source = tmp_path / "found.csv"
+    source.write_text("\n".join(lines))
+    rows = detected(tmp_path, source)
+    assert [row["status"] for row in rows] == ["ok", "failed", "failed"]
+    assert [row["reason"].removeprefix(str(source)) for row in rows[1:]] == [
+        ", line 12: u: 'nan' is not a finite number",
+        ", c.png: scores: keypoint 3 has the value -1, which is negative",
+    ]
+
+
+def test_a_detectors_file_without_a_good_object_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = coco(tmp_path / "found.json", {"keypoints": [float("nan")] * 24})
+    assert main(["fit", str(source), "--model", "m.keypoints.json"]) == 1
+    reason = f"{source}: annotations[0].keypoints[0]: nan is not a finite number"
+    assert reason in capsys.readouterr().err
+
+
 def test_photo_of_another_size_than_its_camera_is_warned_of(tmp_path: Path) -> None:
     problem = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
     photo = tmp_path / "photo.png"

@@ -57,6 +57,21 @@ def test_obj_negative_indices_count_back_from_their_own_line(write):
     assert load_mesh(write(text)).faces.tolist() == [[0, 1, 2], [3, 4, 5], [0, 1, 5]]
 
 
+def test_a_mark_of_utf_8_takes_no_line_away(write):
+    text = trimesh.creation.box().export(file_type="ply", encoding="ascii")
+    for name, content in (("a.obj", f"{SQUARE}f 1 2 3\n".encode()), ("a.ply", text)):
+        expected = load_mesh(write(content, name))
+        found = load_mesh(write(b"\xef\xbb\xbf" + content, name))
+        np.testing.assert_array_equal(found.vertices, expected.vertices)
+        np.testing.assert_array_equal(found.faces, expected.faces)
+
+
+def test_a_mark_of_utf_8_hides_no_material(write):
+    write(b"\xef\xbb\xbfnewmtl red\nKd 1 0 0\n", "a.mtl")
+    mesh = load_mesh(write(f"mtllib a.mtl\n{SQUARE}usemtl red\nf 1 2 3\n"))
+    assert mesh.materials[0].color[:3] == (1, 0, 0)
+
+
 def test_obj_faces_keep_file_order_across_materials(write):
     lines = [f"v {i} {i * i} 0" for i in range(8)]
     for i in range(6):

@@ -8,6 +8,7 @@ appendix B1 of the Advanced Visualizer manual.
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -148,7 +149,7 @@ def _sort_statements(data: bytes, path: Path) -> _Statements:
 def _logical_lines(data: bytes) -> Iterator[tuple[int, bytes]]:
     """The lines with their numbers, stripped; a line that ends in a backslash goes on."""
     # A tab may separate the keyword too.
-    lines = data.replace(b"\t", b" ").split(b"\n")
+    lines = data.removeprefix(BOM_UTF8).replace(b"\t", b" ").split(b"\n")
     parts: list[bytes] = []
     for number, line in enumerate(map(bytes.strip, lines), start=1):
         if line[-1:] == b"\\":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from codecs import BOM_UTF8
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,7 +28,7 @@ _MAX_HEADER_LINES = 1000
 
 def read_ply(path: Path) -> Mesh:
     """Read a PLY file, ASCII or binary; `cadalign.load_mesh` is the public way to it."""
-    data = read_bytes(path)
+    data = read_bytes(path).removeprefix(BOM_UTF8)
     with _parsing(path):
         counts, texture_name = _header(data, path)
         if not counts.get("face"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field, fields, make_dataclass
 from inspect import getdoc
 from pathlib import Path
@@ -59,14 +61,16 @@ class RunCommand(JsonOption, RunOptions):
         from cadalign.evaluation.runs.run import execute
 
         kind = self.options_type
-        with named_as_flags(self):
+        # What plugins print is not the command's output.
+        with redirect_stdout(sys.stderr), named_as_flags(self):
             found = (load_plugin(text) for text in getattr(self, "plugin", ()))
             names = tuple(name for name in found if name is not None)
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
             options = options.with_methods(names) if names else options
             folder = RunFolder(self.out or Path("runs") / options.run_name)
             plan, pool = prepared(options, folder, workers=self.workers, dask=self.dask)
-        with run_progress(f"{kind.command.removesuffix('e')}ing") as on_progress:
+        label = f"{kind.command.removesuffix('e')}ing"
+        with redirect_stdout(sys.stderr), run_progress(label) as on_progress:
             execute(plan, folder, workers=pool, on_progress=on_progress)
         spec = spec_named(kind.experiment)
         return spec, spec.open(folder.path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -167,6 +168,32 @@ def test_names_of_the_summary_are_refused(sample_root: Path, name: str) -> None:
     register_metric(name, depth_error)
     with pytest.raises(InputError, match=f"the table has a column '{name}'; register the"):
         cadalign.evaluate(sample_root, metrics=[name], workers=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["0", "2"])
+def test_what_a_plugin_prints_is_not_the_output(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    workers: str,
+) -> None:
+    (tmp_path / "chatty.py").write_text(
+        "from cadalign.evaluation import register_metric\n"
+        "print('at import')\n"
+        "def depth(*, est):\n"
+        "    print('hello')\n"
+        "    return est.translation[2]\n"
+        "register_metric('depth', depth)\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    command = ["simulate", "points", "--values", "8", "--runs", "2", "--workers", workers]
+    command += ["--methods", "aepnp", "--metrics", "depth", "--plugin", "chatty.py", "--json"]
+    assert main(command) == 0
+    printed = capfd.readouterr()
+    assert json.loads(printed.out)["failed"] == 0
+    assert "at import" in printed.err
+    assert "hello" in printed.err
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -125,6 +126,27 @@ def test_tasks_that_raise_become_failed_rows_and_spare_the_others(tmp_path: Path
     failed = {row["task"]: row["reason"] for row in rows if row["square"] is None}
     assert failed == {3: "ValueError: cannot square 3", 50: "ValueError: cannot square 50"}
     assert len(rows) == 100
+
+
+def test_there_are_no_more_processes_than_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def executor(*, max_workers: int, **rest: Any) -> ThreadPoolExecutor:
+        asked.append(max_workers)
+        return SilentPool(1)
+
+    monkeypatch.setattr("joblib.externals.loky.get_reusable_executor", executor)
+    chunks = [(0, [1, 2]), (1, [3])]
+    found = list(in_processes(Squares(), iter(chunks), count=100_000))
+    assert sorted(chunk for (chunk, _), _ in found) == [0, 1]
+    assert set(asked) == {2}
+
+
+class SilentPool(ThreadPoolExecutor):
+    """Threads in the place of loky's processes."""
+
+    def shutdown(self, wait: bool = True, **rest: Any) -> None:
+        super().shutdown(wait)
 
 
 @pytest.mark.long

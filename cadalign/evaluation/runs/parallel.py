@@ -15,6 +15,7 @@ import logging
 import os
 import pickle
 import socket
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,6 +29,7 @@ from concurrent.futures import (
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import chain, islice
 from typing import Any, TypeVar, cast
 
 from cadalign.errors import CadalignError, DataError
@@ -69,11 +71,16 @@ def in_this_process(
 def in_processes(
     experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, count: int
 ) -> Evaluated[T]:
-    """Evaluate chunks in so many processes on this machine, joblib's; -1 for one for each core."""
+    """Evaluate chunks in so many processes on this machine, joblib's; -1 for one for each core.
+
+    There are no more processes than chunks, since each takes a moment to start.
+    """
     from joblib import cpu_count
     from joblib.externals.loky import get_reusable_executor
 
-    count = cpu_count() if count < 0 else count
+    source = iter(chunks)
+    first = list(islice(source, cpu_count() if count < 0 else count))
+    count = max(1, len(first))
     used: list[Executor] = []
 
     def executor() -> Executor:
@@ -82,7 +89,7 @@ def in_processes(
             max_workers=count,
             timeout=_IDLE_SECONDS,
             env=_ENVIRONMENT,
-            initializer=_end_with,
+            initializer=_start,
             initargs=(os.getpid(),),
         )
         used[:] = [pool]
@@ -90,11 +97,20 @@ def in_processes(
 
     try:
         yield from evaluate_on(
-            executor, experiment, chunks, window=count + 1, deadly=(BrokenProcessPool,)
+            executor,
+            experiment,
+            chain(first, source),
+            window=count + 1,
+            deadly=(BrokenProcessPool,),
         )
     finally:
         for pool in used:
             pool.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
+
+
+def _start(parent: int) -> None:
+    sys.stdout = sys.stderr  # what functions print is not the command's output
+    _end_with(parent)
 
 
 def _end_with(parent: int) -> None:

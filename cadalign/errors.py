@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Iterable
+from dataclasses import MISSING, fields
 from typing import Any
 
 _QUOTED_LENGTH = 200
@@ -157,3 +158,11 @@ def brief(text: object) -> str:
 
 def _cut(text: str) -> str:
     return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."
+
+
+def refuse_unused(options: Any, names: Iterable[str], why: str) -> None:
+    """Refuse fields of options that are given, not at their defaults, though not used."""
+    for each in fields(options):
+        default = each.default if each.default_factory is MISSING else each.default_factory()
+        if each.name in names and getattr(options, each.name) != default:
+            raise InputError(f"has no effect {why}", where=each.name, fix="leave it out")

@@ -109,6 +109,11 @@ def export_run(
     if name not in known:
         fix = f"of a run, give one of {', '.join(known)}"
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
+    total = (RunFolder(run).read_config() or {}).get("tasks", 0)
+    for row in rows:
+        if not 0 <= row < total:
+            fix = f"give numbers from 0 to {total - 1}"
+            raise InputError(f"the run has no observation {row}", where="rows", fix=fix)
     left_out: list[CadalignError] = []
     folder = RunFolder(run)
     results = _run_results(folder, rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,7 @@ import tyro
 from cadalign.cli.common import SOME_FAILED, SUCCESS, say
 from cadalign.cli.options import FlaggedOptions, named_as_flags
 from cadalign.datasets.photos.scannet import read_matrix
+from cadalign.errors import refuse_unused
 from cadalign.export.formats import FORMATS, ExportOptions, export_object, format_of
 
 
@@ -69,7 +70,10 @@ class Export:
             fit = fit / "fit.json"
         if fit.is_dir():
             return self._export_run()
-        with named_as_flags(self, self.options):
+        with named_as_flags(self, self.options, others={"world_from_cam": "--world"}):
+            refuse_unused(self, ["rows"], "on one fit")
+            if self.options.frame != "world":
+                refuse_unused(self, ["world"], "without --frame world")
             name = self.format or format_of(self.to)
             exported = read_exported(
                 fit,
@@ -87,6 +91,9 @@ class Export:
         from cadalign.batch.exports import export_run
 
         with named_as_flags(self, self.options):
+            refuse_unused(self, ["observation", "shape", "world"], "on a run")
+            names = [each.name for each in fields(self.options)]
+            refuse_unused(self.options, names, "on a run")
             found = export_run(
                 self.fit, self.to, format=self.format, metres=self.metres, rows=self.rows
             )

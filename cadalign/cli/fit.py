@@ -30,7 +30,7 @@ from cadalign.cli.options import (
     flag_of,
     named_as_flags,
 )
-from cadalign.errors import CadalignError, DataError, InputError, quote
+from cadalign.errors import CadalignError, DataError, InputError, quote, refuse_unused
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
@@ -118,6 +118,10 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
 
     def run(self) -> int:
         """Run the fit, or the fits; returns the exit code."""
+        if not self.robust:
+            with named_as_flags(self.ransac):
+                names = [each.name for each in fields(RansacOptions)]
+                refuse_unused(self.ransac, names, "without --robust")
         if not self.observations and "mask" in self.given and self.model is not None:
             return self._fit_mask(self.given["mask"])
         path = self.first()
@@ -126,6 +130,8 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         data = read_json(path) if is_read else None
         if len(self.observations) > 1 or is_of_many(path, data):
             return self._fit_many()
+        with named_as_flags(self):
+            self.refuse_of_many()
         if isinstance(data, dict) and _OBJECTS in data:
             return _fit_scene(self, path, data)
         return self._write(self._fit_file(path, data), path)
@@ -151,6 +157,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         nothing, camera = np.empty((0, 3)), Camera.without_focal(width, height)
         seen = Observation(nothing, nothing[:, :2], camera, model=self.model)
         with named_as_flags(self, self.fitting, self.ransac):
+            self.refuse_of_many("model")
             observation = self.changes.applied_to(seen)
             style, status = self._style(observation, mask), waiting("fitting")
             result, views = self.fit(observation, str(mask), note=say, status=status)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from cadalign.cli.common import JsonOption, OptionError, UsageError
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError, refuse_unused
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
 from cadalign.io.evidence import Size, evidence_fields
@@ -35,19 +35,18 @@ def named_as_flags(
     ``others`` are flags of further arguments by name. Their kind is `OptionError` while the
     command line is parsed.
     """
-    flags = {field.name: flag_of(field.name) for each in options for field in fields(each)}
-    flags |= others or {}
+    flags = flags_of(*options) | dict(others or {})
     try:
         yield
     except DataError as error:
         if (error.fix or "").startswith("known are "):  # names of a file's fields, no options
             raise
-        raise DataError(error.what, where=error.where, fix=_with_flags(error.fix, flags)) from None
+        raise DataError(error.what, where=error.where, fix=with_flags(error.fix, flags)) from None
     except InputError as error:
         if error.where not in flags:
             raise
         where = flags[str(error.where)]
-        raise kind(error.what, where=where, fix=_with_flags(error.fix, flags)) from None
+        raise kind(error.what, where=where, fix=with_flags(error.fix, flags)) from None
 
 
 class FlaggedOptions:
@@ -59,7 +58,12 @@ class FlaggedOptions:
             super().__post_init__()  # type: ignore[misc]
 
 
-def _with_flags(fix: str | None, flags: Mapping[str, str]) -> str | None:
+def flags_of(*options: DataclassInstance) -> dict[str, str]:
+    """The command line's options by the names of fields."""
+    return {field.name: flag_of(field.name) for each in options for field in fields(each)}
+
+
+def with_flags(fix: str | None, flags: Mapping[str, str]) -> str | None:
     """A remedy that names flags in the place of arguments of several words."""
     for name, flag in flags.items():
         if fix is not None and "_" in name:
@@ -94,6 +98,11 @@ class ManyCommand(JsonOption, DetectorOptions):
     """Address of a Dask scheduler, whose workers are used instead."""
     pictures: int = 100
     """Number of observations, the first ones of many, whose photos the page shows."""
+
+    def refuse_of_many(self, *used: str) -> None:
+        """Refuse what is for many observations alone, but for ``used``; see `refuse_unused`."""
+        names = {"workers", "dask", "pictures", *DetectorOptions.__dataclass_fields__}
+        refuse_unused(self, names.difference(used), "on one observation")
 
     def first(self) -> Path:
         """The first observation; raises UsageError if none is given."""

@@ -69,6 +69,7 @@ class Retrieve(ManyCommand, ObservationRetrieval, CameraOptions):
         with named_as_flags(self, self.ranking):
             if len(self.observations) > 1 or is_many:
                 return self._retrieve_many()
+            self.refuse_of_many("workers")
             return self._retrieve(path)
 
     def _retrieve_many(self) -> int:

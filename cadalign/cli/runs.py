@@ -20,6 +20,7 @@ from rich.progress import (
 from rich.text import Text
 
 from cadalign.cli.common import beside, exit_code, new_console, print_json, print_table, say
+from cadalign.cli.options import flags_of, with_flags
 from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
     if command.json:
         print_json(read_rows(folder))
     for reason, count in tally.reasons[:_MOST_REASONS]:
-        say(f"failed {count:,}: {reason}")
+        say(f"failed {count:,}: {_as_typed(reason, command)}")
     rest = tally.reasons[_MOST_REASONS:]
     if rest:
         say(f"failed {sum(count for _, count in rest):,}: {len(rest):,} other reasons")
@@ -136,6 +137,12 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
     if command.picture and tally.total <= _ON_PAGE:
         write_run_report(folder)
     return exit_code(tally.failed, tally.total)
+
+
+def _as_typed(reason: str, command: ManyCommand) -> str:
+    """A failure's reason whose remedy names the command line's options."""
+    what, mark, fix = reason.rpartition("; ")
+    return f"{what}{mark}{with_flags(fix, flags_of(command)) if mark else fix}"
 
 
 def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:

@@ -165,7 +165,7 @@ class AlignedObject:
         """
         if self.mesh is None:
             what = "there is no mesh of the model to write"
-            raise InputError(what, where="mesh", fix="give mesh=, or an observation a `model`")
+            raise InputError(what, where="mesh", fix="give one, or an observation with a `model`")
         return self.mesh
 
     def frame_from_model(self, frame: Frame) -> Alignment:

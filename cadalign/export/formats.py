@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.datasets.photos.scan2cad import scan_entry
 from cadalign.datasets.sfm.colmap import write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, InputError, quote, refuse_unused
 from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame, photos_of
 from cadalign.export.camera_files import write_nerf, write_open3d
 from cadalign.export.scene_parts import write_line_set
@@ -27,11 +27,12 @@ from cadalign.io.files import as_path, keeping, printable, refuse_input, refuse_
 from cadalign.io.meshes.files import write_obj_mesh, write_ply_mesh
 
 _SAME = 1e-9
+_OF_BOP = ("scene_id", "image_id", "object_id")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Options of an export; each format takes those that it has a place for.
+    """Options of an export; formats refuse those that they have no place for.
 
     Parameters
     ----------
@@ -82,11 +83,14 @@ class Format:
         Writes a path, an object and the options.
     endings : tuple of str
         Endings of file names that mean this format; a whole name where it has no dot in front.
+    options : tuple of str
+        The fields of `ExportOptions` that it has a place for.
     """
 
     about: str
     write: Writer
     endings: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("frame",)
 
 
 def _glb(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
@@ -205,10 +209,15 @@ FORMATS: dict[str, Format] = {
         (".lines.ply",),
     ),
     "bop-results": Format(
-        "BOP's result CSV, the stretched mesh beside it", _bop_results, (".csv",)
+        "BOP's result CSV, the stretched mesh beside it", _bop_results, (".csv",), _OF_BOP
     ),
-    "bop": Format("a BOP scene's folder with its models", _bop, ("scene_gt.json",)),
-    "scan2cad": Format("Scan2CAD's JSON, the stretch as scale", _scan2cad, ("annotations.json",)),
+    "bop": Format("a BOP scene's folder with its models", _bop, ("scene_gt.json",), _OF_BOP),
+    "scan2cad": Format(
+        "Scan2CAD's JSON, the stretch as scale",
+        _scan2cad,
+        ("annotations.json",),
+        ("frame", "scan_id", "category_id"),
+    ),
     "nerfstudio": Format("cameras as transforms.json", _nerf, ("transforms.json",)),
     "colmap": Format(
         "cameras as COLMAP's text files",
@@ -223,6 +232,7 @@ FORMATS: dict[str, Format] = {
         "keypoints in the photos",
         lambda path, exported, options: write_coco_keypoints(path, photos_of(exported)),
         (".coco.json", "keypoints.json"),
+        options=(),
     ),
 }
 """The formats by name."""
@@ -286,7 +296,8 @@ def export_object(
     Raises
     ------
     InputError
-        If the format or frame is not known, or the object lacks what the format needs.
+        If the format or frame is not known, an option has no place in the format, or the object
+        lacks what it needs.
     DataError
         If a photo cannot be read, or the file cannot be written or is one that the object was read
         from.
@@ -297,6 +308,9 @@ def export_object(
     if name not in FORMATS:
         fix = f"known are {', '.join(FORMATS)}"
         raise InputError(f"unknown format {quote(name)}", where="format", fix=fix)
+    options = options or ExportOptions()
+    others = {each.name for each in fields(options)}.difference(FORMATS[name].options)
+    refuse_unused(options, others, f"on the format {name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -305,5 +319,5 @@ def export_object(
     photos = (view.image for view in exported.views if isinstance(view.image, Path))
     with keeping([*exported.sources, *photos]):
         refuse_input(path)  # first: files beside it are written before it
-        FORMATS[name].write(path, exported, options or ExportOptions())
+        FORMATS[name].write(path, exported, options)
     return path

@@ -149,6 +149,8 @@ def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
         export_run(run, tmp_path / "out.usdz")
     with pytest.raises(DataError, match="not a finished run of fits"):
         export_run(tmp_path, tmp_path / "out.csv")
+    with pytest.raises(InputError, match="rows: the run has no observation 99; give numbers from"):
+        export_run(run, tmp_path / "out.csv", rows=[0, 99])
 
 
 def test_photos_of_a_run_and_its_files_are_not_written_over(run: Path, tmp_path: Path) -> None:

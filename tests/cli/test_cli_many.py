@@ -186,6 +186,39 @@ def test_matrix_takes_the_place_of_the_camera(folder: Path) -> None:
     assert camera.cx == pytest.approx(1.1 * 319.5 - 0.5)
 
 
+@pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ("--min-score 0.5", "--min-score: has no effect on one observation; leave it out"),
+        ("--model m.keypoints.json", "--model: has no effect on one observation; leave it out"),
+        ("--images photos", "--images: has no effect on one observation; leave it out"),
+        ("--pictures 3", "--pictures: has no effect on one observation; leave it out"),
+        ("--workers 2", "--workers: has no effect on one observation; leave it out"),
+        ("--seed 3", "--seed: has no effect without --robust; leave it out"),
+        ("--max-iterations 5", "--max-iterations: has no effect without --robust; leave it out"),
+    ],
+)
+def test_options_without_effect_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, text: str
+) -> None:
+    path = tmp_path / "p0.json"
+    Observation(POINTS, CAMERA.project(POSES[0].apply(POINTS)), CAMERA).save(path)
+    assert main(["fit", str(path), *option.split()]) == 1
+    assert capsys.readouterr().err == f"cadalign: {text}\n"
+    assert not path.with_name("p0_fit").exists()
+
+
+def test_reasons_of_failures_name_the_options(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = folder / "few.keypoints.json"
+    ModelKeypoints((ModelKeypoint("corner 0", (0.0, 0.0, 0.0)),)).save(path)
+    arguments = ["--camera", str(folder / "K.txt"), "--model", str(path), "--no-picture"]
+    assert main(["fit", str(folder / "found.json"), *arguments]) == 1
+    said = capsys.readouterr().err
+    assert "it has corner 0; --ignore-unknown leaves out what it has not\n" in said
+
+
 def test_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"cadalign {__version__}\n"

@@ -119,6 +119,7 @@ def test_running_times_are_positive_and_not_in_the_results(tmp_path: Path) -> No
         ("points", {"runs": 0}, "not positive"),
         ("noise", {"points": 3}, "not a number of points"),
         ("points", {"noise_px": float("nan")}, "not a noise level"),
+        ("noise", {"noise_px": 5.0}, "noise_px: has no effect where it is varied; leave it out"),
     ],
 )
 def test_bad_options_are_named(sweep: str, options: dict[str, Any], message: str) -> None:

@@ -87,7 +87,7 @@ def plan(options: DemoOptions, folder: RunFolder) -> Plan[KeypointTask]:
     if not keys:
         raise DataError(
             "none of the annotated models has a mesh",
-            where="root",
+            where=str(dataset.root),
             fix="put the meshes beside the annotations, or name the folder that holds both",
         )
     config = {

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import tyro
 
-from cadalign.errors import DataError, InputError, unknown
+from cadalign.errors import DataError, InputError, refuse_unused, unknown
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics import table as metrics
@@ -119,6 +119,7 @@ class SweepOptions(FunctionOptions):
         if self.values is not None:
             self.replace_values(values=tuple(float(value) for value in self.values))
         _check_values(self.kind)
+        refuse_unused(self, [self.kind.column], "where it is varied")
 
     def with_methods(self, names: tuple[str, ...]) -> Self:
         """The options with further methods beside the sweep's own."""

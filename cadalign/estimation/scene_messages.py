@@ -326,5 +326,5 @@ def left_out(known: SharedUnknowns, agreed: SharedUnknowns) -> list[str]:
 
 
 def but_for(said: Sequence[SceneMessage], number: int) -> SceneMessage:
-    """What all say but one."""
+    """The messages of all but one together."""
     return sum((each for k, each in enumerate(said) if k != number), NOTHING)

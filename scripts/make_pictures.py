@@ -40,7 +40,7 @@ KINDS = {
     "#e8e8ec": "errors names arrays notebook seeding compile",
     "#d9e8f7": "geometry metrics io solvers shapes export estimation torch jax",
     "#dcf0dc": "datasets render web",
-    "#fbe9d0": "retrieval evaluation batch report annotate cli __main__ scripts",
+    "#fbe9d0": "retrieval evaluation batch report annotate cli scripts",
 }
 # The layers that a journey passes, in order, and what happens there.
 FIT = "cli options, io observation, estimation checks, solvers search, render overlay"

@@ -715,7 +715,7 @@ def test_a_page_that_cannot_be_written_is_an_error(drawn: Path, tmp_path: Path) 
     with pytest.raises(DataError, match="cannot be written"):
         write_report([drawn], tmp_path / "file" / "report.html")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(DataError, match="cannot be written"):
+    with pytest.raises(DataError, match="is a folder; give a file's name"):
         write_report([drawn], tmp_path / "folder")
 
 

@@ -51,8 +51,8 @@ class RetrievalOptions(AlignmentOptions):
     """Distance of a model's keypoints from the object's, as a share of the extent of the keypoints
     in the image: above 0, say 0.03, for libraries with only similar models."""
     stretch_sigma: float | None = 0.4
-    """Standard deviation of a Gaussian prior on the logarithm of each stretch; None for no
-    prior."""
+    """Standard deviation of a Gaussian prior on the logarithm of each stretch; in Python, None is
+    no prior."""
     max_stretch: float = 4.0
     """Largest stretch of a model; its inverse is the smallest."""
     symmetries: bool = False

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from cadalign.io.observation import ObservationChanges
     from cadalign.render import OverlayStyle
 
-_MOST_REASONS = 10
+_MOST_REASONS, _MOST_OF_EVALUATIONS = 10, 3
 _ON_PAGE = 5000
 """Observations beyond which the page is left to `cadalign report`."""
 
@@ -57,6 +58,7 @@ def conclude(spec: Spec, run: Run, *, json: bool) -> int:
         )
     else:
         print_table(spec.console_table(run, summaries))
+        _say_reasons(_reasons(run), most=_MOST_OF_EVALUATIONS)
         note = f", {found.note}" if found.note else ""
         say(f"Run: {run.folder.path} ({found.failed} of {found.rows} rows failed{note})")
     return exit_code(found.failed, found.rows)
@@ -127,11 +129,7 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
         )
     if command.json:
         print_json(read_rows(folder))
-    for reason, count in tally.reasons[:_MOST_REASONS]:
-        say(f"failed {count:,}: {_as_typed(reason, command)}")
-    rest = tally.reasons[_MOST_REASONS:]
-    if rest:
-        say(f"failed {sum(count for _, count in rest):,}: {len(rest):,} other reasons")
+    _say_reasons([(_as_typed(reason, command), count) for reason, count in tally.reasons])
     made, table = tally.total - tally.failed, folder.path / "results.csv"
     say(f"{made:,} of {tally.total:,} {done}, {tally.failed:,} failed: {table}")
     if command.picture and tally.total <= _ON_PAGE:
@@ -143,6 +141,25 @@ def _as_typed(reason: str, command: ManyCommand) -> str:
     """A failure's reason whose remedy names the command line's options."""
     what, mark, fix = reason.rpartition("; ")
     return f"{what}{mark}{with_flags(fix, flags_of(command)) if mark else fix}"
+
+
+def _reasons(run: Run) -> list[tuple[str, int]]:
+    """Why rows of a run failed, and how many, the commonest first."""
+    import pyarrow.compute as pc  # loaded with the run
+
+    from cadalign.evaluation.runs.work import FAILED
+
+    failed = run.results.filter(pc.equal(run.results["status"], FAILED))
+    return Counter(failed["reason"].to_pylist()).most_common()
+
+
+def _say_reasons(reasons: Sequence[tuple[str, int]], *, most: int = _MOST_REASONS) -> None:
+    """Say how many rows failed why, the commonest first."""
+    for reason, count in reasons[:most]:
+        say(f"failed {count:,}: {reason}")
+    rest = reasons[most:]
+    if rest:
+        say(f"failed {sum(count for _, count in rest):,}: {len(rest):,} other reasons")
 
 
 def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:

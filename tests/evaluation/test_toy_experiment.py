@@ -156,6 +156,7 @@ def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     )
     assert line.replace("│", " ").split() == ["spoon", "mean", "6", "0", f"{1000 * error:.1f}"]
     assert "12 of 36 rows failed" in shown.err
+    assert "failed 12: ValueError: no numbers" in shown.err
     assert main(["evaluate", "middle", str(root), "--draws", "0", "--out", str(out)]) == 1
     assert "--draws: 0 is less than 1" in capsys.readouterr().err
 

@@ -144,7 +144,7 @@ def _as_typed(reason: str, command: ManyCommand) -> str:
 
 
 def _reasons(run: Run) -> list[tuple[str, int]]:
-    """Why rows of a run failed, and how many, the commonest first."""
+    """Reasons of failed rows of a run, and their numbers, the commonest first."""
     import pyarrow.compute as pc  # loaded with the run
 
     from cadalign.evaluation.runs.work import FAILED

@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple, cast
 
@@ -21,7 +20,7 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_point
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import Count, Document, Finite, NotNegative, Positive, read_document
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import as_path, time_of, write_json
+from cadalign.io.files import as_path, once_per_file, write_json
 from cadalign.io.observation import Observation
 
 if TYPE_CHECKING:
@@ -219,13 +218,9 @@ def with_noise(observation: Observation, path: Path) -> Observation:
     return replace(observation, sigma=sigma_of(observation), others=others, fit_options=options)
 
 
+@once_per_file(4)
 def opened_noise(path: Path) -> DetectorNoise:
     """`DetectorNoise.open`, once for a run over many observations."""
-    return _opened_noise(path, time_of(path))
-
-
-@lru_cache(maxsize=4)
-def _opened_noise(path: Path, _written: int) -> DetectorNoise:
     return DetectorNoise.open(path)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, cast
 
@@ -16,7 +15,7 @@ from cadalign.errors import InputError
 from cadalign.estimation.focal import USUAL, FocalPrior, PriorOption, prior_of_camera
 from cadalign.estimation.options import SIMILAR_SCALE_SIGMA, FitOptions, RansacOptions, Sigma
 from cadalign.io.documents import in_file, within
-from cadalign.io.files import time_of
+from cadalign.io.files import once_per_file
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
@@ -340,7 +339,7 @@ class ObservationFit:
                     where=f"{where}: symmetry",
                     fix="leave out one of the two",
                 )
-            return _opened(shape, time_of(shape))
+            return _opened(shape)
         from cadalign.estimation.observed import model_of
         from cadalign.io.meshes.files import load_mesh
 
@@ -362,8 +361,8 @@ class ObservationFit:
                 raise
 
 
-@lru_cache(maxsize=4)
-def _opened(path: Path, _written: int) -> ShapeModel:
+@once_per_file(4)
+def _opened(path: Path) -> ShapeModel:
     """Open a learned shape, which runs use again and again."""
     from cadalign.shapes.model import ShapeModel
 

@@ -165,7 +165,10 @@ class View(DeclaredEvidence):
             self._keep("image", _photo(self.image, camera))
         if self.depth_image is not None:
             as_positive(self.depth_sigma, name="depth_sigma")
-        as_one_or_each(self.depth_sigma, name="depth_sigma", count=len(points), entries="keypoints")
+        else:
+            as_one_or_each(
+                self.depth_sigma, name="depth_sigma", count=len(points), entries="keypoints"
+            )
         for name in ("camera_height", "camera_height_sigma", "mask_sigma"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, as_positive(getattr(self, name), name=name))

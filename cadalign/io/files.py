@@ -13,11 +13,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import lru_cache, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from cadalign.errors import DataError, InputError, quote
 
+F = TypeVar("F", bound=Callable[..., Any])
 _MAX_NAME = 50  # such that the unfinished file's name stays below the 255 bytes of file systems
 _MAX_PATH = 1000  # of a path that is shown whole
 MOST_BYTES = 2**32
@@ -177,6 +179,23 @@ def time_of(path: Path) -> int:
         return path.stat().st_mtime_ns
     except (OSError, ValueError):
         return 0
+
+
+def once_per_file(most: int) -> Callable[[F], F]:
+    """Remember what a reader gives of so many files, each until it is written anew."""
+
+    def remembering(read: F) -> F:
+        @lru_cache(maxsize=most)
+        def remembered(path: Path, written: int, **given: Any) -> Any:
+            return read(path, **given)
+
+        @wraps(read)
+        def opened(path: Path, **given: Any) -> Any:
+            return remembered(path, time_of(path), **given)
+
+        return cast(F, opened)
+
+    return remembering
 
 
 def read_bytes(path: Path, *, most: int = MOST_BYTES) -> bytes:

@@ -9,7 +9,6 @@ import os
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +21,7 @@ from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import Positive, in_file, path_from, read_json, within, written_path
 from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
-from cadalign.io.files import as_path, time_of, write_json
+from cadalign.io.files import as_path, once_per_file, write_json
 from cadalign.io.observation_file import (
     fill_xyz,
     read_fields,
@@ -237,8 +236,7 @@ class ObservationChanges:
         """The camera, if there is one; ``size`` is the photo's, for a file of a matrix alone."""
         if self.camera is None:
             return None
-        written = time_of(self.camera)
-        return _read_camera(self.camera, written, size=size, pixel_origin=self.pixel_origin)
+        return _read_camera(self.camera, size=size, pixel_origin=self.pixel_origin)
 
     def applied_to(self, observation: Observation, where: str | None = None) -> Observation:
         """The observation with all of this in the place of its own; ``where`` is its file.
@@ -264,8 +262,8 @@ class ObservationChanges:
         return changed.with_lens(self.focal, fov=self.fov)
 
 
-@lru_cache(maxsize=64)
-def _read_camera(path: Path, _written: int, **given: Any) -> Camera:
+@once_per_file(64)
+def _read_camera(path: Path, **given: Any) -> Camera:
     """One file for many observations."""
     from cadalign.io.camera_file import read_camera
 

@@ -15,7 +15,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
-from cadalign.io.files import time_of
+from cadalign.io.files import once_per_file, time_of
 from cadalign.io.images import is_grey, open_photo, read_image, read_mask
 from cadalign.io.observation import Observation
 from cadalign.retrieval.options import RetrievalOptions
@@ -55,7 +55,7 @@ class ObservationRetrieval:
             If two shapes are of the same category.
         """
         shapes = tuple((path, time_of(path)) for path in self.shape)
-        return _opened_library(self.library, time_of(self.library)), _opened_shapes(shapes)
+        return _opened_library(self.library), _opened_shapes(shapes)
 
     def retrieve(
         self, seen: Observation, where: str, *, mask: BoolArray | None = None, workers: int = -1
@@ -100,8 +100,8 @@ class ObservationRetrieval:
         )
 
 
-@lru_cache(maxsize=4)
-def _opened_library(path: Path, _written: int) -> Library:
+@once_per_file(4)
+def _opened_library(path: Path) -> Library:
     from cadalign.retrieval.library import Library  # only here: help of a command needs none
 
     return Library.open(path)

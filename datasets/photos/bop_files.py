@@ -44,9 +44,8 @@ from cadalign.io.files import (
     read_text,
     write_json,
     write_text,
-    write_whole,
 )
-from cadalign.io.meshes.files import ply_mesh
+from cadalign.io.meshes.files import ply_mesh, write_ply_mesh
 
 TRUTH = "scene_gt.json"
 RESULT_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -372,12 +371,12 @@ def write_model(folder: Path, mesh: Mesh, number: int) -> dict[str, float]:
 
     Raises DataError if another mesh has this number: poses that are there are of that one.
     """
-    path, data = folder / _MODEL_FOLDERS[0] / f"{object_name(number)}.ply", ply_mesh(mesh)
-    if path.exists() and read_bytes(path) != data:
+    path = folder / _MODEL_FOLDERS[0] / f"{object_name(number)}.ply"
+    if not path.exists():
+        write_ply_mesh(path, mesh)
+    elif read_bytes(path) != ply_mesh(mesh):
         fix = "give another object_id, or another folder"
         raise DataError("holds another mesh", where=str(path), fix=fix)
-    made_folder(path.parent)
-    write_whole(path, lambda unfinished: unfinished.write_bytes(data))
     low, high = mesh.bounds
     info = {"diameter": _diameter(mesh)}
     for axis, least, size in zip("xyz", low.tolist(), (high - low).tolist(), strict=True):

@@ -85,10 +85,9 @@ def method_names(paths: Sequence[Path]) -> tuple[str, ...]:
 def plan(options: EstimatesOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan the scoring of files of estimates on the photos of a data set."""
     from cadalign.evaluation.photos.given import estimates_benchmark, opened_estimates
-    from cadalign.evaluation.photos.target import PhotoTasks, opened
+    from cadalign.evaluation.photos.target import PhotoTasks, reopened
 
-    opened.cache_clear()  # of a session that has changed its files
-    dataset = opened(options.root)
+    dataset = reopened(options.root)
     methods = method_names(options.estimates)
     tasks = PhotoTasks(dataset, options.max_photos)
     unread, strays = {}, {}

@@ -213,11 +213,10 @@ _LOOKED_AT = 20  # photos that say which evidence the data set has
 def plan(options: PhotosOptions, folder: RunFolder) -> Plan[PhotoTask]:
     """Plan a run over the photos of a data set."""
     from cadalign.evaluation.photos.objects import photos_benchmark
-    from cadalign.evaluation.photos.target import PhotoTasks, opened
+    from cadalign.evaluation.photos.target import PhotoTasks, reopened
     from cadalign.evaluation.shape_files import shapes_fingerprint, shapes_of
 
-    opened.cache_clear()  # of a session that has changed its files
-    dataset = opened(options.root)
+    dataset = reopened(options.root)
     protocol = protocols.protocol_of(dataset.kind)
     shapes = shapes_of(options.shape, dataset.root)
     if not options.methods:

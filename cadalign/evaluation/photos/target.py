@@ -75,6 +75,14 @@ class PhotoTasks(Tasks[PhotoTask]):
 
 
 opened = lru_cache(maxsize=1)(open_photos)
+
+
+def reopened(root: Path) -> PhotoDataset:
+    """`opened`, listed anew: a session may have changed its files."""
+    opened.cache_clear()
+    return opened(root)
+
+
 """The data set of a folder, listed once in every process."""
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Any
 
 import numpy as np
 
@@ -30,5 +29,4 @@ def instance_rng(seed: int, *names: str) -> np.random.Generator:
     """
     digest = hashlib.sha256("\0".join(names).encode()).digest()
     words = np.frombuffer(digest[:16], dtype=np.uint32)
-    entropy: Any = [seed, words]  # NumPy's annotation knows numbers or arrays, not both
-    return np.random.default_rng(entropy)
+    return np.random.default_rng([seed, *words.tolist()])

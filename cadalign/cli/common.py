@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import tyro
 
 from cadalign.errors import CadalignError, DataError
-from cadalign.io.files import finite, printable, refuse_folder
+from cadalign.io.files import finite, printable, refuse_folder, refuse_nul
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -182,11 +182,12 @@ def beside(given: Path, ending: str) -> Path:
 
 def make_folder(path: Path) -> None:
     """Create an output folder; raises DataError on failure."""
+    refuse_nul(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+    except OSError as error:
         raise DataError(
-            f"the folder cannot be created ({getattr(error, 'strerror', None) or error})",
+            f"the folder cannot be created ({error.strerror or error})",
             where=printable(path),
             fix="choose another --out",
         ) from None

@@ -161,6 +161,11 @@ def test_it_is_a_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "--draws: 0 is less than 1" in capsys.readouterr().err
 
 
+def test_random_streams_stay_what_they_are_from_version_to_version() -> None:
+    assert instance_rng(0, "chair", "88382b87").integers(0, 1000, 3).tolist() == [731, 850, 330]
+    assert instance_rng(2**40, "").integers(0, 1000, 3).tolist() == [98, 254, 354]
+
+
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> None:
     options = MiddleOptions(root)

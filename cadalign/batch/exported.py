@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -69,6 +69,9 @@ def exported_object(
         _require_same(len(view.residuals), len(image.points_2d), path, "keypoints")
     if result.method != "align":
         mesh = None if seen.model is None else _loaded(seen.model)
+        own = _labels(seen)  # a fit of pairs knows rows, of which a photo may lack some
+        views = tuple(replace(view, ids=own) for view in result.views)
+        result = replace(result, ids=own, views=views)
     else:
         opened = _shape(result, seen, shape)
         with in_file(path):  # older files lack the ids of keypoints
@@ -81,6 +84,12 @@ def exported_object(
     name = "model" if seen.model is None else seen.model.stem
     images = [view.image for view in seen.views]
     return object_of(result, mesh=mesh, images=images, name=name, **how)
+
+
+def _labels(seen: Observation) -> tuple[Hashable, ...]:
+    """Names of the only view's keypoints, or what else tells them apart."""
+    names = seen.names
+    return names if names is not None and len(set(names)) == len(names) else own_ids([seen])[0]
 
 
 _loaded = lru_cache(maxsize=8)(load_mesh)  # many objects of a run may share a mesh

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import msgspec
+import numpy as np
 import pyarrow.compute as pc
 
 from cadalign.arrays import is_number
@@ -260,7 +261,8 @@ def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
 
 def _line(number: int, observation: Any) -> bytes:
     require_kind(observation, Observation, f"observations[{number}]")
-    return msgspec.json.encode(observation.to_dict(states_origins=True)) + b"\n"
+    data = observation.to_dict(states_origins=True)
+    return msgspec.json.encode(data, enc_hook=np.generic.item) + b"\n"  # names may be NumPy's
 
 
 def _chunks(observations: Iterable[Observation], size: int) -> Iterator[Chunk[ObservationTask]]:

@@ -6,7 +6,7 @@ The forms that are read are described in docs/formats/detections.md.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -412,22 +412,33 @@ def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
 
     All keypoints of a model are projected. The visibility flag is 2 for those that are marked in
     the photo, 1 for those that the alignment adds, and 0, with the coordinates 0, for those outside
-    the image. ``bbox`` is that of the mesh, or else of the keypoints, in the image. ``pose`` is a
+    the image, and those that another object of the model has. ``bbox`` is that of the mesh, or else of the keypoints, in the image. ``pose`` is a
     field of its own: ``quat_wxyz`` and ``translation`` [m] from the model's axes to the camera's,
     and ``scale`` along the model's axes [m per model unit].
 
     Raises InputError if the camera, a pose or a model is not known.
     """
     placed = [(row, PlacedObject(p, found)) for row, p in enumerate(photos) for found in p.objects]
-    models = {each.model.model_id: each.names for _, each in placed}
+    models: dict[str, dict[str, int]] = {}  # the keypoints that any object of a model has
+    for _, each in placed:
+        columns = models.setdefault(each.model.model_id, {})
+        for name in each.names:
+            columns.setdefault(name, len(columns))
     rows = {model_id: row for row, model_id in enumerate(models)}
     cameras = [photo.known_camera for photo in photos]
     images = [(p.name, c.width, c.height) for p, c in zip(photos, cameras, strict=True)]
-    objects = (_projected(each, row, rows[each.model.model_id]) for row, each in placed)
-    write_json(path, coco_document(images, models.items(), objects))
+    objects = (
+        _projected(each, row, rows[each.model.model_id], models[each.model.model_id])
+        for row, each in placed
+    )
+    categories = ((model_id, tuple(columns)) for model_id, columns in models.items())
+    write_json(path, coco_document(images, categories, objects))
 
 
-def _projected(placed: PlacedObject, image: int, category: int) -> CocoObject:
+def _projected(
+    placed: PlacedObject, image: int, category: int, columns: Mapping[str, int]
+) -> CocoObject:
+    """The keypoints of an object at the ``columns`` of its category; it may lack some."""
     pixels = placed.camera.project_where_ahead(placed.pose.apply(placed.points))
     inside: BoolArray = np.asarray(np.isfinite(pixels).all(axis=1))
     inside[inside] = placed.camera.contains(pixels[inside])
@@ -438,4 +449,7 @@ def _projected(placed: PlacedObject, image: int, category: int) -> CocoObject:
     except InputError:  # an object behind the camera
         rectangle = np.zeros(4)
     pose = Alignment(placed.pose.rotation, placed.pose.translation, placed.scale)
-    return CocoObject(image, category, np.round(pixels, 4), flags, rectangle, pose)
+    own = [columns[name] for name in placed.names]
+    points_2d, of_all = np.zeros((len(columns), 2)), np.full(len(columns), _OUTSIDE)
+    points_2d[own], of_all[own] = np.round(pixels, 4), flags
+    return CocoObject(image, category, points_2d, of_all, rectangle, pose)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from cadalign import Alignment, Camera, Mesh, Observation, Result, Results
 from cadalign.batch.exports import export_run
 from cadalign.cli import main
 from cadalign.datasets import open as open_data
+from cadalign.datasets import read_image_keypoints
 from cadalign.datasets.photos.bop_files import RESULT_COLUMNS
 from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError
@@ -66,6 +68,30 @@ def test_coco_has_every_object_with_its_pose(run: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(rotation, result.alignment.rotation, atol=1e-9)
         np.testing.assert_allclose(each["pose"]["translation"], result.alignment.translation)
         np.testing.assert_allclose(each["pose"]["scale"], result.alignment.scale)
+
+
+def test_coco_keeps_the_keypoints_of_photos_that_show_other_ones_apart(
+    run: Path, tmp_path: Path
+) -> None:
+    names = np.array([f"corner {k}" for k in range(8)])
+    seen = box_in(run.parent / "000004.png", 0, run.parent / "box.obj")
+    shown = [[0, 1, 2, 5, 6, 7], [2, 3, 4, 5, 6, 7]]
+    parts = [
+        replace(
+            seen, points_3d=CORNERS[rows], points_2d=seen.points_2d[rows], names=tuple(names[rows])
+        )
+        for rows in shown
+    ]
+    cadalign.fit_many(parts, out=tmp_path / "run")
+    export_run(tmp_path / "run", tmp_path / "out", format="coco")
+    found = read_image_keypoints(tmp_path / "out" / "keypoints.json")
+    for each, rows in zip(found, shown, strict=True):
+        assert each.names is not None and each.scores is not None
+        assert set(each.names) == set(names)
+        marked = dict(zip(each.names, zip(each.points_2d, each.scores, strict=True), strict=True))
+        assert {name for name, (_, score) in marked.items() if score == 1} == set(names[rows])
+        own = [marked[name][0] for name in names[rows]]
+        np.testing.assert_allclose(own, seen.points_2d[rows], atol=1e-3)
 
 
 def test_bop_results_are_poses_of_stretched_meshes(run: Path, tmp_path: Path) -> None:

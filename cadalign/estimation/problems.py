@@ -59,7 +59,7 @@ class Problems:
     @property
     def calibrations(self) -> FloatArray:
         """Focal lengths and principal points (1 or B, 4): fx, fy, cx, cy."""
-        return np.array([[c.fx, c.fy, c.cx, c.cy] for c in self.cameras])
+        return np.reshape([[c.fx, c.fy, c.cx, c.cy] for c in self.cameras], (-1, 4))
 
     @property
     def counts(self) -> IntArray:

@@ -127,8 +127,10 @@ def _solve_one_linearly(problems: Problems, options: FitOptions) -> Solutions | 
 
     The short way of the usual call, which would otherwise take longer than its kernels.
     """
+    if len(problems.offsets) != 2:
+        return None
     camera = problems.cameras[0]
-    plain = len(problems.offsets) == 2 and options.known_axis == "x" and camera.focal_known
+    plain = options.known_axis == "x" and camera.focal_known
     if not plain or camera.distortion or not _is_plain(options.sigma, None):
         return None
     points, pixels, offsets = problems.points_3d, problems.points_2d, problems.offsets
@@ -270,7 +272,7 @@ def _with_bounded_repeated(
 ) -> Solutions:
     """The solutions, those of which the bounding prior holds a scale solved anew in rounds."""
     usual, scales = math.exp(options.scale_prior.width), found.poses[:, 0, 13:]
-    if scales.max() <= usual and scales.min() >= 1 / usual:
+    if scales.max(initial=1.0) <= usual and scales.min(initial=1.0) >= 1 / usual:
         return found
     outside = ((scales > usual) | (scales < 1 / usual)).any(axis=1) & (found.statuses == OK)
     errors = dict(found.errors)

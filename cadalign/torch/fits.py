@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.errors import InputError, require_kind
+from cadalign.errors import require_kind
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.layers import FitTask, KeypointBatch, check_cameras, fits_of
+from cadalign.estimation.model import checked_ids
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import in_threads, whitening_by
@@ -69,7 +70,8 @@ def fit(
     sigma : float or tensor that expands to (B, n)
         Standard deviations of the keypoints [px].
     mask : (B, n) bool tensor, optional
-        Marks the keypoints that are present. Those that are not finite count as absent.
+        Marks the keypoints that are present. Those that are not finite, or whose sigma is not
+        positive, count as absent.
     loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
         As for `cadalign.fit`; with ``focal="estimate"`` all images have one size.
     exact : bool
@@ -224,10 +226,7 @@ def align(
     options = FitOptions(loss=loss, loss_scale=loss_scale)
     sigmas, present, cameras = checked(points_2d, camera, sigma, mask)
     check_cameras(cameras)
-    names = tuple(model.ids if ids is None else ids)
-    if len(names) != points_2d.shape[1]:
-        what = f"{len(names)} ids for {points_2d.shape[1]} keypoints"
-        raise InputError(what, where="ids", fix="give the id of each keypoint")
+    names = checked_ids(model.ids if ids is None else ids, points_2d.shape[1])
     rows = np.array(prior_of(model).rows_of(names, "ids"), dtype=np.int64)
     weights, means, covariances = model.gaussians
     mixture = Mixture(means, covariances, -2 * np.log(weights))

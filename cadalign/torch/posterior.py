@@ -17,8 +17,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from cadalign.errors import InputError
-from cadalign.estimation.options import BOUNDING_PRIOR, FitOptions
+from cadalign.arrays import is_whole
+from cadalign.errors import InputError, quote
+from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
 from cadalign.torch.poses import PoseBatch, calibrations, checked, expanded, torch
 
@@ -41,6 +42,7 @@ def posterior_loss(
     mask: Tensor | None = None,
     loss: str = FitOptions.loss,
     loss_scale: float = FitOptions.loss_scale,
+    stretch_sigma: float | None = FitOptions.stretch_sigma,
     samples: int = 128,
     rounds: int = 2,
     seed: int = 0,
@@ -56,8 +58,8 @@ def posterior_loss(
     found : PoseBatch
         Of `cadalign.torch.fit`, for the same keypoints.
     truth : PoseBatch
-    points_3d, points_2d, camera, sigma, mask, loss, loss_scale
-        As for `cadalign.torch.fit`; without lens distortion.
+    points_3d, points_2d, camera, sigma, mask, loss, loss_scale, stretch_sigma
+        As for `cadalign.torch.fit`, whose are to be given again; without lens distortion.
     samples : int
         Number of samples of each problem and round.
     rounds : int
@@ -73,7 +75,8 @@ def posterior_loss(
     Raises
     ------
     InputError
-        If ``found`` has no covariance, as poses of `cadalign.torch.align` have none.
+        If ``found`` has no covariance, as poses of `cadalign.torch.align` have none, or focal
+        lengths of its own, or an option is wrong.
 
     Examples
     --------
@@ -93,12 +96,28 @@ def posterior_loss(
     if found.covariance is None or found.valid is None:
         what = "the poses have no covariance to draw samples from"
         raise InputError(what, where="found", fix="give poses of cadalign.torch.fit")
+    if found.focal is not None:
+        what = "the poses have estimated focal lengths, which the posterior does not integrate over"
+        raise InputError(what, where="found", fix='fit with focal="known"')
+    for name, count in (("samples", samples), ("rounds", rounds)):
+        if not is_whole(count) or count < 1:
+            raise InputError(f"{quote(count)} is not a whole number from 1", where=name)
+    options = FitOptions(loss=loss, loss_scale=loss_scale, stretch_sigma=stretch_sigma)
     sigmas, present, _ = checked(points_2d, camera, sigma, mask)
     points = expanded(points_3d, (*points_2d.shape[:2], 3), "points_3d")
-    valid = found.valid
-    weights = present.to(points_2d) * valid[:, None].to(points_2d)
     calibration = calibrations(camera, len(points)).to(points_2d)
-    pixels = torch.where(weights[..., None] > 0, points_2d, torch.zeros_like(points_2d))
+    if not len(points):
+        return points_2d.sum(dim=(1, 2))
+    valid = found.valid
+    is_seen = present.to(points_2d.device) & torch.isfinite(sigmas) & (sigmas > 0)
+    for each in (points_2d, points):
+        is_seen = is_seen & torch.isfinite(each).all(dim=2)
+    # What is absent is replaced, not weighed: 0 times NaN is NaN, and so are its gradients.
+    pixels = torch.where(is_seen[..., None], points_2d, torch.zeros_like(points_2d))
+    points = torch.where(is_seen[..., None], points, torch.zeros_like(points))
+    sigmas = torch.where(is_seen, sigmas, torch.ones_like(sigmas))
+    weights = (is_seen & valid[:, None]).to(points_2d)
+    prior = options.scale_prior
 
     def costs(rotation: Tensor, translation: Tensor, scale: Tensor) -> Tensor:
         """-2 log likelihood (B, k) with the prior on the scales, normalised over the pixels."""
@@ -108,8 +127,8 @@ def posterior_loss(
         squares = ((projected - pixels[:, None]) ** 2).sum(dim=-1) / each**2
         bent = _bent(squares, loss, loss_scale)
         whole = weights[:, None] * (bent + 4 * torch.log(each))
-        excess = torch.relu(torch.log(scale).abs() - BOUNDING_PRIOR.width)
-        return whole.sum(dim=-1) + BOUNDING_PRIOR.weight * (excess**2).sum(dim=-1)
+        excess = torch.relu(torch.log(scale).abs() - prior.width)
+        return whole.sum(dim=-1) + prior.weight * (excess**2).sum(dim=-1)
 
     with torch.no_grad():
         steps, log_density = _samples(costs, found, found.covariance, (samples, rounds), seed)

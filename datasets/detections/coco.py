@@ -412,9 +412,10 @@ def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
 
     All keypoints of a model are projected. The visibility flag is 2 for those that are marked in
     the photo, 1 for those that the alignment adds, and 0, with the coordinates 0, for those outside
-    the image, and those that another object of the model has. ``bbox`` is that of the mesh, or else of the keypoints, in the image. ``pose`` is a
-    field of its own: ``quat_wxyz`` and ``translation`` [m] from the model's axes to the camera's,
-    and ``scale`` along the model's axes [m per model unit].
+    the image, and for those that only another object of the model has. ``bbox`` is that of the
+    mesh, or else of the keypoints, in the image. ``pose`` is a field of its own: ``quat_wxyz`` and
+    ``translation`` [m] from the model's axes to the camera's, and ``scale`` along the model's axes
+    [m per model unit].
 
     Raises InputError if the camera, a pose or a model is not known.
     """

@@ -86,7 +86,8 @@ def test_coco_keeps_the_keypoints_of_photos_that_show_other_ones_apart(
     export_run(tmp_path / "run", tmp_path / "out", format="coco")
     found = read_image_keypoints(tmp_path / "out" / "keypoints.json")
     for each, rows in zip(found, shown, strict=True):
-        assert each.names is not None and each.scores is not None
+        assert each.names is not None
+        assert each.scores is not None
         assert set(each.names) == set(names)
         marked = dict(zip(each.names, zip(each.points_2d, each.scores, strict=True), strict=True))
         assert {name for name, (_, score) in marked.items() if score == 1} == set(names[rows])

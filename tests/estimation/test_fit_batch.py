@@ -232,6 +232,13 @@ def test_no_problems_give_no_results(method: str, workers: int) -> None:
     assert batch.errors == {}
 
 
+@pytest.mark.parametrize("options", [{"focal": "estimate"}, {"sigma": None}, {"method": "aepnp"}])
+@pytest.mark.parametrize("lens", ["perspective", "fisheye"])
+def test_no_problems_give_no_results_with_any_option(options: dict[str, Any], lens: str) -> None:
+    camera = Camera(640, 480, 400.0, 400.0, 319.5, 239.5, lens=lens)
+    assert len(fit_batch([], [], camera, **options)) == 0
+
+
 def test_input_is_not_changed() -> None:
     points_3d = np.stack([p.points_3d for p in problems_of([9] * 4)])
     points_2d = np.stack([p.points_2d for p in problems_of([9] * 4)])

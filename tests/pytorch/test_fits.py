@@ -264,6 +264,10 @@ def test_align_marks_what_has_too_few_keypoints() -> None:
             "points_2d: expected floating point numbers, got torch.int64; give points_2d.double()",
         ),
         (
+            lambda p, x, c: align(*shapes()[:2], c, ids=[0, *range(shapes()[1].shape[1] - 1)]),
+            "ids: 0 occurs twice; give each once",
+        ),
+        (
             lambda p, x, c: align(*shapes()[:2], UNKNOWN),
             'camera: the focal length is unknown; estimate it with focal="estimate", or give it: '
             "camera.with_focal(...)",

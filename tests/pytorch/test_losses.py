@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.problems import problem_of
 
 from cadalign import Camera, Symmetry
+from cadalign.errors import InputError
 
 torch = pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
 from cadalign.torch import (  # noqa: E402
@@ -172,3 +174,70 @@ def test_invalid_estimates_cost_nothing() -> None:
     total = total + posterior_loss(found, truth, points, pixels, CAMERA).sum()
     assert total.item() == 0
     total.backward()
+
+
+def test_posterior_loss_leaves_out_the_keypoints_that_the_fit_does() -> None:
+    points, pixels, truth = seen_problem(1.0)
+    given = pixels.expand(3, -1, -1).clone()
+    sigma, mask = torch.ones(3, 8).double(), torch.ones(3, 8, dtype=torch.bool)
+    given[0, 2], sigma[1, 2], mask[2, 2] = torch.nan, 0.0, False
+    points = points.clone().requires_grad_()
+    given.requires_grad_()
+    sigma.requires_grad_()
+    true = PoseBatch(
+        *(each.expand(3, *each.shape[1:]) for each in vars(truth).values() if each is not None)
+    )
+    found = fit(points, given, CAMERA, sigma=sigma, mask=mask)
+    values = posterior_loss(
+        found, true, points, given, CAMERA, sigma=sigma, mask=mask, samples=4000
+    )
+    assert found.valid is not None
+    assert found.valid.all()
+    torch.testing.assert_close(values, values[2].expand(3), atol=0.05, rtol=0)
+    values.sum().backward()
+    for each in (given, sigma, points):
+        assert torch.isfinite(each.grad).all()
+        assert each.grad.any()
+
+
+def test_posterior_loss_of_an_empty_batch_is_empty() -> None:
+    points, pixels, _ = seen_problem(1.0)
+    none = pixels[:0].clone().requires_grad_()
+    found = fit(points, none, CAMERA, focal="known")
+    value = posterior_loss(found, found, points, none, CAMERA)
+    assert value.shape == (0,)
+    value.sum().backward()
+
+
+def test_posterior_loss_knows_the_prior_on_the_stretch() -> None:
+    points, pixels, _ = seen_problem(1.0)
+    found = fit(points, pixels, CAMERA, stretch_sigma=0.01)
+    at_fit = PoseBatch(found.rotation, found.translation, found.scale)
+    with_prior, without = (
+        posterior_loss(found, at_fit, points, pixels, CAMERA, stretch_sigma=sigma, samples=4000)
+        for sigma in (0.01, None)
+    )
+    kept = [0, 1, 2, 3, 4, 5, 7, 8]
+    assert found.covariance is not None
+    laplace = 0.5 * torch.logdet(2 * math.pi * found.covariance[0][kept][:, kept])
+    assert abs(with_prior.item() - laplace.item()) < 0.2
+    assert without > with_prior + 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"loss": "foo"}, "loss: unknown loss 'foo'"),
+        ({"loss_scale": -1.0}, "loss_scale: -1.0 is not positive"),
+        ({"samples": 0}, "samples: 0 is not a whole number from 1"),
+        ({"rounds": 0}, "rounds: 0 is not a whole number from 1"),
+        ({}, "found: the poses have estimated focal lengths"),
+    ],
+)
+def test_posterior_loss_refuses_what_it_cannot_integrate(
+    options: dict[str, Any], message: str
+) -> None:
+    points, pixels, truth = seen_problem(1.0)
+    found = fit(points, pixels, CAMERA, focal="known" if options else "estimate")
+    with pytest.raises(InputError, match=re.escape(message)):
+        posterior_loss(found, truth, points, pixels, CAMERA, **options)

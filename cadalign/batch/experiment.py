@@ -15,7 +15,11 @@ import numpy as np
 from cadalign.batch.options import Estimated, ManyOptions
 from cadalign.batch.sources import ObservationTask, read_sources
 from cadalign.batch.table import COLUMNS, RECORD_COLUMNS, TIMING_COLUMNS, naming_row, result_row
-from cadalign.datasets.detections.image_keypoints import ImageKeypoints, join_keypoints
+from cadalign.datasets.detections.image_keypoints import (
+    ImageKeypoints,
+    join_keypoints,
+    photo_in,
+)
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
@@ -108,8 +112,7 @@ class ManyEstimates:
         assert self.model is not None
         photo = None
         if found.image is not None:
-            path = (detector.images or folder) / Path(found.image).name
-            photo = path if _exists(path) else None
+            photo = _photo(found.image, detector.images or folder)
         size = found.size or (None if photo is None else photo_size(photo))
         with in_file(found.source):
             camera = changes.read_camera(size)
@@ -136,6 +139,10 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     """
     options.changes.read_camera((1, 1))  # whatever the size: else every row would say its error
     tasks = read_sources(options.inputs)
+    photos = options.detector.images
+    if photos is not None and not photos.is_dir():
+        what = f"{photos} is not a folder of photos"
+        raise InputError(what, where="images", fix="give the photos' folder, or leave it out")
     model = _model_keypoints(options) if tasks.has_detections else None
     config = {
         **options.as_config(),
@@ -166,7 +173,9 @@ def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
     return ModelKeypoints(tuple(keypoints))
 
 
-_exists = lru_cache(maxsize=1024)(Path.is_file)
+@lru_cache(maxsize=1024)
+def _photo(image: str, folder: Path) -> Path | None:
+    return photo_in(folder, image)
 
 
 def _parsed(content: bytes, name: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import tempfile
 from collections import Counter
@@ -241,6 +242,9 @@ def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
     """The inputs of a run; observations are written to a file of its folder."""
     if isinstance(observations, str | os.PathLike):
         return (as_path(observations, "observations"),)
+    if not isinstance(observations, Iterable):
+        what = f"expected paths or Observations, got {type(observations).__name__}"
+        raise InputError(what, where="observations", fix="give a list of them")
     source = iter(observations)
     first = next(source, None)
     if first is None:
@@ -253,6 +257,9 @@ def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
     def write(unfinished: Path) -> None:
         with unfinished.open("wb") as file:
             file.writelines(starmap(_line, enumerate(chain([first], source))))
+        if path.exists() and not filecmp.cmp(path, unfinished, shallow=False):
+            folder.refuse_others(_SPOOL)
+            raise folder.another(f"{_SPOOL} holds other observations")
 
     with folder.locked():
         write_whole(path, write)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from array import array
 from bisect import bisect_right
+from codecs import BOM_UTF8
 from collections.abc import Iterable, Sequence
 from glob import glob
 from itertools import accumulate
@@ -85,6 +86,9 @@ class Lines:
         with open_input(path) as file:
             for number, line in enumerate(file, start=1):
                 digest.update(line)
+                if number == 1 and line.startswith(BOM_UTF8):  # as programs of Windows write
+                    place = len(BOM_UTF8)
+                    line = line[place:]
                 if line.strip():
                     starts.append(place)
                     numbers.append(number)

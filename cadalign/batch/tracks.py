@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.datasets import ImageKeypoints
+from cadalign.datasets.detections.image_keypoints import plain_name
 from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.result import Result
 from cadalign.estimation.tracks.motion import Trajectory
@@ -93,7 +94,8 @@ def tracks_of(
             raise DataError(what, where=each.source, fix=fix)
         own[frame] = each
     found = []
-    has_one = len({video for video, _ in by_track}) == 1
+    videos = {video for video, _ in by_track}
+    has_names = len({Path(video).name for video in videos}) == len(videos)
     for (video, name), own in by_track.items():
         known = camera or next(iter(own.values())).camera
         if known is None:
@@ -108,7 +110,8 @@ def tracks_of(
             for k in frames
         )
         names = tuple(images.get((video, k), "") for k in frames)
-        label = name if has_one else f"{video}/{name}"
+        called = Path(video).name if has_names else video
+        label = name if len(videos) == 1 else f"{called}/{name}"
         found.append(VideoTrack(label, views, tuple(frames), names))
     return found
 
@@ -133,8 +136,8 @@ def with_pictures(tracks: Sequence[VideoTrack], video: Video, *, first: int) -> 
 
 
 def _video(image: str) -> str:
-    """Name of the video that an image is of: its folder's."""
-    return Path(image).parent.name
+    """The video that an image is of: its folder."""
+    return Path(image).parent.as_posix()
 
 
 def _view(
@@ -149,8 +152,11 @@ def _view(
     """A frame as a view, without keypoints where the object was not detected."""
     if seen is None:
         return View(camera, time=time)
-    given: Sequence[object] | None = seen.names if seen.names is not None else seen.ids
-    if given is None:
+    given: Sequence[object] | None = seen.ids
+    if seen.names is not None:
+        known = {plain_name(str(each)): each for each in ids}
+        given = [known.get(plain_name(name), name) for name in seen.names]
+    elif given is None:
         if len(seen) != len(ids):
             what = f"{len(seen)} keypoints without names, but the model has {len(ids)}"
             raise DataError(what, where=seen.source, fix="name them in the file's categories")

@@ -31,6 +31,7 @@ from cadalign.datasets import (
     read_image_keypoints,
 )
 from cadalign.datasets.detections.coco import decode_segmentation
+from cadalign.datasets.detections.image_keypoints import photo_in
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
@@ -97,7 +98,7 @@ class Observe(CameraOptions, EvidenceOptions):
         """Write the observation, or those of all objects; returns the exit code."""
         if self.every:
             return _observe_all(self, objects, model)
-        name = None if self.image is None else self.image.name
+        name = None if self.image is None else str(self.image)
         with named_as_flags(self, others=_FLAGS):
             found = choose_object(objects, image=name, number=self.object)
         out = self.out or self.keypoints.with_suffix(".observation.json")
@@ -238,8 +239,7 @@ def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:
     """The photo of an object in a folder, if it is there."""
     if folder is None or found.image is None:
         return None
-    path = folder / Path(found.image).name
-    return path if path.exists() else None
+    return photo_in(folder, found.image)
 
 
 def _slugs(texts: Sequence[str | None]) -> list[str]:

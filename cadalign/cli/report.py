@@ -14,7 +14,8 @@ from cadalign.cli.evaluate import command_of
 from cadalign.cli.runs import conclude
 from cadalign.errors import InputError
 from cadalign.evaluation.experiments.estimates import EstimatesOptions
-from cadalign.io.files import write_text
+from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.io.files import keeping, write_text
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,8 @@ class ReportCommand:
         if self.out is None:
             sys.stdout.write(text)
         else:
-            write_text(self.out, text)
+            with keeping(path for run in runs for path in RunFolder(run).sources):
+                write_text(self.out, text)
         return code
 
     def _score(self) -> int:

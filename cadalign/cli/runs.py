@@ -138,8 +138,10 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
 
 
 def _as_typed(reason: str, command: ManyCommand) -> str:
-    """A failure's reason whose remedy names the command line's options."""
+    """A failure's reason whose remedy names the command line's options, not fields of a file."""
     what, mark, fix = reason.rpartition("; ")
+    if fix.startswith("known are"):
+        return reason
     return f"{what}{mark}{with_flags(fix, flags_of(command)) if mark else fix}"
 
 

@@ -60,7 +60,15 @@ from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.tables import Run
-from cadalign.io.files import as_path, dense_json, made_folder, refuse_folder, write_text
+from cadalign.io.files import (
+    as_path,
+    dense_json,
+    keeping,
+    made_folder,
+    refuse_folder,
+    refuse_input,
+    write_text,
+)
 from cadalign.report.headline import Headline, headline_of
 from cadalign.report.instances import (
     INLINE_LIMIT,
@@ -125,6 +133,8 @@ def write_report(
     page = as_path(path)
     refuse_folder(page)
     found = read_runs(runs)
+    with keeping(path for run in found for path in run.folder.sources):
+        refuse_input(page)
     made_folder(page.parent)
     table, media, folder = None, {}, None
     metrics = shown_metrics(found)

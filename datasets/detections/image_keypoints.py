@@ -86,6 +86,13 @@ class ImageKeypoints:
         )
 
 
+def photo_in(folder: Path, image: str) -> Path | None:
+    """The file of an image in a folder of photos: of as much of its path as lies there, or None."""
+    parts = Path(image).parts
+    paths = (folder.joinpath(*parts[first:]) for first in range(len(parts)))
+    return next(filter(Path.is_file, paths), None)
+
+
 def choose_object(
     objects: Sequence[ImageKeypoints], *, image: str | None = None, number: int | None = None
 ) -> ImageKeypoints:
@@ -95,8 +102,8 @@ def choose_object(
     ----------
     objects : sequence of ImageKeypoints
     image : str, optional
-        The image's file name or id; needed where the file has several images. A file of one image
-        may call it otherwise.
+        The image's file name, also with its folders, or id; needed where the file has several
+        images. A file of one image may call it otherwise.
     number : int, optional
         Which of the image's objects, from 0; by default that of the highest score, or the only one.
 
@@ -107,6 +114,12 @@ def choose_object(
     """
     images = list(dict.fromkeys(found.image for found in objects))
     wanted = [found for found in objects if image is not None and found.is_of(image)]
+    shares = {found.image: _shared_end(image, found.image) for found in wanted}
+    wanted = [found for found in wanted if shares[found.image] == max(shares.values())]
+    named = list(dict.fromkeys(found.image for found in wanted))
+    if len(named) > 1:
+        fix = f"give its path, one that ends with one of {', '.join(map(str, named[:5]))}"
+        raise InputError(f"{len(named)} images are called {image!r}", where="image", fix=fix)
     if not wanted:
         listed_images = max((found.images for found in objects), default=0)
         if image is not None and listed_images > 1 and len(images) == 1:
@@ -127,6 +140,12 @@ def choose_object(
         what = f"{len(wanted)} objects in the image, and no scores to choose by"
         raise InputError(what, where="number", fix=f"choose one, 0 to {len(wanted) - 1}")
     return max(wanted, key=lambda found: found.score or 0.0)
+
+
+def _shared_end(photo: str | None, image: str | None) -> int:
+    """Number of the names in an image's path, where these are the end of a photo's; else 0."""
+    own = Path(image or "").parts
+    return len(own) if own and Path(photo or "").parts[-len(own) :] == own else 0
 
 
 def join_keypoints(
@@ -218,8 +237,8 @@ def join_keypoints(
 def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
     """For each of the image's keypoints the model's row; None where the model has it not."""
     if found.names is not None:
-        rows = {_plain(name): row for row, name in enumerate(model.names)}
-        return [rows.get(_plain(name)) for name in found.names]
+        rows = {plain_name(name): row for row, name in enumerate(model.names)}
+        return [rows.get(plain_name(name)) for name in found.names]
     if found.ids is not None:
         by_id = {number: row for row, number in enumerate(model.ids)}
         return [by_id.get(number) for number in found.ids]
@@ -230,7 +249,8 @@ def _places(found: ImageKeypoints, model: ModelKeypoints) -> list[int | None]:
     return list(range(len(found)))
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
+    """A keypoint's name without what does not count: capitals, and spaces for ``_`` and ``-``."""
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 

@@ -274,6 +274,40 @@ def test_what_is_no_observation_is_refused() -> None:
         cadalign.fit_many([next(observations(1)), 5])  # type: ignore[list-item]
     with pytest.raises(InputError, match="observations: there are none"):
         cadalign.fit_many([])
+    message = "observations: expected paths or Observations, got Observation; give a list of them"
+    with pytest.raises(InputError, match=message):
+        cadalign.fit_many(next(observations(1)))  # type: ignore[arg-type]
+
+
+def test_files_of_others_and_of_another_run_are_not_written_over(tmp_path: Path) -> None:
+    for name in ("observations.jsonl", "results.csv", "report.html"):
+        folder = tmp_path / name.partition(".")[0]
+        folder.mkdir()
+        (folder / name).write_text("mine")
+        with pytest.raises(DataError, match=f"holds {name}, which is no run's: there is no run"):
+            cadalign.fit_many(observations(2), out=folder)
+        assert (folder / name).read_text() == "mine"
+    run = tmp_path / "run"
+    first = cadalign.fit_many(observations(2), out=run)
+    kept = (run / "observations.jsonl").read_bytes()
+    with pytest.raises(DataError, match=r"another configuration: observations.jsonl holds other"):
+        cadalign.fit_many(observations(3), out=run)
+    assert (run / "observations.jsonl").read_bytes() == kept
+    again = cadalign.fit_many(observations(2), out=run)
+    np.testing.assert_array_equal(again.rotation, first.rotation)
+
+
+def test_a_byte_order_mark_is_no_part_of_the_first_observation(tmp_path: Path) -> None:
+    source = lines(tmp_path / "o.jsonl", 3)
+    plain = cadalign.fit_many(source)
+    source.write_bytes(b"\xef\xbb\xbf" + source.read_bytes())
+    np.testing.assert_array_equal(cadalign.fit_many(source).rotation, plain.rotation)
+
+
+def test_names_of_numpy_are_texts() -> None:
+    names: Any = np.array([f"corner {k}" for k in range(8)])
+    seen = replace(next(observations(1)), names=tuple(names))
+    assert cadalign.fit_many([seen]).solved.all()
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:

@@ -175,6 +175,30 @@ def test_a_wrong_model_name_is_a_warning_of_its_row_and_refused_for_all(
     assert not (tmp_path / "x").exists()
 
 
+def test_fields_of_a_file_are_no_flags_in_reasons(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = lines(tmp_path / "o.jsonl", 1, colour="red")
+    assert main(["fit", str(source), "--no-picture", "--out", str(tmp_path / "run")]) == 1
+    said = capsys.readouterr().err
+    assert "unknown field 'colour'; known are cam_from_rig, camera, camera_height," in said
+
+
+def test_no_page_is_written_over_what_it_is_made_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, run = lines(tmp_path / "o.jsonl", 1), tmp_path / "run"
+    assert main(["fit", str(source), "--no-picture", "--out", str(run)]) == 0
+    before = (run / "run.json").read_bytes()
+    for form in ("html", "csv"):
+        capsys.readouterr()
+        assert main(["report", str(run), "--format", form, "--out", str(run / "run.json")]) == 1
+        assert "run.json: what is to be written is made from this file" in capsys.readouterr().err
+    assert (run / "run.json").read_bytes() == before
+    assert main(["report", str(run)]) == 0
+    assert main(["report", str(run)]) == 0  # in the place of the page before
+
+
 def test_duplicate_object_ids_are_rows_of_their_own(tmp_path: Path) -> None:
     flat = np.column_stack([PIXELS, np.ones(8)]).ravel().tolist()
     entry = {"id": 7, "image_id": 1, "category_id": 1, "keypoints": flat, "num_keypoints": 8}
@@ -199,6 +223,29 @@ def test_duplicate_object_ids_are_rows_of_their_own(tmp_path: Path) -> None:
     page = (tmp_path / "run" / "report.html").read_text()
     assert "found.json: annotations[0], row 0" in page
     assert "found.json: annotations[1], row 1" in page
+
+
+def test_photos_of_several_folders_are_their_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flat = np.column_stack([PIXELS, np.full(8, 0.9)]).ravel().tolist()
+    named = [f"{place}/a.png" for place in ("left", "right", "elsewhere")]
+    data = {
+        "images": [{"id": k, "file_name": name} for k, name in enumerate(named)],
+        "annotations": [{"image_id": k, "category_id": 1, "keypoints": flat} for k in range(3)],
+        "categories": [],
+    }
+    source = tmp_path / "found.json"
+    source.write_text(json.dumps(data))
+    for place in ("left", "right"):
+        (tmp_path / place).mkdir()
+        Image.new("RGB", (640, 480)).save(tmp_path / place / "a.png")
+    rows = detected(tmp_path, source)
+    photos = [Path(row["image"]).relative_to(tmp_path).as_posix() for row in rows]
+    assert photos == ["left/a.png", "right/a.png", "a.png"]
+    given = ["--model", str(tmp_path / "model.keypoints.json"), "--images", str(tmp_path / "gone")]
+    assert main(["fit", str(source), *given]) == 1
+    assert "--images: " in capsys.readouterr().err
 
 
 def coco(path: Path, *changes: dict[str, Any]) -> Path:

@@ -204,6 +204,25 @@ def test_csv_with_tracks_is_read(video: tuple[Path, list[SimulatedTrack]], tmp_p
         assert (tmp_path / "found_tracks" / name).is_file()
 
 
+def test_names_count_as_for_fit_and_folders_of_one_name_are_two_videos(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path
+) -> None:
+    folder, objects = video
+    rows = [
+        f"{place}/left/frame_{k + start:04d}.png,1,{str(name).title().replace(' ', '_')},{u},{v}"
+        for place, start in (("a", 0), ("b", FRAMES))
+        for k, view in enumerate(objects[0].views)
+        for name, (u, v) in zip(view.keypoint_ids, np.asarray(view.points_2d), strict=True)
+    ]
+    path = tmp_path / "found.csv"
+    path.write_text("\n".join(["image,track,name,u,v", *rows]))
+    files = ["--shape", str(folder / "thing.shape"), "--camera", str(folder / "camera.json")]
+    assert main(["track", str(path), *files]) == 0
+    table = pq.read_table(tmp_path / "found_tracks" / "results.parquet").to_pydict()
+    assert table["track"] == ["a/left/1"] * FRAMES + ["b/left/1"] * FRAMES
+    assert sum(table["keypoints"]) == len(rows)
+
+
 @pytest.mark.parametrize(
     ("more", "line"),
     [

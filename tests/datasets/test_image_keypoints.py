@@ -18,6 +18,7 @@ from cadalign.datasets import (
     join_keypoints,
     read_image_keypoints,
 )
+from cadalign.datasets.detections.image_keypoints import photo_in
 from cadalign.errors import CadalignError, DataError, InputError
 
 CAMERA = Camera.without_focal(640, 480)
@@ -373,9 +374,27 @@ def test_object_is_chosen_by_image_number_and_score() -> None:
     assert choose_object([seen(None)], image="other.jpg").image is None
 
 
+def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) -> None:
+    objects = [seen("left/1.jpg", 0.9), seen("right/1.jpg", 0.5)]
+    assert choose_object(objects, image="photos/right/1.jpg") is objects[1]
+    (tmp_path / "right").mkdir()
+    for name in ("1.jpg", "right/1.jpg", "2.jpg"):
+        (tmp_path / name).touch()
+    assert photo_in(tmp_path, "right/1.jpg") == tmp_path / "right/1.jpg"
+    assert photo_in(tmp_path, "data/right/1.jpg") == tmp_path / "right/1.jpg"
+    assert photo_in(tmp_path, "data/right/2.jpg") == tmp_path / "2.jpg"
+    assert photo_in(tmp_path, "3.jpg") is None
+
+
 @pytest.mark.parametrize(
     ("objects", "options", "text"),
     [
+        (
+            [seen("x/a.jpg", 0.5), seen("y/a.jpg", 0.9)],
+            {"image": "a.jpg"},
+            "image: 2 images are called 'a.jpg'; give its path, one that ends with one of "
+            "x/a.jpg, y/a.jpg",
+        ),
         ([seen("a"), seen("b")], {}, "image: 2 images; choose one of a, b"),
         (
             [seen(name) for name in "abcdefg"],

@@ -25,6 +25,8 @@ _MOST_DIFFERENCES = 6
 _FIX = "give another folder (--out), or remove this one"
 _FIX_FOREIGN = "rename it, or give another --out"
 _LOCK = ".lock"
+_WRITTEN = ("results.csv", "summary.csv", "report.html", "records.parquet", "timings.parquet")
+"""Files of a run that somebody may have by the same name."""
 
 
 class _Inside:
@@ -64,6 +66,11 @@ class RunFolder:
         """True once all results are there."""
         return self.results.is_file()
 
+    @property
+    def sources(self) -> tuple[Path, ...]:
+        """The files that pages and tables are made from."""
+        return tuple(path for path in self.path.glob("*.*") if path != self.report)
+
     def part(self, table: Path, index: int) -> Path:
         """A chunk's rows of the results, timings or records."""
         kind = "" if table == self.results else f".{table.stem}"
@@ -82,6 +89,13 @@ class RunFolder:
             found = list(self.path.iterdir()) if self.path.is_dir() else []
         if not self.config_file.exists() and any(each.name[0] != "." for each in found):
             raise DataError("holds files that are no run's", where=str(self.path), fix=_FIX_FOREIGN)
+
+    def refuse_others(self, *names: str) -> None:
+        """Raise a DataError for a file of these names that no run has written."""
+        for name in () if self.config_file.exists() else names:
+            if (self.path / name).exists():
+                what = f"holds {name}, which is no run's: there is no {self.config_file.name}"
+                raise DataError(what, where=str(self.path), fix=_FIX_FOREIGN)
 
     def remove(self) -> None:
         """Remove a run without pictures; the folder stays where something else is in it."""
@@ -151,17 +165,19 @@ class RunFolder:
         if found is None:
             if self.parts.exists() or self.results.exists():
                 raise DataError("holds results, but no run.json", where=str(self.path), fix=_FIX)
+            self.refuse_others(*_WRITTEN)
             write_json(self.config_file, wanted)
             return
         differences = list(_differences(found, wanted))
         if differences:
             listed, rest = differences[:_MOST_DIFFERENCES], len(differences) - _MOST_DIFFERENCES
             more = f"; and {rest} more differences" if rest > 0 else ""
-            raise DataError(
-                f"the folder holds a run with another configuration: {'; '.join(listed)}{more}",
-                where=str(self.path),
-                fix=_FIX,
-            )
+            raise self.another("; ".join(listed) + more)
+
+    def another(self, differences: str) -> DataError:
+        """The error of a folder that holds another run."""
+        what = f"the folder holds a run with another configuration: {differences}"
+        return DataError(what, where=str(self.path), fix=_FIX)
 
 
 class _Config(ForeignDocument):

@@ -242,10 +242,11 @@ def _inputs(observations: Observed, folder: RunFolder) -> tuple[Path, ...]:
     """The inputs of a run; observations are written to a file of its folder."""
     if isinstance(observations, str | os.PathLike):
         return (as_path(observations, "observations"),)
-    if not isinstance(observations, Iterable):
+    try:
+        source = iter(observations)
+    except TypeError:
         what = f"expected paths or Observations, got {type(observations).__name__}"
-        raise InputError(what, where="observations", fix="give a list of them")
-    source = iter(observations)
+        raise InputError(what, where="observations", fix="give a list of them") from None
     first = next(source, None)
     if first is None:
         raise InputError("there are none", where="observations")

@@ -154,8 +154,8 @@ def _view(
         return View(camera, time=time)
     given: Sequence[object] | None = seen.ids
     if seen.names is not None:
-        known = {plain_name(str(each)): each for each in ids}
-        given = [known.get(plain_name(name), name) for name in seen.names]
+        own_names = {plain_name(str(each)): each for each in ids}
+        given = [own_names.get(plain_name(name), name) for name in seen.names]
     elif given is None:
         if len(seen) != len(ids):
             what = f"{len(seen)} keypoints without names, but the model has {len(ids)}"

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _FREEDOM = 5.0  # of the proposals' Student distribution
 _INFLATION = 1.5  # of their covariance
 _LEAST_SPREAD = 1e-12
+_WIDEST = 1.0  # of turns [rad], shifts over the distance and log scales; keypoints may tell nothing
 
 
 def posterior_loss(
@@ -133,10 +134,23 @@ def posterior_loss(
     with torch.no_grad():
         steps, log_density = _samples(costs, found, found.covariance, (samples, rounds), seed)
     logs = -costs(*_moved(found, steps)) / 2 + _log_haar(steps) - log_density
+    logs, is_sampled = _usable(logs)
     log_integral = torch.logsumexp(logs, dim=1) - math.log(steps.shape[1])
     true = truth.rotation[:, None], truth.translation[:, None], truth.scale[:, None]
     value = costs(*true)[:, 0] / 2 + log_integral
-    return torch.where(valid & torch.isfinite(value), value, torch.zeros_like(value))
+    is_known = valid & is_sampled & torch.isfinite(value)
+    return torch.where(is_known, value, torch.zeros_like(value))
+
+
+def _usable(logs: Tensor) -> tuple[Tensor, Tensor]:
+    """Log weights (B, k), equal ones where none is finite, and where some are (B,).
+
+    Whatever is not finite would make NaN of the gradients of all parameters.
+    """
+    is_known = torch.isfinite(logs)
+    has_some = is_known.any(dim=1)
+    logs = torch.where(is_known, logs, torch.full_like(logs, -math.inf))
+    return torch.where(has_some[:, None], logs, torch.zeros_like(logs)), has_some
 
 
 def _bent(squares: Tensor, loss: str, bend: float) -> Tensor:
@@ -162,7 +176,8 @@ def _samples(
     free = covariance.diagonal(dim1=1, dim2=2).amax(dim=0) > 0
     places = torch.nonzero(free)[:, 0]
     size = len(places)
-    spread = _INFLATION * covariance[:, places][:, :, places]
+    widest = _widest(found)[:, places]
+    spread = _bounded(_INFLATION * covariance[:, places][:, :, places], widest)
     mean = spread.new_zeros(len(spread), size)
     proposals: list[tuple[Tensor, Tensor]] = []
     drawn: list[Tensor] = []
@@ -184,11 +199,26 @@ def _samples(
         steps = spread.new_zeros(*every.shape[:2], 10)
         steps[..., places] = every
         logs = -costs(*_moved(found, steps)) / 2 + _log_haar(steps) - log_density
-        weights = torch.softmax(logs, dim=1)
+        weights = torch.softmax(_usable(logs)[0], dim=1)
         mean = (weights[..., None] * every).sum(dim=1)
         apart = every - mean[:, None]
-        spread = _INFLATION * (apart * weights[..., None]).transpose(1, 2) @ apart
+        adapted = _INFLATION * (apart * weights[..., None]).transpose(1, 2) @ apart
+        spread = _bounded(adapted, widest)
     return steps, log_density
+
+
+def _widest(found: PoseBatch) -> Tensor:
+    """Standard deviations (B, 10) of proposals beyond which most samples would be of no use."""
+    widest = found.scale.new_full((len(found.scale), 10), _WIDEST)
+    widest[:, 3:6] *= found.translation.detach().norm(dim=1, keepdim=True)
+    return widest
+
+
+def _bounded(spread: Tensor, widest: Tensor) -> Tensor:
+    """Covariances whose standard deviations are at most ``widest`` (B, m)."""
+    deviations = torch.sqrt(torch.clamp(spread.diagonal(dim1=1, dim2=2), min=_LEAST_SPREAD))
+    share = torch.clamp(widest / deviations, max=1.0)
+    return spread * share[:, :, None] * share[:, None]
 
 
 def _factor(spread: Tensor) -> Tensor:

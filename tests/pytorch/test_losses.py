@@ -200,6 +200,30 @@ def test_posterior_loss_leaves_out_the_keypoints_that_the_fit_does() -> None:
         assert each.grad.any()
 
 
+def test_posterior_loss_of_keypoints_that_tell_nothing_is_of_the_truths_size() -> None:
+    points, _, truth = seen_problem(1.0)
+    generator = torch.Generator().manual_seed(0)
+    middle = 300 + 0.5 * torch.randn(6, 8, 2, generator=generator).double()  # as of no training
+    middle.requires_grad_()
+    found = fit(points, middle, CAMERA, sigma=10.0)
+    true = PoseBatch(
+        truth.rotation.expand(6, 3, 3), truth.translation.expand(6, 3), truth.scale.expand(6, 3)
+    )
+    few, many = (
+        posterior_loss(
+            *(found, true, points, middle, CAMERA), sigma=10.0, loss="huber", samples=samples
+        )
+        for samples in (128, 8000)
+    )
+    assert found.valid is not None
+    assert found.valid.all()
+    assert (few > 0).all()
+    assert ((few > many / 2) & (few < 2 * many)).all()
+    few.sum().backward()
+    assert torch.isfinite(middle.grad).all()
+    assert middle.grad.any(dim=2).all()
+
+
 def test_posterior_loss_of_an_empty_batch_is_empty() -> None:
     points, pixels, _ = seen_problem(1.0)
     none = pixels[:0].clone().requires_grad_()

@@ -170,7 +170,7 @@ def write_image(path: Path, image: ByteImage) -> None:
     write_whole(path, lambda unfinished: unfinished.write_bytes(data.tobytes()))
 
 
-_PHOTOS = frozenset((".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"))
+PHOTO_ENDINGS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _MOST_BYTES = 2**40
 
 
@@ -244,7 +244,7 @@ def frame_numbers(images: Iterable[str]) -> dict[str, int]:
 
 def _photos(folder: Path) -> list[Path]:
     with reading(folder):
-        found = sorted(each for each in folder.iterdir() if each.suffix.lower() in _PHOTOS)
+        found = sorted(each for each in folder.iterdir() if each.suffix.lower() in PHOTO_ENDINGS)
     if not found:
         raise DataError("there is no photo in it", where=str(folder), fix="give PNG or JPEG files")
     return found

@@ -14,6 +14,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
+from cadalign.io.images import PHOTO_ENDINGS
 from cadalign.io.observation import Observation
 from cadalign.names import renamed
 
@@ -87,9 +88,11 @@ class ImageKeypoints:
 
 
 def photo_in(folder: Path, image: str) -> Path | None:
-    """The file of an image in a folder of photos: of as much of its path as lies there, or None."""
+    """The photo of an image or id in a folder, by as much of its path as is there; or None."""
     parts = Path(image).parts
-    paths = (folder.joinpath(*parts[first:]) for first in range(len(parts)))
+    paths = [folder.joinpath(*parts[first:]) for first in range(len(parts))]
+    if not Path(image).suffix:  # detectors' results have ids, a photo's name without ending
+        paths += [folder / f"{image}{ending}" for ending in PHOTO_ENDINGS]
     return next(filter(Path.is_file, paths), None)
 
 

@@ -384,6 +384,8 @@ def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) ->
     assert photo_in(tmp_path, "data/right/1.jpg") == tmp_path / "right/1.jpg"
     assert photo_in(tmp_path, "data/right/2.jpg") == tmp_path / "2.jpg"
     assert photo_in(tmp_path, "3.jpg") is None
+    assert photo_in(tmp_path, "2") == tmp_path / "2.jpg"  # results of detectors have ids
+    assert photo_in(tmp_path, "3") is None
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from cadalign.names import renamed
 
 VISIBILITY_SCORES = (0.0, 0.5, 1.0)
 """Scores by COCO's visibility flag: not labelled, labelled but hidden, visible."""
+_COCO_DIGITS = 12
 
 
 @renamed(semantic_ids="ids")
@@ -88,11 +89,15 @@ class ImageKeypoints:
 
 
 def photo_in(folder: Path, image: str) -> Path | None:
-    """The photo of an image or id in a folder, by as much of its path as is there; or None."""
-    parts = Path(image).parts
+    """The photo of an image or id in a folder, by as much of its path as is there; or None.
+
+    COCO's photos are named by their ids in twelve digits.
+    """
+    parts = [part for part in Path(image).parts if part not in (Path(image).anchor, "..")]
     paths = [folder.joinpath(*parts[first:]) for first in range(len(parts))]
     if not Path(image).suffix:  # detectors' results have ids, a photo's name without ending
-        paths += [folder / f"{image}{ending}" for ending in PHOTO_ENDINGS]
+        stems = (image, image.zfill(_COCO_DIGITS)) if image.isdecimal() else (image,)
+        paths += [folder / f"{stem}{ending}" for stem in stems for ending in PHOTO_ENDINGS]
     return next(filter(Path.is_file, paths), None)
 
 

@@ -386,6 +386,12 @@ def test_photos_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) ->
     assert photo_in(tmp_path, "3.jpg") is None
     assert photo_in(tmp_path, "2") == tmp_path / "2.jpg"  # results of detectors have ids
     assert photo_in(tmp_path, "3") is None
+    coco, outside = tmp_path / "000000000139.jpg", tmp_path / "outside.jpg"
+    for path in (coco, outside):
+        path.touch()
+    assert photo_in(tmp_path, "139") == coco
+    assert photo_in(tmp_path / "right", str(outside)) is None
+    assert photo_in(tmp_path / "right", "../outside.jpg") is None
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from typing import Literal, cast
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import ImageOps
+from PIL import Image
 
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.facing import require_perspective
@@ -22,7 +22,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.documents import Document, in_file, read_document
 from cadalign.io.files import read_bytes, reading, write_json
-from cadalign.io.images import open_photo, photo_size
+from cadalign.io.images import open_photo, photo_size, upright_pixels
 
 Pixel = tuple[float, float]
 Mark = Literal["done", "skipped"]
@@ -55,13 +55,14 @@ class PhotoFile:
     @classmethod
     def open(cls, path: Path) -> PhotoFile:
         """Read a photo's size; raises DataError if it is missing or no photo."""
+        require_text(path)
         return cls(path, *photo_size(path))
 
     def thumbnail(self) -> bytes:
         """Encode the upright photo as a small JPEG; raises DataError if it is damaged."""
         with open_photo(self.path) as image:
             image.draft("RGB", _THUMBNAIL)
-            small = ImageOps.exif_transpose(image).convert("RGB")
+            small = Image.fromarray(upright_pixels(image))
         small.thumbnail(_THUMBNAIL)
         data = io.BytesIO()
         small.save(data, format="JPEG", quality=80)
@@ -78,10 +79,19 @@ class PhotoFile:
             is_turned = image.getexif().get(_ORIENTATION) in _TURNED
             if not is_turned and image.format in _SHOWN_AS_IS:
                 return _SHOWN_AS_IS[image.format], read_bytes(self.path)
-            upright = ImageOps.exif_transpose(image).convert("RGB")
+            upright = upright_pixels(image)
         data = io.BytesIO()
-        upright.save(data, format="JPEG", quality=_QUALITY, subsampling=0)
+        Image.fromarray(upright).save(data, format="JPEG", quality=_QUALITY, subsampling=0)
         return "image/jpeg", data.getvalue()
+
+
+def require_text(path: Path) -> None:
+    """Refuse a file whose path no JSON file can hold: names of old disks may be no UTF-8."""
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError:
+        fix = "rename it, or the folder that it is in"
+        raise DataError("the path is not UTF-8", where=str(path), fix=fix) from None
 
 
 def find_photos(path: Path) -> list[Path]:
@@ -149,8 +159,14 @@ class Intrinsics:
         return f"The photo's EXIF data give about {self.prior.focal:.0f} px, used as a prior."
 
     def with_focal(self, choice: FocalChoice) -> Camera:
-        """The camera with the focal length that the user typed, if any."""
-        return self.camera if choice.pixels is None else self.camera.with_focal(choice.pixels)
+        """The camera with the focal length that the user typed, if any.
+
+        Where it is estimated, pixels are square, as `cadalign fit` takes them.
+        """
+        own = self.camera
+        if not choice.known:
+            return self.to_write(choice).with_focal(choice.pixels or own.fx)
+        return own if choice.pixels is None else own.with_focal(choice.pixels)
 
     def to_write(self, choice: FocalChoice) -> Camera:
         """The camera for an observation file: without a focal length where that is estimated."""

@@ -69,9 +69,13 @@ class Known:
     """What the mask alone allows, by the camera; kept while nothing but pairs changes."""
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
-        """The model that `cadalign fit` aligns to the observation."""
+        """The model that `cadalign fit` aligns to the observation.
+
+        A similar one has keypoints that no pair shows, too, where they do not change the estimate.
+        """
         shape = self.shape
-        if shape.learned is not None or (shape.is_estimated and not observation.others):
+        is_single = shape.is_estimated and not observation.others
+        if shape.learned is not None or (is_single and not _shows_surface(observation)):
             points = self.anchors.values()
             return shape.model_with(points, self.mesh, up_axis=observation.up_axis)
         options = FitOptions(stretch_sigma=observation.fit_options.get("stretch_sigma"))
@@ -303,6 +307,19 @@ class LiveProblem:
         """The option of the fit for the pairs' standard deviations times a factor."""
         given = np.asarray(self.views[0].sigma)
         return (factor * given).tolist() if given.ndim else factor
+
+
+def _shows_surface(observation: Observation) -> bool:
+    """True if a mask, a depth image or the photo bears on the mesh, which every keypoint warps.
+
+    Not where the mask alone says where the search begins: that is saved from the third pair on.
+    """
+    evidence = observation.evidence
+    few = len(observation.points_2d) < LEAST_JOINT_PAIRS and observation.init is None
+    if few and evidence.mask is not None:
+        return False
+    has_photo = bool(observation.fit_options.get("image"))
+    return has_photo or evidence.mask is not None or evidence.depth is not None
 
 
 def _points_of(model: Model, ids: Sequence[Hashable]) -> FloatArray:

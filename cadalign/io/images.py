@@ -64,14 +64,15 @@ def open_picture(file: BinaryIO, size: int, *, where: str) -> Iterator[Image]:
             with Image.open(file, formats=FORMATS) as image:
                 _check_pixels(image, size)
                 yield image
+    except Image.DecompressionBombError:
+        most = 2 * (Image.MAX_IMAGE_PIXELS or 0) // 10**6
+        what, fix = f"the image has more than {most} megapixels", "make it smaller"
+        raise DataError(what, where=where, fix=fix) from None
     except UnidentifiedImageError:
         reason = f"it begins like none of {', '.join(FORMATS)}"
         raise DataError(f"not an image that can be read ({reason})", where=where) from None
     # SyntaxError: Pillow's word for a broken PNG; the last two, for numbers of a TIFF or of EXIF.
-    except (
-        *(OSError, ValueError, SyntaxError, Image.DecompressionBombError),
-        *(TypeError, struct.error),
-    ) as error:
+    except (OSError, ValueError, SyntaxError, TypeError, struct.error) as error:
         what = f"not an image that can be read ({brief(error)})"
         raise DataError(what, where=where) from None
 
@@ -92,10 +93,20 @@ def read_photo(path: str | os.PathLike[str]) -> ByteImage:
 
     It is of one of the `FORMATS`, whatever its name ends in.
     """
+    with open_photo(path) as image:
+        return upright_pixels(image)
+
+
+def upright_pixels(image: Image) -> ByteImage:
+    """The pixels of an open photo as `read_photo` returns them."""
     from PIL import ImageOps
 
-    with open_photo(path) as image:
-        return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+    upright = ImageOps.exif_transpose(image)
+    if not upright.mode.startswith("I"):
+        return np.asarray(upright.convert("RGB"))
+    # Of 16 bits, which Pillow would cut off at 255.
+    grey = (np.clip(np.asarray(upright), 0, 0xFFFF) >> 8).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=2)
 
 
 def photo_size(path: str | os.PathLike[str]) -> tuple[int, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -148,3 +148,37 @@ def test_a_prior_that_is_switched_off_is_so_in_fit(
     assert live.result is not None
     command = Result.from_json(json.dumps(fitted(case, capsys)))
     np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("evidence", ["mask", "photo"])
+def test_fit_finds_what_the_page_does_of_a_similar_model_with_its_outline(
+    case: Case, capsys: pytest.CaptureFixture[str], evidence: str
+) -> None:
+    """Every keypoint of the model warps its mesh: those that no pair shows are not in the file."""
+    session = case.open(shape_sigma=0.02)
+    place_all(session, case, count=5)
+    if evidence == "mask":
+        perform(session, 0, {"do": "mask_cut", "corners": [[90, 10], [470, 460]]})
+    else:
+        perform(session, 0, {"do": "use_photo", "on": True})
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None
+    command = Result.from_json(json.dumps(fitted(case, capsys)))
+    np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)
+
+
+def test_an_estimated_focal_length_has_square_pixels_as_in_fit(
+    case: Case, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calibrated = case.instance.camera
+    case.camera.write_text(json.dumps(replace(calibrated, fy=1.1 * calibrated.fx).to_dict()))
+    session = case.open()
+    place_all(session, case)
+    perform(session, 0, {"do": "focal", "known": False})
+    live, _ = session.live(session.photos[0])
+    assert live.result is not None
+    command = Result.from_json(json.dumps(fitted(case, capsys)))
+    assert live.result.camera.fy == live.result.camera.fx
+    np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)
+    perform(session, 0, {"do": "focal", "known": True})
+    assert session.photos[0].camera.fy == pytest.approx(1.1 * calibrated.fx)

@@ -82,6 +82,25 @@ def test_any_kind_of_picture_becomes_rgb(tmp_path: Path, kind: str) -> None:
     assert read_photo(tmp_path / "picture.png").shape == (10, 20, 3)
 
 
+@pytest.mark.parametrize("ending", ["png", "tif"])
+def test_greys_of_16_bits_keep_their_contrast(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"photo.{ending}"
+    greys = np.arange(0, 2**16, 2**8, dtype=np.uint16).reshape(16, 16)
+    Image.fromarray(greys).save(path)
+    np.testing.assert_array_equal(read_photo(path), np.repeat(greys[..., None] >> 8, 3, axis=2))
+
+
+def test_photo_of_too_many_pixels_says_how_many_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "photo.png"
+    Image.new("L", (2000, 1100)).save(path)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1_000_000)
+    with pytest.raises(DataError) as caught:
+        photo_size(path)
+    assert str(caught.value) == f"{path}: the image has more than 2 megapixels; make it smaller"
+
+
 @pytest.mark.parametrize("read", [read_photo, photo_size, FocalPrior.from_exif])
 @pytest.mark.parametrize("content", [b"", b"no picture", b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff\xe1"])
 def test_file_that_is_no_photo_is_refused(

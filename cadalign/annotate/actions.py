@@ -18,7 +18,7 @@ from cadalign.annotate.object_actions import (
     bring_back,
 )
 from cadalign.annotate.objects import PhotoState
-from cadalign.annotate.photos import Mark, nearest_corner
+from cadalign.annotate.photos import Mark, WorkList, nearest_corner
 from cadalign.annotate.proposals import proposals_of
 from cadalign.annotate.session import Session
 from cadalign.errors import InputError, quote
@@ -238,7 +238,9 @@ def mark(state: PhotoState, *, mark: Mark | None = None) -> None:
     """Say that a photo is done or skipped, or neither."""
     session = state.session
     session.before_saving()
-    session.worklist = session.worklist.marked(state.photo.path.name, mark)
+    # As the file is by now, which others may have changed.
+    kept = WorkList.open(session.worklist.path.parent)
+    session.worklist = kept.marked(state.photo.path.name, mark)
 
 
 def undo(state: PhotoState) -> ActionOutcome:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -290,7 +291,7 @@ class _File(Document):
 
 def history_path(observation: Path) -> Path:
     """File of the history of an observation."""
-    mark = hashlib.sha256(str(observation.resolve()).encode()).hexdigest()[:32]
+    mark = hashlib.sha256(os.fsencode(observation.resolve())).hexdigest()[:32]
     return user_state_path("cadalign", appauthor=False) / "annotate" / f"{mark}.json"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import InputError
+from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.gravity import vertical_direction
 from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
@@ -185,10 +185,18 @@ def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray,
 
 
 def draw_mask(drawing: MaskDrawing, width: int, height: int) -> BoolArray:
-    """The pixels (h, w) of a mask."""
+    """The pixels (h, w) of a mask; raises DataError if its file is none of that size."""
     mask = np.zeros((height, width), dtype=np.uint8)
     if drawing.base is not None:
-        mask[:] = read_mask(Path(drawing.base))
+        base = read_mask(Path(drawing.base))
+        if base.shape != mask.shape:
+            raise DataError(
+                f"the mask has {base.shape[1]} x {base.shape[0]} pixels, the photo "
+                f"{width} x {height}",
+                where=drawing.base,
+                fix="give a mask of the photo's size",
+            )
+        mask[:] = base
     for stroke in drawing.strokes:
         value = int(stroke.adds)
         if stroke.runs:

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Priors
+from cadalign.annotate.locks import LastContent
 from cadalign.annotate.models import (
     KeypointRegistry,
     ObjectShape,
@@ -44,7 +45,7 @@ from cadalign.io.documents import (
     within,
 )
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import checksum, read_bytes, write_json, writing
+from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SeenKeypoint
 
@@ -136,8 +137,7 @@ class AnnotationFiles:
     """Files of one object; the observation, which names photos and mesh, need not exist yet."""
 
     observation: Path
-    _known: bytes | None = field(default=None, init=False, repr=False)
-    """Checksum of the observation as it was last read or written; None before."""
+    _content: LastContent = field(default_factory=LastContent, init=False, repr=False)
 
     @property
     def fit(self) -> Path:
@@ -147,7 +147,7 @@ class AnnotationFiles:
     def read(self, photo: Path, model: OpenedModel, shape: ObjectShape) -> Stored:
         """Read an earlier session's annotation; new model points are added to the registry."""
         registry, stored = model.registry, Stored()
-        self._known = self._checksum()
+        self._content.note(self.observation)
         parts = []
         if self.observation.exists():
             observation = self._load()
@@ -178,10 +178,10 @@ class AnnotationFiles:
         Killed at any moment, the file has everything of before or of now. A file that was changed
         by others is refused.
         """
-        self._refuse_changed()
+        self._content.refuse_changed(self.observation)
         earlier = self._earlier_unfinished()
         observation.save(self.observation)
-        self._known = self._checksum()
+        self._content.note(self.observation)
         if earlier is not None:
             _remove(earlier_unfinished_file(self.observation))
 
@@ -196,21 +196,11 @@ class AnnotationFiles:
 
     def remove(self) -> None:
         """Remove the files of a deleted object; raises DataError on failure."""
-        self._refuse_changed()
+        self._content.refuse_changed(self.observation)
         for path in (self.observation, self.fit):
             _remove(path)
         with suppress(OSError):  # something else is in it
             self.fit.parent.rmdir()
-
-    def _refuse_changed(self) -> None:
-        if self._checksum() not in (None, self._known):
-            what = "was changed by another program since the annotator read or wrote it"
-            fix = "rename it to have all marks saved, or start anew to go on with that file"
-            raise DataError(what, where=str(self.observation), fix=fix)
-
-    def _checksum(self) -> bytes | None:
-        """The checksum of the observation's file; None where there is none."""
-        return checksum(read_bytes(self.observation)) if self.observation.exists() else None
 
     def _load(self) -> Observation:
         data = read_json(self.observation)
@@ -300,9 +290,16 @@ class AnnotationFiles:
 
 
 def _place_of(photo: Path, views: Sequence[ObservedImage], *, where: Path) -> int:
-    """The number of the view that shows a photo; of a single view its own."""
+    """The number of the view that shows a photo; that of a single view whose photo is gone."""
+    named = views[0].image
     if len(views) == 1:
-        return 0
+        if named is None or not named.exists() or named.samefile(photo):
+            return 0
+        raise DataError(
+            f"belongs to the photo {named.name}, not {photo.name}",
+            where=str(where),
+            fix="give another --observation, or correct the field image in this one",
+        )
     for number, view in enumerate(views):
         if view.image is not None and view.image.exists() and view.image.samefile(photo):
             return number

@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from cadalign.annotate.names import file_name
 from cadalign.errors import DataError, InputError
-from cadalign.io.files import read_text
+from cadalign.io.files import checksum, read_bytes, read_text
 
 logger = logging.getLogger("cadalign")
 
@@ -33,6 +33,24 @@ _PATIENCE = 0.2  # for a lock that is just being removed [s]
 _QUEUE = 2.0  # for others that are passing through the folder's lock [s]
 _LONGEST_NOTE = 150
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+
+
+@dataclass
+class LastContent:
+    """The content of a file as it was last read or written: who changes it is no annotator."""
+
+    _known: bytes | None = None  # its checksum; None without a file
+
+    def note(self, path: Path) -> None:
+        """Remember the content of the file, or that there is none."""
+        self._known = _content(path)
+
+    def refuse_changed(self, path: Path) -> None:
+        """Raise DataError if the file has other content by now."""
+        if _content(path) not in (None, self._known):
+            what = "was changed by another program since the annotator read or wrote it"
+            fix = "rename it to have all marks saved, or start anew to go on with that file"
+            raise DataError(what, where=str(path), fix=fix)
 
 
 class WriterLocks:
@@ -169,6 +187,10 @@ class _Lock:
 def _lock_path(file: Path) -> Path:
     # Without the ending: files that differ only in that share those derived from them.
     return file.with_name(file_name(f".{file.stem}", f".{_ENDING}"))
+
+
+def _content(path: Path) -> bytes | None:
+    return checksum(read_bytes(path)) if path.exists() else None
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

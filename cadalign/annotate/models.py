@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -12,9 +13,11 @@ import numpy as np
 
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.lines import Wireframe
+from cadalign.annotate.locks import LastContent
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.names import keypoints_file
 from cadalign.annotate.options import SessionOptions
+from cadalign.annotate.photos import require_text
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
@@ -26,6 +29,8 @@ from cadalign.shapes.parts import KeypointId
 
 if TYPE_CHECKING:
     from cadalign.annotate.document import Pair
+
+logger = logging.getLogger("cadalign")
 
 _SAME_PLACE = 1e-6  # largest distance of two points that count as one [diagonals]
 _LONGEST_NAME = 80
@@ -286,6 +291,7 @@ class OpenedModel:
     cad: ClickableModel
     registry: KeypointRegistry
     keypoints_path: Path
+    content: LastContent  # of that file
 
     def __post_init__(self) -> None:
         self.wireframe = Wireframe.of_model(self.cad)
@@ -311,8 +317,10 @@ class OpenedModel:
     def write_keypoints(self, used: frozenset[int]) -> None:
         """Write the given keypoints and those in use; raises DataError on failure."""
         registry = self.registry
+        self.content.refuse_changed(self.keypoints_path)
         kept = (point for number, point in registry if number in registry.given | used)
         ModelKeypoints(tuple(kept), self.path).save(self.keypoints_path)
+        self.content.note(self.keypoints_path)
 
 
 class Models:
@@ -375,6 +383,7 @@ class Models:
         return self[self.number_of(path)]
 
     def _open(self, path: Path) -> OpenedModel:
+        require_text(path)
         cad = ClickableModel(load_mesh(path))
         own, beside = self._keypoints_path(path), keypoints_file(path, path.parent)
         source = beside if self._models or self._keypoints is None else self._keypoints
@@ -383,12 +392,14 @@ class Models:
         if source != own and (source != beside or source.exists()):
             given = ModelKeypoints.load(source, mesh=mesh, model=path).keypoints
         tolerance = _SAME_PLACE * cad.diagonal
+        content = LastContent()
+        content.note(own)
         registry = KeypointRegistry(given, reserved=self._reserved, tolerance=tolerance)
         if own.exists():
             earlier = ModelKeypoints.load(own, mesh=mesh, model=path)
             refuse_other_model(earlier.model, path, where=own)
             registry.merge(earlier.keypoints)
-        return OpenedModel(path, cad, registry, own)
+        return OpenedModel(path, cad, registry, own, content)
 
     def _keypoints_path(self, path: Path) -> Path:
         """The model's file of keypoints; with folders in its name where another model has it."""
@@ -404,8 +415,14 @@ class Models:
 
 
 def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
-    """Refuse a file that names another model than the annotated one; raises DataError."""
+    """Refuse a file that names another model than the annotated one; raises DataError.
+
+    One that is gone is taken for this one, which was renamed or moved, with a warning.
+    """
     if named is None or named.resolve() == model.resolve():
+        return
+    if not named.exists():
+        logger.warning("%s: its model %s is gone: %s takes its place", where, named, model)
         return
     # In some datasets all meshes have the same file name and differ by their folders.
     same = named.name == model.name

@@ -18,14 +18,15 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from cadalign.annotate.photos import ENDINGS, MASK, SECOND_MASK
+from cadalign.annotate.photos import ENDINGS, FILE, MASK, SECOND_MASK
 from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
 
 _MOST_BYTES = 255  # of a file's name, in the common file systems
 _EARLIER_UNFINISHED = ".unfinished.json"
-_AMBIGUOUS = (_EARLIER_UNFINISHED.removesuffix(".json"), SUFFIX.removesuffix(".json"), *ENDINGS)
+_DERIVED = (_EARLIER_UNFINISHED, SUFFIX, FILE)
+_AMBIGUOUS = (*(name.removesuffix(".json") for name in _DERIVED), *ENDINGS)
 _OBJECT = re.compile(r"\.object-([1-9][0-9]*)$")  # at the end of a stem
 _OTHER_FOLDER = "give another --observation or --out"
 

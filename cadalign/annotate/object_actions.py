@@ -260,7 +260,10 @@ def mask_paint(
 
 def mask_load(state: PhotoState, *, runs: list[Count]) -> None:
     """Take a mask as it is given; see `encode_runs`."""
-    decode_runs(tuple(runs), state.photo.width, state.photo.height)
+    if not decode_runs(tuple(runs), state.photo.width, state.photo.height).any():
+        what = "no pixel of the mask is white or coloured"
+        fix = "draw it with 255 on the object; values of 16 bits are read by --mask"
+        raise InputError(what, where="mask", fix=fix)
     state.mark(mask=MaskDrawing(strokes=(Stroke(runs=tuple(runs)),)))
 
 

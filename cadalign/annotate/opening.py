@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cadalign.annotate.document import History, Priors, history_path, read_history
-from cadalign.annotate.evidence import MarkedEvidence, MarkedLengths, MaskDrawing
+from cadalign.annotate.evidence import MarkedEvidence, MarkedLengths, MaskDrawing, draw_mask
 from cadalign.annotate.files import AnnotationFiles, StoredView
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.models import Models, ObjectShape
@@ -76,9 +76,10 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
         raise InputError(what, where="--observation", fix="give a shorter one")
     photos = _readable(paths) if in_folder else [PhotoFile.open(paths[0])]
     listed = {photo.path.resolve() for photo in photos}
-    photos += [
-        PhotoFile.open(path) for path in options.further_photos if path.resolve() not in listed
-    ]
+    for path in options.further_photos:
+        if path.resolve() not in listed:
+            photos.append(PhotoFile.open(path))
+            listed.add(path.resolve())
     photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
     out = options.out or paths[0].parent if given is None else given.parent
     observations = [] if given is None else [given]
@@ -174,7 +175,7 @@ def _open_object(
     evidence = ImageEvidence() if seen is None else seen.evidence
     marks = MarkedEvidence.of(evidence, observation)
     if is_first:
-        marks = _with_options(marks, options)
+        marks = _with_options(marks, options, photo)
     intrinsics, focal = _intrinsics(photo, None if seen is None else seen.camera, camera)
     priors = stored.priors_or(Priors(LIKELY_STRETCH, intrinsics.likely_focal))
     if session.shape.is_estimated:  # with a prior of its own on the stretch
@@ -202,7 +203,9 @@ def _open_object(
     return owner.first
 
 
-def _with_options(marks: MarkedEvidence, options: SessionOptions) -> MarkedEvidence:
+def _with_options(
+    marks: MarkedEvidence, options: SessionOptions, photo: PhotoFile
+) -> MarkedEvidence:
     """The marks with the mask and the lengths that the options give."""
     mask, size = options.mask, options.size
     if options.image.is_dir() and not (mask is None and size is None):
@@ -210,7 +213,9 @@ def _with_options(marks: MarkedEvidence, options: SessionOptions) -> MarkedEvide
         what = "is of a single photo, but a folder is given"
         raise InputError(what, where=where, fix="give one photo")
     if mask is not None:
-        marks = replace(marks, mask=MaskDrawing(str(mask.resolve())))
+        drawing = MaskDrawing(str(mask.resolve()))
+        draw_mask(drawing, photo.width, photo.height)  # refuses another file now, not in the page
+        marks = replace(marks, mask=drawing)
     if size is not None:
         given = read_size(convert(size, SizeFields, where="--size"))
         marks = replace(marks, lengths=MarkedLengths.of(given))
@@ -270,8 +275,12 @@ def _further_view(owner: AnnotatedObject, stored: StoredView) -> PhotoState | Ob
 
 def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
     """True if what was drawn is what the observation file has of a photo."""
-    stored = state.document.evidence
-    mask = None if drawn.mask is None or stored.mask is None else state.mask_file(drawn.mask.base)
+    stored, mask = state.document.evidence, None
+    if drawn.mask is not None:
+        if stored.mask is not None:
+            mask = state.mask_file(drawn.mask.base)
+        elif not _is_blank(drawn.mask, state.photo):
+            return False  # it was taken from the file
     written = drawn.as_written(state.camera, mask)
     if written.mask != stored.mask:
         return False
@@ -280,3 +289,11 @@ def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
     if written.up is None or stored.up is None:
         return written.up is stored.up
     return bool(np.allclose(written.up, stored.up, rtol=0, atol=_SAME_DIRECTION))
+
+
+def _is_blank(mask: MaskDrawing, photo: PhotoFile) -> bool:
+    """True if nothing is in a mask, which an observation then lacks."""
+    try:
+        return not draw_mask(mask, photo.width, photo.height).any()
+    except CadalignError:  # the file under its strokes is gone
+        return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -18,13 +19,16 @@ from cadalign.estimation.align import align
 from cadalign.estimation.model import Model
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.io.images import Video, frame_numbers, write_image
+from cadalign.io.images import Video, frame_numbers, read_photo, write_image
 from cadalign.render.viewpoints import visible_keypoints
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.projection import predicted_covariances, projection_jacobian
 
+logger = logging.getLogger("cadalign")
+
 _RATE = 30.0  # frames in a second, of which only the strength of the motion depends
 _CLICK_SIGMA = 2.0  # [px]
+_COMPARED = 30  # one of so many frames that are there, to know whether they are the video's
 _LEAST_FRAMES = 3  # with pairs: two do not say how the motion changes
 _MOST_UNCERTAIN = 0.05  # standard deviation of a prediction that is still shown [image widths]
 
@@ -32,16 +36,35 @@ _MOST_UNCERTAIN = 0.05  # standard deviation of a prediction that is still shown
 def write_frames(video: Path, folder: Path, *, every: int) -> Path:
     """Write every so many frames of a video as photos; those that are there stay as they are.
 
-    Returns the folder. Raises DataError if the video cannot be read.
+    Returns the folder. Raises DataError if the video cannot be read, or the folder has another's.
     """
     if every < 1:
         raise InputError(f"{every} is not positive", where="--every")
     opened = Video.open(video)
     folder.mkdir(parents=True, exist_ok=True)
+    taken, alike = set[str](), list[bool]()
+
+    def refuse_others() -> None:
+        if alike and not any(alike):
+            fix = "rename the folder or the video, or give another --out"
+            what = f"the frames there are not those of {video.name}"
+            raise DataError(what, where=str(folder), fix=fix)
+
     for number, picture in opened.pictures():
         path = folder / f"frame_{number:06d}.png"
-        if number % every == 0 and not path.exists():
+        if number % every:
+            continue
+        taken.add(path.name)
+        if not path.exists():
+            refuse_others()
             write_image(path, picture)
+        elif number % (_COMPARED * every) == 0:
+            alike.append(np.array_equal(read_photo(path), picture))
+    refuse_others()
+    others = sum(path.name not in taken for path in folder.glob("frame_*.png"))
+    if others:
+        text = "%s: has %d frames beside those of --every %d, which are photos here, too"
+        logger.warning(text, folder, others, every)
     return folder
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.annotating import Case, flat, place_all
+from support.refusals import refusal_text
 
 from cadalign import Camera
 from cadalign.annotate.actions import perform
@@ -23,7 +24,7 @@ from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.errors import CadalignError
-from cadalign.io.images import read_grey
+from cadalign.io.images import read_grey, write_image
 from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long
@@ -194,3 +195,35 @@ def test_known_length_is_used(case: Case, capsys: pytest.CaptureFixture[str]) ->
         perform(session, 0, {"do": "lengths", "width": -1})
     perform(session, 0, {"do": "lengths"})
     assert "size" not in json.loads(case.observation.read_text())
+
+
+def test_a_mask_that_was_taken_from_the_file_does_not_come_back(case: Case) -> None:
+    session = case.open(prepared=False)
+    place_all(session, case, count=4)
+    perform(session, 0, {"do": "mask_paint", "points": [[200, 200]], "radius": 20})
+    assert case.open(prepared=False).photos[0].document.evidence.mask is not None
+    data = json.loads(case.observation.read_text())
+    assert data.pop("mask") == "photo.mask.png"
+    case.observation.write_text(json.dumps(data))
+    again = case.open(prepared=False)
+    assert again.photos[0].document.evidence.mask is None
+    assert len(again.photos[0].document.pairs) == 4
+
+
+def test_masks_that_cannot_be_the_photos_are_refused(case: Case) -> None:
+    small, colored = case.folder / "small.png", case.folder / "colored.png"
+    write_image(small, np.full((24, 32), 255, dtype=np.uint8))
+    write_image(colored, np.zeros((480, 640, 3), dtype=np.uint8))
+    for mask, what in (
+        (
+            small,
+            "the mask has 32 x 24 pixels, the photo 640 x 480; give a mask of the photo's size",
+        ),
+        (colored, "the image has the mode RGB"),
+        (case.folder / "nowhere.png", "no such file"),
+    ):
+        assert refusal_text(lambda m=mask: case.open(mask=m)).startswith(f"{mask}: {what}")
+    session = case.open(prepared=False)
+    runs = {"do": "mask_load", "runs": [640 * 480]}
+    assert refusal_text(lambda: perform(session, 0, runs)).startswith("mask: no pixel of the mask")
+    assert session.photos[0].document.evidence.mask is None

@@ -22,7 +22,14 @@ from cadalign.io.observation import Observation
 
 AWKWARD = (
     *("x.jpg", "x.png", "X.webp", "x.jpg.jpg", "x.jpg.json.jpg", "x.unfinished.jpg"),
-    *("x.unfinished.png", "x.unfinished.unfinished.jpg", "x_fit.jpg", "y.UNFINISHED.jpg", "y.png"),
+    *(
+        "cadalign.worklist.jpg",
+        "x.unfinished.png",
+        "x.unfinished.unfinished.jpg",
+        "x_fit.jpg",
+        "y.UNFINISHED.jpg",
+        "y.png",
+    ),
     *("sample_chair_000.keypoints.jpg", "sample_chair_000.jpg", "sample_chair_000.png.png"),
     *("a" * 240 + ".jpg", "a" * 240 + "b.jpg", "a" * 251 + ".jpg", "ä" * 125 + ".png"),
 )
@@ -185,3 +192,41 @@ def test_written_files_are_named_before_anything_is_read(case: Case) -> None:
     options = SessionOptions(image=case.photo, model=case.folder / "nowhere.obj")
     names = {path.name for path in find_session_files(options).written}
     assert names == {"nowhere.keypoints.json", "photo.json"}
+
+
+@pytest.mark.long
+def test_observation_of_another_photo_is_refused_by_name(case: Case) -> None:
+    write_observation(case.observation, case, case.photo)
+    other = case.folder / "other.png"
+    shutil.copy(case.photo, other)
+    assert refusal_text(lambda: case.open(image=other, observation=case.observation)) == (
+        f"{case.observation}: belongs to the photo photo.png, not other.png; "
+        "give another --observation, or correct the field image in this one"
+    )
+
+
+@pytest.mark.long
+def test_further_photos_count_once(case: Case) -> None:
+    other = case.folder / "other.png"
+    shutil.copy(case.photo, other)
+    session = case.open(further_photos=(other, case.photo, other), prepared=False)
+    assert [each.photo.path for each in session.photos] == [case.photo, other]
+
+
+@pytest.mark.long
+def test_names_that_are_not_utf_8(case: Case, caplog: pytest.LogCaptureFixture) -> None:
+    folder = case.folder / "photos"
+    folder.mkdir()
+    shutil.copy(case.photo, folder / "a.png")
+    odd = folder / os.fsdecode(b"caf\xe9.png")
+    try:
+        shutil.copy(case.photo, odd)
+    except OSError:
+        pytest.skip("this file system has no such names")
+    session = case.open(image=folder, prepared=False)
+    assert [each.photo.path.name for each in session.photos] == ["a.png"]
+    assert "the path is not UTF-8; rename it" in caplog.text
+    assert "the path is not UTF-8; rename it" in refusal_text(lambda: case.open(image=odd))
+    model = folder / os.fsdecode(b"caf\xe9.ply")
+    shutil.copy(case.model, model)
+    assert "the path is not UTF-8; rename it" in refusal_text(lambda: case.open(model=model))

@@ -212,6 +212,22 @@ def test_an_observation_that_others_changed_is_not_written_over(case: Case) -> N
     assert len(page_state(case.open(prepared=False), 0)["pairs"]) == 3
 
 
+def test_keypoints_that_others_changed_are_not_written_over(case: Case) -> None:
+    session = case.open(prepared=False)
+    place(session, 0, [10, 20])
+    keypoints = session.models[0].keypoints_path
+    theirs = keypoints.read_text().replace("keypoint 1", "armrest")
+    keypoints.write_text(theirs)
+    perform(session, 0, {"do": "place_uv", "uv": [30, 40]})
+    trouble = page_state(session, 0)["saved"]["trouble"]
+    assert trouble.startswith(f"{keypoints}: was changed by another program")
+    assert keypoints.read_text() == theirs
+    keypoints.rename(case.folder / "theirs.json")
+    perform(session, 0, {"do": "place_uv", "uv": [50, 60]})
+    assert page_state(session, 0)["saved"]["trouble"] == ""
+    assert keypoints.exists()
+
+
 def test_what_an_observation_says_of_its_keypoints_is_kept(case: Case) -> None:
     instance = case.instance
     count = len(instance.points_3d)
@@ -563,6 +579,7 @@ def test_files_of_others_are_never_overwritten(case: Case) -> None:
 
 def test_observation_of_another_model_is_refused(case: Case) -> None:
     instance = case.instance
+    shutil.copy(case.model, case.folder / "table.ply")
     Observation(
         instance.points_3d, instance.points_2d, instance.camera, model=case.folder / "table.ply"
     ).save(case.observation)
@@ -570,6 +587,23 @@ def test_observation_of_another_model_is_refused(case: Case) -> None:
         f"{case.observation}: belongs to the model table.ply, not sample_chair_000.ply; "
         "give another --observation or --out"
     )
+
+
+def test_annotation_goes_on_with_a_renamed_model(
+    case: Case, caplog: pytest.LogCaptureFixture
+) -> None:
+    former, model = case.folder / "former.ply", case.folder / "renamed.ply"
+    shutil.copy(case.model, former)
+    session = case.open(model=former, prepared=False)
+    for keypoint, uv in case.clicks[:3]:
+        place(session, keypoint, uv)
+    former.rename(model)
+    assert "start anew with the new name" in page_state(session, 0)["message"]
+    again = case.open(model=model, prepared=False)
+    assert len(again.photos[0].document.complete_pairs) == 3
+    assert f"{case.observation}: its model {former} is gone: {model} takes its place" in caplog.text
+    perform(again, 0, {"do": "delete", "pair": 1})
+    assert Observation.load(case.observation).model == model
 
 
 def namesake(case: Case) -> Path:

@@ -15,6 +15,8 @@ from cadalign.annotate.proposals import write_frames
 from cadalign.cli import main
 from cadalign.datasets import read_image_keypoints
 from cadalign.errors import DataError, InputError
+from cadalign.io.images import read_photo
+from cadalign.render.drawing.movie import write_movie
 
 pytestmark = pytest.mark.long
 
@@ -83,3 +85,19 @@ def test_keypoints_of_four_frames_are_proposed_in_all_others(clip: Clip, tmp_pat
     assert main([*command, "--keypoints", str(clip.case.keypoints)]) == 0
     found = read_image_keypoints(written)
     assert [each.track for each in found] == ["1"] * (len(KEY_FRAMES) + 1)
+
+
+def test_frames_of_another_video_are_refused_and_further_ones_named(
+    clip: Clip, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = write_frames(clip.path, tmp_path / "frames", every=10)
+    caplog.clear()
+    write_frames(clip.path, folder, every=20)
+    assert f"{folder}: has 3 frames beside those of --every 20" in caplog.text
+    other = tmp_path / clip.path.name
+    pictures = [255 - read_photo(path) for path in sorted(folder.iterdir())]
+    write_movie(other, [*pictures, *pictures], fps=30)
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    with pytest.raises(DataError, match=f"the frames there are not those of {other.name}; rename"):
+        write_frames(other, folder, every=1)
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before

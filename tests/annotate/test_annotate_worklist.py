@@ -16,7 +16,7 @@ from support.annotating import IDLE, Case, opened_page, place, place_of_pixel, w
 from cadalign.annotate.actions import perform
 from cadalign.annotate.exporting import coco_of, glb_of
 from cadalign.annotate.page_state import page_state, worklist_state
-from cadalign.annotate.photos import FILE
+from cadalign.annotate.photos import FILE, WorkList
 from cadalign.annotate.session import Session
 from cadalign.cli import main
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
@@ -171,3 +171,20 @@ def test_proposals_are_taken_in_the_page(browser: Browser, case: Case) -> None:
         with page.expect_download() as glb:
             page.get_by_role("link", name="Aligned model (GLB)").click()
         assert glb.value.suggested_filename == "photo.glb"
+        page.get_by_label("Form of the data set").select_option("kitti")
+        page.get_by_role("link", name="Data set (ZIP)").click()  # of an object that is tilted
+        wait(page, "annotator.layout.message.textContent.includes('choose another form')")
+
+
+def test_why_a_photo_cannot_be_shown_is_said(browser: Browser, case: Case) -> None:
+    with opened_page(browser, case.open()) as page:
+        case.photo.write_bytes(case.photo.read_bytes()[:5000])
+        page.reload()
+        wait(page, "annotator.layout?.message.textContent.includes('photo.png: not an image')")
+
+
+def test_marks_of_others_in_the_work_list_are_kept(case: Case) -> None:
+    session = case.open(image=case.folder, prepared=False)
+    marks = WorkList.open(case.folder).marked("other.png", "done")
+    perform(session, 0, {"do": "mark", "mark": "skipped"})
+    assert WorkList.open(case.folder).marks == {**marks.marks, "photo.png": "skipped"}

@@ -1,4 +1,8 @@
 // Talks to the server: one request after the other, each answered with the whole state.
+import { h } from "../common/dom.js";
+
+const SILENT = "The server does not answer. Everything up to the last “Saved” is on disk.";
+const KEPT = 60_000; // a file in memory, while the browser saves it [ms]
 
 export class Api {
   /**
@@ -58,7 +62,7 @@ export class Api {
   async models() {
     try {
       const response = await fetch(addressOf("models", this.place));
-      return response.ok ? await response.json() : { note: await this.reason(response), none: null, models: [] };
+      return response.ok ? await response.json() : { note: await reasonOf(response), none: null, models: [] };
     } catch {
       return null;
     }
@@ -91,11 +95,11 @@ export class Api {
     try {
       response = await fetch(url, options);
     } catch {
-      this.onTrouble("The server does not answer. Everything up to the last “Saved” is on disk.");
+      this.onTrouble(SILENT);
       return null;
     }
     if (!response.ok) {
-      this.onTrouble(await this.reason(response));
+      this.onTrouble(await reasonOf(response));
       return null;
     }
     const state = await response.json();
@@ -110,13 +114,43 @@ export class Api {
     return state;
   }
 
-  async reason(response) {
-    const text = await response.text();
-    try {
-      return JSON.parse(text).error;
-    } catch {
-      return text || `refused (${response.status})`;
+}
+
+/** Why the server refused a request. */
+async function reasonOf(response) {
+  const text = await response.text();
+  try {
+    return JSON.parse(text).error;
+  } catch {
+    return text || `refused (${response.status})`;
+  }
+}
+
+/** Why an address has no file; null if it has one. */
+export async function failureOf(address) {
+  try {
+    const response = await fetch(address);
+    return response.ok ? null : await reasonOf(response);
+  } catch {
+    return SILENT;
+  }
+}
+
+/** Save the file of an address, as the server names it; says why if there is none. */
+export async function download(address, tell) {
+  try {
+    const response = await fetch(address);
+    if (!response.ok) {
+      tell(await reasonOf(response));
+      return;
     }
+    const name = /filename\*=UTF-8''(.*)/.exec(response.headers.get("Content-Disposition") ?? "");
+    const url = URL.createObjectURL(await response.blob());
+    h("a", { href: url, download: name ? decodeURIComponent(name[1]) : "" }).click();
+    setTimeout(() => URL.revokeObjectURL(url), KEPT);
+    tell("");
+  } catch {
+    tell(SILENT);
   }
 }
 

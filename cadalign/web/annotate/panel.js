@@ -1,6 +1,6 @@
 // The lower half: what the alignment is, what to mark next, and the list of pairs.
 import { button, h } from "../common/dom.js";
-import { addressOf } from "./api.js";
+import { addressOf, download } from "./api.js";
 import { Candidates } from "./candidates.js";
 import { EvidencePanel } from "./evidence_panel.js";
 
@@ -224,15 +224,27 @@ export class Panel {
     );
     this.empty = h("p", { class: "soft" }, "No pairs yet.");
     this.table = h("table", {}, h("thead", {}, h("tr", {}, head)), this.rows);
-    this.glb = h("a", { download: true }, "Aligned model (GLB)");
-    const coco = h("a", { href: "export/coco.json", download: true }, "All keypoints (COCO)");
+    this.glb = this.makeLink("Aligned model (GLB)");
+    const coco = this.makeLink("All keypoints (COCO)");
+    coco.href = "export/coco.json";
     const exports = h("p", { class: "exports" }, "Export: ", coco, " ", this.glb, " ", this.makePhotoSet());
     return h("div", { class: "scroll" }, exports, this.empty, this.table);
   }
 
+  /** A link to a file that the server may refuse, which the page then says. */
+  makeLink(text) {
+    const link = h("a", {
+      onclick: (event) => {
+        event.preventDefault();
+        download(link.href, this.handlers.tell);
+      },
+    }, text);
+    return link;
+  }
+
   /** A choice among the forms of data sets, and the link to all photos in that form. */
   makePhotoSet() {
-    const link = h("a", { download: true }, "Data set (ZIP)");
+    const link = this.makeLink("Data set (ZIP)");
     const form = h(
       "select",
       { "aria-label": "Form of the data set", onchange: () => (link.href = `export/${form.value}.zip`) },

@@ -1,4 +1,5 @@
 // The photo: zoomed, panned, and drawn over with points and the alignment.
+import { failureOf } from "./api.js";
 import { drawBadge, kindOf } from "./marker.js";
 import { drawPhotoLoupe, Loupe } from "./loupe.js";
 import { Marking } from "./marking.js";
@@ -66,7 +67,9 @@ export class PhotoView {
     try {
       await picture.decode();
     } catch {
-      this.handlers.onTrouble("This photo cannot be read to its end.");
+      const { wanted } = this;
+      const reason = await failureOf(picture.src);
+      if (this.wanted === wanted) this.handlers.onTrouble(reason ?? "The browser cannot show this photo.");
       return;
     }
     if (this.wanted !== picture) return;

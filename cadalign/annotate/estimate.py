@@ -23,8 +23,6 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.io.observation import Observation
 
-_PROPOSAL = "A proposal by the mask: it is saved from the third pair on."
-
 
 @dataclass(frozen=True, eq=False)
 class LiveAlignment:
@@ -70,13 +68,11 @@ class LiveAlignment:
                 continue
             if (stored := observation.fit_options.get("sigma")) is not None:
                 sigma, options = stored, {"sigma": stored}
-            text = assumed.format(reason="" if reason is None else reason.what)
+            text = assumed.format(reason="" if reason is None else reason.what) or attempt.proposal
             found = cls(result, text, attempt, sigma, options)
             if attempt.is_by_mask:  # with the mask's candidates that the pairs leave
-                # `cadalign fit` knows neither the model's other keypoints nor where to begin.
-                text = text or ("" if attempt.exact else _PROPOSAL)
                 candidates, chances = attempt.candidates, attempt.chances
-                found = replace(found, message=text, candidates=candidates, chances=chances)
+                found = replace(found, candidates=candidates, chances=chances)
             return found
         assert reason is not None
         raise reason

@@ -123,6 +123,19 @@ class LiveProblem:
         model = self.model
         return model if isinstance(model, Model) and model.shape_sigma is None else None
 
+    @property
+    def proposal(self) -> str:
+        """Says that it is shown and not saved, since `cadalign fit` would not find it; else empty.
+
+        That knows neither a similar model's other keypoints nor where the mask's search begins.
+        """
+        if self.exact is None and self.is_by_mask:
+            return "A proposal by the mask: it is saved from the third pair on."
+        is_similar = self.exact is None and isinstance(self.model, Model)
+        if is_similar and not any(len(view.keypoint_ids) for view in self.views):
+            return "A proposal: it is saved from the first pair on."
+        return ""
+
     def attempts(self) -> Iterator[tuple[LiveProblem, str]]:
         """Problems to try, the first as it is, down to what is left where marks do not suffice.
 
@@ -312,11 +325,12 @@ class LiveProblem:
 def _shows_surface(observation: Observation) -> bool:
     """True if a mask, a depth image or the photo bears on the mesh, which every keypoint warps.
 
-    Not where the mask alone says where the search begins: that is saved from the third pair on.
+    Not of proposals, which are not saved: without a pair, and where the mask alone says where the
+    search begins, with fewer than three.
     """
-    evidence = observation.evidence
-    few = len(observation.points_2d) < LEAST_JOINT_PAIRS and observation.init is None
-    if few and evidence.mask is not None:
+    evidence, count = observation.evidence, len(observation.points_2d)
+    by_mask = evidence.mask is not None and observation.init is None
+    if count < (LEAST_JOINT_PAIRS if by_mask else 1):
         return False
     has_photo = bool(observation.fit_options.get("image"))
     return has_photo or evidence.mask is not None or evidence.depth is not None

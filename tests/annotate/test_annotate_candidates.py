@@ -162,6 +162,9 @@ def test_a_choice_among_those_that_are_left(similar: Similar) -> None:
     assert page["by_mask"] == {"chosen": True, "candidates": [], "text": ""}
     live, _ = session.live(session.photos[0])
     assert rotation_error(est=live.alignment, gt=wanted) < 10
+    # Which `cadalign fit` would not find: it knows no keypoint of the model.
+    assert page["alignment"]["notes"][0] == "A proposal: it is saved from the first pair on."
+    assert not (similar.case.folder / "photo_fit" / "fit.json").exists()
 
 
 @pytest.mark.long

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -529,3 +530,23 @@ def test_shape_is_drawn_and_an_unknown_point_identified(browser: Browser, case: 
         expect(choice).to_have_count(0)
         context.close()
         assert driver.errors == []
+
+
+def test_an_answer_that_takes_long_is_waited_for_in_sight(
+    opened: tuple[Driver, Case, Access], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    driver, _, _ = opened
+    released = threading.Event()
+
+    def late(*given: Any, **options: Any) -> Any:
+        released.wait(60)
+        return perform(*given, **options)
+
+    monkeypatch.setattr("cadalign.annotate.server.perform", late)
+    before = driver.page.evaluate("annotator.layout.saved.textContent")
+    driver.page.evaluate("void annotator.act({ do: 'delete', pair: 9 }).catch(() => null)")
+    driver.wait("annotator.layout.saved.textContent === 'Working…'")
+    released.set()
+    driver.wait("annotator.api.idle")
+    assert driver.page.evaluate("annotator.layout.saved.textContent") == before
+    driver.errors.clear()  # that there is no such pair

@@ -2,6 +2,7 @@
 import { h } from "../common/dom.js";
 
 const SILENT = "The server does not answer. Everything up to the last “Saved” is on disk.";
+const LONG = 1000; // without an answer, until the page says that it is waited for [ms]
 const KEPT = 60_000; // a file in memory, while the browser saves it [ms]
 
 export class Api {
@@ -9,10 +10,12 @@ export class Api {
    * @param {object} handlers
    * @param {(state: object) => void} handlers.onState - gets every new state
    * @param {(text: string) => void} handlers.onTrouble - gets what went wrong; "" when all is well
+   * @param {(on: boolean) => void} handlers.onWorking - hears that an answer takes long, and its end
    */
-  constructor({ onState, onTrouble }) {
+  constructor({ onState, onTrouble, onWorking }) {
     this.onState = onState;
     this.onTrouble = onTrouble;
+    this.onWorking = onWorking;
     this.queue = Promise.resolve();
     this.waiting = 0;
     this.place = { image: 0, object: null };
@@ -83,10 +86,15 @@ export class Api {
     const { place } = this;
     const request = makeRequest(place);
     this.waiting += 1;
+    this.slow ??= setTimeout(() => this.onWorking(true), LONG);
     const answer = this.queue.then(() => this.send(request, place));
     this.queue = answer.catch(() => null);
     return answer.finally(() => {
       this.waiting -= 1;
+      if (this.waiting) return;
+      clearTimeout(this.slow);
+      this.slow = null;
+      this.onWorking(false);
     });
   }
 

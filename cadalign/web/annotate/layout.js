@@ -39,6 +39,8 @@ const KEYS = [
   ["?", "this help"],
 ];
 
+const WORKING = "Working…";
+
 export class Layout {
   /** @param {object} handlers - undo, redo, previous, next */
   constructor(handlers, panel, objects) {
@@ -119,6 +121,12 @@ export class Layout {
     this.saved.classList.toggle("trouble", Boolean(saved.trouble));
     this.saved.textContent = savedText(saved);
     if (state.message) this.tell(state.message);
+  }
+
+  /** Say in the place of the last save that an answer is waited for, or no more. */
+  showWorking(on) {
+    if (on) [this.before, this.saved.textContent] = [this.saved.textContent, WORKING];
+    else if (this.saved.textContent === WORKING) this.saved.textContent = this.before;
   }
 
   /** Open the help at its beginning, or close it. */

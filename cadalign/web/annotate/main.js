@@ -35,6 +35,7 @@ class App {
     this.api = new Api({
       onState: (state) => this.show(state),
       onTrouble: (text) => this.layout.tell(text),
+      onWorking: (on) => this.layout.showWorking(on),
     });
     const act = (action, select) => this.act(action, select);
     this.askSoon = debounced(() => this.ask(), REST);

@@ -15,6 +15,8 @@ import tyro
 from cadalign.annotate.options import LOOPBACK, VIDEOS, FileOptions, SessionOptions
 from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
 from cadalign.cli.options import flag_of
+from cadalign.errors import DataError, InputError
+from cadalign.io.documents import read_json
 from cadalign.io.files import write_json, writing
 
 if TYPE_CHECKING:
@@ -156,6 +158,7 @@ def _export(options: SessionOptions, to: Path, form: str) -> int:
 
     session = open_session(options)
     if form == "coco":
+        _refuse_other_file(to, options)
         data = coco_of(session)
         write_json(to, data)
         count = len(data["annotations"])
@@ -170,6 +173,19 @@ def _export(options: SessionOptions, to: Path, form: str) -> int:
     count = len(photos) - len(problems)
     say(f"{to}: {count} photos in the form of {form}")
     return 0
+
+
+def _refuse_other_file(path: Path, options: SessionOptions) -> None:
+    """Refuse to write COCO annotations over a file without any, or over a detector's."""
+    known: Any = None
+    if path.is_file():
+        with suppress(DataError):
+            known = read_json(path)
+    is_coco = isinstance(known, dict) and "annotations" in known
+    is_read = options.detections is not None and options.detections.resolve() == path.resolve()
+    if path.exists() and (is_read or not is_coco):
+        what = f"{path} exists and is no earlier export"
+        raise InputError(what, where="--export", fix="give another name")
 
 
 def _save_and_say_where(session: Session) -> int:

@@ -140,6 +140,14 @@ def test_annotations_are_exported_as_coco_and_glb(
     command = ["annotate", str(case.folder), str(case.model), "--export", str(to)]
     assert main([*command, "--camera", str(case.camera)]) == 0
     assert json.loads(to.read_text()) == data
+    assert main([*command, "--camera", str(case.camera)]) == 0  # once more
+    capsys.readouterr()
+    kept = (case.folder / "other.json").read_bytes()
+    assert main([*command[:-1], str(case.folder / "other.json")]) == 1
+    assert "other.json exists and is no earlier export; give another" in capsys.readouterr().err
+    assert main([*command, "--detections", str(to)]) == 1
+    assert (case.folder / "other.json").read_bytes() == kept
+    assert json.loads(to.read_text()) == data
     read = read_image_keypoints(to)
     assert [each.image for each in read] == ["other.png", "photo.png"]
     assert (read[0].scores > 0).tolist() == [True] * 5 + [False]

@@ -54,12 +54,12 @@ def earlier_unfinished_file(observation: Path) -> Path:
     return observation.with_name(file_name(observation.stem, _EARLIER_UNFINISHED))
 
 
-def mask_file(observation: Path, base: str | None) -> Path:
-    """Path of the mask beside an observation, not the file of the mask under its strokes."""
+def mask_files(observation: Path) -> tuple[Path, Path]:
+    """Paths of the mask beside an observation; the second where the first is another's file."""
     first, second = (
         observation.with_name(file_name(observation.stem, ending)) for ending in (MASK, SECOND_MASK)
     )
-    return second if base is not None and Path(base).resolve() == first.resolve() else first
+    return first, second
 
 
 def object_file(observation: Path, number: int) -> Path:

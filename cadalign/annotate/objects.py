@@ -15,7 +15,7 @@ from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.evidence import MaskDrawing, draw_mask
 from cadalign.annotate.files import AnnotationFiles, written_half
 from cadalign.annotate.models import OpenedModel, Proposal
-from cadalign.annotate.names import file_name, mask_file, object_number
+from cadalign.annotate.names import file_name, mask_files, object_number
 from cadalign.annotate.photos import Intrinsics, PhotoFile
 from cadalign.annotate.problem import LEAST_JOINT_PAIRS
 from cadalign.annotate.suggestion import Suggestion
@@ -217,12 +217,20 @@ class PhotoState:
         return draw_mask(drawing, self.photo.width, self.photo.height)
 
     def mask_file(self, base: str | None) -> Path:
-        """Path of the mask to draw, not the file of the one under its strokes."""
+        """Path of the mask to draw: no file under its strokes, nor one that was not drawn here."""
+        first, second = self.mask_files
+        is_base = base is not None and Path(base).resolve() == first.resolve()
+        is_own = self.drawn is not None and self.drawn[1] == first
+        return second if is_base or (first.exists() and not is_own) else first
+
+    @property
+    def mask_files(self) -> tuple[Path, Path]:
+        """Paths that the mask may have."""
         observation = self.owner.files.observation
         if not self.is_first:  # several photos share the observation
             stem = f"{observation.stem}.{self.photo.path.stem}"
             observation = observation.with_name(file_name(stem, ".json"))
-        return mask_file(observation, base)
+        return mask_files(observation)
 
     def require_inside(self, uv: Pixel) -> None:
         """Refuse a place outside the photo."""

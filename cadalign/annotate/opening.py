@@ -194,12 +194,18 @@ def _open_object(
         further = (each for each in owner.states if not each.is_first and each.key == view)
         return _is_same(drawn, next(further, owner.first))
 
+    stored_masks = [view.document.evidence.mask for view in owner.states]
     owner.history = read_history(
         history_path(files.observation),
         owner.document,
         model.registry,
         is_same,
     )
+    for view, kept in zip(owner.states, stored_masks, strict=True):
+        shown = view.document.evidence.mask
+        own = None if shown is None or kept is None else _own_mask(shown, kept, view)
+        if own is not None:  # which may be drawn anew
+            view.drawn = MaskDrawing(), own, True
     return owner.first
 
 
@@ -278,8 +284,8 @@ def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
     stored, mask = state.document.evidence, None
     if drawn.mask is not None:
         if stored.mask is not None:
-            mask = state.mask_file(drawn.mask.base)
-        elif not _is_blank(drawn.mask, state.photo):
+            mask = _own_mask(drawn.mask, stored.mask, state)
+        elif not _is_alike(drawn.mask, MaskDrawing(), state.photo):
             return False  # it was taken from the file
     written = drawn.as_written(state.camera, mask)
     if written.mask != stored.mask:
@@ -291,9 +297,16 @@ def _is_same(drawn: MarkedEvidence, state: PhotoState) -> bool:
     return bool(np.allclose(written.up, stored.up, rtol=0, atol=_SAME_DIRECTION))
 
 
-def _is_blank(mask: MaskDrawing, photo: PhotoFile) -> bool:
-    """True if nothing is in a mask, which an observation then lacks."""
+def _own_mask(drawn: MaskDrawing, stored: MaskDrawing, state: PhotoState) -> Path | None:
+    """The file of a stored mask if it is that of the strokes; None if it is another's."""
+    own = next((path for path in state.mask_files if str(path) == stored.base != drawn.base), None)
+    return own if drawn.strokes and _is_alike(drawn, stored, state.photo) else None
+
+
+def _is_alike(one: MaskDrawing, other: MaskDrawing, photo: PhotoFile) -> bool:
+    """True if two masks are of the same pixels."""
+    size = photo.width, photo.height
     try:
-        return not draw_mask(mask, photo.width, photo.height).any()
-    except CadalignError:  # the file under its strokes is gone
+        return np.array_equal(draw_mask(one, *size), draw_mask(other, *size))
+    except CadalignError:  # the file of one is gone
         return False

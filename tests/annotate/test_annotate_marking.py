@@ -227,3 +227,28 @@ def test_masks_that_cannot_be_the_photos_are_refused(case: Case) -> None:
     runs = {"do": "mask_load", "runs": [640 * 480]}
     assert refusal_text(lambda: perform(session, 0, runs)).startswith("mask: no pixel of the mask")
     assert session.photos[0].document.evidence.mask is None
+
+
+def test_a_mask_of_others_is_not_painted_over(case: Case) -> None:
+    theirs = case.folder / "photo.mask.png"
+    write_image(theirs, np.full((480, 640), 7, dtype=np.uint8))
+    kept = theirs.read_bytes()
+
+    def named() -> str:
+        (view,) = json.loads(case.observation.read_text())["views"]
+        return str(view["mask"])
+
+    for start in ({}, {"mask": theirs}):
+        session = case.open(prepared=False, **start)
+        perform(session, 0, {"do": "mask_clear"})
+        perform(session, 0, {"do": "mask_paint", "points": [[200, 200]], "radius": 20})
+        assert named() == "photo.mask-2.png"
+        again = case.open(prepared=False)  # with the strokes, which can be undone
+        perform(again, 0, {"do": "mask_paint", "points": [[300, 200]], "radius": 20})
+        assert named() == "photo.mask-2.png"
+        drawn = read_grey(case.folder / "photo.mask-2.png") != 0
+        assert drawn[200, 200]
+        assert drawn[200, 300]
+        perform(again, 0, {"do": "undo"})
+        assert not (read_grey(case.folder / "photo.mask-2.png") != 0)[200, 300]
+        assert theirs.read_bytes() == kept

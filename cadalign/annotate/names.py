@@ -18,15 +18,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from cadalign.annotate.photos import ENDINGS, FILE, MASK, SECOND_MASK
+from cadalign.annotate.photos import FILE, MASK, SECOND_MASK
 from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
+from cadalign.io.images import PHOTO_ENDINGS
 
 _MOST_BYTES = 255  # of a file's name, in the common file systems
 _EARLIER_UNFINISHED = ".unfinished.json"
 _DERIVED = (_EARLIER_UNFINISHED, SUFFIX, FILE)
-_AMBIGUOUS = (*(name.removesuffix(".json") for name in _DERIVED), *ENDINGS)
+_AMBIGUOUS = (*(name.removesuffix(".json") for name in _DERIVED), *PHOTO_ENDINGS)
 _OBJECT = re.compile(r"\.object-([1-9][0-9]*)$")  # at the end of a stem
 _OTHER_FOLDER = "give another --observation or --out"
 
@@ -175,7 +176,7 @@ def _has_namesake(photo: Path) -> bool:
     return any(
         name != photo.name
         and _folded(Path(name).stem) == _folded(photo.stem)
-        and Path(name).suffix.lower() in ENDINGS
+        and Path(name).suffix.lower() in PHOTO_ENDINGS
         for name in names
     )
 

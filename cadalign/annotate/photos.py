@@ -22,14 +22,13 @@ from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.documents import Document, in_file, read_document
 from cadalign.io.files import read_bytes, reading, write_json
-from cadalign.io.images import open_photo, photo_size, upright_pixels
+from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
 
 Pixel = tuple[float, float]
 Mark = Literal["done", "skipped"]
 State = Literal["to do", "begun", "done", "skipped"]
 FILE = "cadalign.worklist.json"
 _FORMAT = "cadalign work list"
-ENDINGS = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 MASK, SECOND_MASK = ".mask.png", ".mask-2.png"
 """Endings of the files of masks; the second is for one that is painted over the first."""
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
@@ -100,7 +99,7 @@ def find_photos(path: Path) -> list[Path]:
         in_folder, exists = path.is_dir(), path.exists()
         entries = list(path.iterdir()) if in_folder else []
     if in_folder:
-        photos = [p for p in entries if p.suffix.lower() in ENDINGS and p.is_file()]
+        photos = [p for p in entries if p.suffix.lower() in PHOTO_ENDINGS and p.is_file()]
         stems = {p.stem for p in photos}
         own = [p for p in photos if not _is_mask(p, stems)]
         found = sorted(own, key=lambda p: natural_key(p.name))
@@ -108,7 +107,7 @@ def find_photos(path: Path) -> list[Path]:
             raise InputError(
                 "there are no photos in this folder",
                 where=str(path),
-                fix=f"file names of photos end in {', '.join(ENDINGS)}",
+                fix=f"file names of photos end in {', '.join(PHOTO_ENDINGS)}",
             )
         return found
     if not exists:

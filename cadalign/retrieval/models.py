@@ -356,6 +356,8 @@ def mirrored_labelings(xyz: FloatArray, reflections: Iterable[tuple[int, int]]) 
 def read_library(path: str | os.PathLike[str]) -> ModelTable:
     """Map a library's file into memory and check it."""
     where = str(path)
+    if as_path(path).is_dir():
+        raise DataError("is a folder, not a library's file", where=where, fix=_AGAIN)
     try:
         # Opening a pipe would wait for its other end.
         if as_path(path).exists() and not Path(path).is_file():

@@ -546,7 +546,7 @@ def test_photos_of_a_folder_come_in_turn_each_with_its_file(
 
 def test_folder_without_photos_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
-        InputError, match=r"no photos in this folder; file names of photos end in .bmp"
+        InputError, match=r"no photos in this folder; file names of photos end in .png"
     ):
         find_photos(tmp_path)
     (tmp_path / "x.png").write_text("no photo")

@@ -85,9 +85,15 @@ class Annotate(FileOptions):
         rest: dict[str, Any] = {
             field.name: getattr(self, field.name) for field in fields(FileOptions)
         }
-        if found["image"].suffix.lower() in VIDEOS:
+        image = found["image"]
+        if image.suffix.lower() in VIDEOS:
             rest["track"] = True
-            found["image"] = self._frames(found["image"])
+            found["image"] = self._frames(image)
+        elif self.every != 1:
+            raise UsageError(f"{image} is no video", where="--every", fix="leave it out")
+        elif self.track and not image.is_dir():
+            what = f"{image} is neither a video nor a folder"
+            raise UsageError(what, where="--track", fix="give the folder of the frames")
         return SessionOptions(**(found | rest))
 
     def _frames(self, video: Path) -> Path:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cadalign.cli.common import answer, group_of, make_folder_of, say
+from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
 
 if TYPE_CHECKING:
     from cadalign.retrieval import Library
@@ -71,7 +71,7 @@ class LibraryBuild:
 
 
 @dataclass(frozen=True)
-class LibraryShow:
+class LibraryShow(JsonOption):
     """Check a library file and list its models by category."""
 
     library: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="LIBRARY")]
@@ -81,14 +81,28 @@ class LibraryShow:
         """Open the library and describe it; returns the exit code."""
         from cadalign.retrieval import Library
 
-        answer(_describe(Library.open(self.library)))
+        library = Library.open(self.library)
+        if self.json:
+            print_json(_summary(library))
+        else:
+            answer(_describe(library))
         return 0
 
 
-def _describe(library: Library) -> str:
+def _summary(library: Library) -> dict[str, Any]:
     counts = Counter(category for category, _ in library.keys)
-    listed = ", ".join(f"{count} {category}" for category, count in sorted(counts.items()))
-    return f"{len(library)} models: {listed}"
+    return {
+        "models": len(library),
+        "with_mesh": library.with_mesh,
+        "categories": dict(sorted(counts.items())),
+    }
+
+
+def _describe(library: Library) -> str:
+    counts = _summary(library)["categories"]
+    listed = ", ".join(f"{count} {category}" for category, count in counts.items())
+    without = len(library) - library.with_mesh
+    return f"{len(library)} models: {listed}" + (f"; {without} without a mesh" if without else "")
 
 
 LibraryCommand = group_of(

@@ -67,6 +67,10 @@ class OutlineStore:
         lacking = [row for row in rows if row not in self._known]
         with ThreadPoolExecutor(worker_count(workers)) as pool:
             self._known |= zip(lacking, pool.map(self._made, lacking), strict=True)
+        without = sum(self._known[row] is None for row in lacking)
+        if without and without < len(rows):
+            said = "%d of %d models have no mesh that can be read, and are not ranked by the mask"
+            logger.warning(said, without, len(rows))
         return [self._known[row] for row in rows]
 
     def _made(self, row: int) -> Whitened | None:
@@ -83,7 +87,7 @@ class OutlineStore:
 def rank_by_mask(
     table: ModelTable,
     outlines: OutlineStore,
-    mask: npt.NDArray[np.generic],
+    mask: npt.NDArray[Any],
     camera: Camera,
     options: RetrievalOptions,
     exclude: Collection[ModelKey],
@@ -97,6 +101,8 @@ def rank_by_mask(
     if not camera.focal_known:
         what, fix = "a mask alone does not tell the focal length", "give a calibrated camera"
         raise InputError(what, where="camera", fix=f"{fix}, or keypoints")
+    if mask.dtype.kind in "iu":  # of an image
+        mask = mask > np.iinfo(mask.dtype).max / 2
     inside = np.asarray(View(camera, mask=mask).mask_image) >= 0.5
     rows = chosen_models(table, options.category, exclude).tolist()
     query = FacedMask.of(inside, camera).outline

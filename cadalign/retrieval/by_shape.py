@@ -57,7 +57,11 @@ _NEGLIGIBLE = 1e-9  # probability of a Gaussian that is left out
 _FLOOR = 1e-4  # least standard deviation of a coordinate, in extents of the shape
 _FLAT = 1e-9  # share of a model's variance along an axis without extent
 _MOST_NEIGHBOURS = 2000  # models among which the nearest ones are looked for
-_INAPPLICABLE = {"method": "optimal", "symmetries": False}
+_INAPPLICABLE = {
+    "method": "optimal",
+    "symmetries": False,
+    **{name: getattr(RetrievalOptions, name) for name in ("stretch_sigma", "none_prior")},
+}
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 
 from cadalign.datasets import AnnotatedModel, KeypointNet
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, refuse_unused
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from cadalign.retrieval.by_mask import OutlineStore
 
 logger = logging.getLogger("cadalign")
+
+# Options that say something of the models, of which a mask alone does not make use.
+_OF_KEYPOINTS = ("method", "shape_sigma", "max_stretch", "none_prior")
 
 
 class Library:
@@ -164,6 +167,11 @@ class Library:
         return tuple(self._table.keys)
 
     @property
+    def with_mesh(self) -> int:
+        """Number of models that have a mesh."""
+        return len(self) - int(self._table.table["mesh"].null_count)
+
+    @property
     def nbytes(self) -> int:
         """Memory of the models in bytes; an opened library shares it among processes."""
         return int(self._table.table.nbytes)
@@ -226,7 +234,7 @@ class Library:
             The image instead of a mask: its opacity, or a segmentation around the keypoints, is
             the mask.
         exclude : collection of (str, str)
-            Category and id of models to leave out.
+            Category and id of models to leave out; those that the library lacks make no difference.
         workers : int
             Number of threads; -1 for one per core.
         **options
@@ -263,6 +271,7 @@ class Library:
                 raise InputError("keypoints are missing", where=where, fix=fix)
             from cadalign.retrieval.by_mask import OutlineStore, mask_of, rank_by_mask
 
+            refuse_unused(chosen, _OF_KEYPOINTS, "on a mask alone")
             if self._outlines is None:
                 self._outlines = OutlineStore(self._table)
             inside, limits = mask_of(mask, None, (), camera), (exclude, workers)

@@ -144,9 +144,10 @@ class Match:
 
     def observation(self, seen: Observation) -> Observation:
         """The keypoints of an observation that the model has, paired with the model's."""
-        assert seen.ids is not None
-        kept = np.flatnonzero(np.isin(seen.ids, self.ids))
-        ids = seen.ids[kept]
+        # None of a mask alone.
+        given = np.empty(0, dtype=np.int64) if seen.ids is None else seen.ids
+        kept = np.flatnonzero(np.isin(given, self.ids))
+        ids = given[kept]
         own: dict[str, Any] = {name: getattr(seen, name) for name in ("sigma", "scores", "depths")}
         own = {name: None if each is None else each[kept] for name, each in own.items()}
         return replace(
@@ -198,6 +199,7 @@ class Match:
             "missing_ids": list(self.missing_ids),
             "mirrored": self.mirrored,
             "mesh": None if self.mesh_path is None else str(self.mesh_path),
+            "camera": None if self.camera is None else self.camera.to_dict(),
             "silhouette_iou": self.silhouette_iou,
             "none_probability": self.none_probability,
         }

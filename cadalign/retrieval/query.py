@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from cadalign.render.drawing.canvas import ByteImage
     from cadalign.retrieval.library import Library
     from cadalign.retrieval.match import Match
+
+
+logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +75,9 @@ class ObservationRetrieval:
             As for `Library.retrieve`; or if the keypoints have no semantic ids, or the photo cannot
             be read.
         """
+        if seen.others:
+            said = "%s: models are ranked by the first of its %d photos alone"
+            logger.warning(said, where, len(seen.views))
         library, shape = self.opened()
         camera, ids = seen.camera, _semantic_ids(seen, where)
         cuts_out = self.silhouette and len(ids)

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
 from cadalign.datasets.models.categories import require_category
-from cadalign.errors import DegenerateError, InputError, require_kind
+from cadalign.errors import DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.fit import fit_batch
 from cadalign.estimation.options import LOSSES, Sigma
@@ -157,11 +157,20 @@ def chosen_models(
     if category is not None:
         rows = rows[table.rows_of(require_category(category, table.categories, where="category"))]
     if exclude:
-        unwanted = set(exclude)
+        unwanted = {_checked_key(key) for key in exclude}
         rows = rows[[table.keys[row] not in unwanted for row in rows.tolist()]]
         if not len(rows):
             raise InputError("all models are excluded", where="exclude")
     return rows
+
+
+def _checked_key(key: object) -> ModelKey:
+    """A model's category and id; other things would exclude nothing."""
+    match key:
+        case (str(category), str(model_id)) | [str(category), str(model_id)]:
+            return category, model_id
+    what = f"{quote(key)} is not a model's category and id"
+    raise InputError(what, where="exclude", fix='give pairs, as [("chair", model_id)]')
 
 
 def gather_candidates(

@@ -360,6 +360,12 @@ class TestCategories:
         with pytest.raises(InputError, match="exclude: all models are excluded"):
             self.LIBRARY.retrieve(pixels, IDS, CAMERA, exclude=self.LIBRARY.keys)
 
+    @pytest.mark.parametrize("key", ["003", ("box", 3), ["box"]])
+    def test_what_names_no_model_to_exclude_is_refused(self, key: Any) -> None:
+        pixels = view(self.LIBRARY["box", "003"], pose_of(3))
+        with pytest.raises(InputError, match="is not a model's category and id"):
+            self.LIBRARY.retrieve(pixels, IDS, CAMERA, exclude=[key])
+
 
 # --- the bound and the order -----------------------------------------------------------------
 

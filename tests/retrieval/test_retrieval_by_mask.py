@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from cadalign import Alignment, Camera, Library
+from cadalign import Alignment, Camera, Library, load_mesh
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError, InputError
 from cadalign.io.images import write_image
+from cadalign.io.observation import Observation
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, look_at
 from cadalign.retrieval import LibraryModel
@@ -82,9 +84,35 @@ def test_an_observation_of_a_mask_is_ranked_by_it(
     view = {"camera": CAMERA.to_dict(), "mask": "mask.png"}
     (tmp_path / "seen.json").write_text(json.dumps({"views": [view]}))
     command = ["retrieve", str(tmp_path / "seen.json"), "--library"]
-    assert main([*command, str(tmp_path / "models.cadalign"), "--json"]) == 0
+    command += [str(tmp_path / "models.cadalign"), "--json", "--out", str(tmp_path / "out")]
+    assert main(command) == 0
     first = json.loads(capsys.readouterr().out)[0]
     assert (first["category"], first["model_id"]) == key
+    # Its model and pose are an observation and a fit, of which the other commands make more.
+    best = Observation.load(tmp_path / "out" / "match_01.json")
+    assert best.model == library[key].mesh_path
+    assert best.evidence.mask == tmp_path / "mask.png"
+    fit = tmp_path / "out" / "match_01_fit"
+    assert main(["export", str(fit), "--to", str(tmp_path / "best.obj")]) == 0
+    placed = Alignment.from_dict(first["alignment"]).apply(library[key].load_mesh().vertices)
+    assert np.abs(load_mesh(tmp_path / "best.obj").vertices - placed).max() < 1e-6
+
+
+def test_a_mask_may_be_an_image_of_bytes(library: Library) -> None:
+    key = next(key for key in library.keys if key[0] == "chair")
+    mask, _ = masked(library, key)
+    matches = library.retrieve(mask=255 * mask.astype(np.uint8), camera=CAMERA, category="chair")
+    assert (matches[0].category, matches[0].model_id) == key
+
+
+def test_models_without_a_mesh_are_counted(
+    library: Library, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, second, *_ = library
+    some = Library.from_models([replace(first, mesh_path=None), second])
+    mask, _ = masked(library, second.key)
+    assert len(some.retrieve(mask=mask, camera=CAMERA)) == 1
+    assert "1 of 2 models have no mesh that can be read, and are not ranked" in caplog.text
 
 
 def test_a_mask_of_labels_is_read_as_a_fit_reads_it(tmp_path: Path) -> None:
@@ -118,6 +146,8 @@ def test_a_part_that_is_hidden_does_not_hide_the_model(library: Library) -> None
             "camera: a mask alone does not tell the focal length; give a calibrated camera, or",
         ),
         ({"mask": np.zeros((240, 320), dtype=bool)}, "mask: "),
+        ({"shape_sigma": 0.03}, "shape_sigma: has no effect on a mask alone; leave it out"),
+        ({"max_stretch": 1.1}, "max_stretch: has no effect on a mask alone; leave it out"),
     ],
 )
 def test_refusals(library: Library, change: dict[str, Any], message: str) -> None:

@@ -249,6 +249,11 @@ NAMED = ShapeModel.from_basis(MODELS[0].xyz, [MODELS[0].xyz], [0.1], names=list(
             "method: 'epnp' does not apply to a ranking by shape; "
             "leave it at 'optimal', or rank without shape",
         ),
+        (
+            {"none_prior": 0.1},
+            "none_prior: 0.1 does not apply to a ranking by shape; "
+            "leave it at 0.5, or rank without shape",
+        ),
     ],
 )
 def test_bad_input_is_refused(options: dict[str, Any], message: str) -> None:

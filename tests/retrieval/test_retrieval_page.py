@@ -213,6 +213,9 @@ def test_a_library_is_built_and_shown(
     assert out.read_bytes() == (case.folder / "lib.cadalign").read_bytes()
     assert main(["library", "show", str(out)]) == 0
     assert capsys.readouterr().out == "8 models: 4 bottle, 4 chair\n"
+    assert main(["library", "show", str(out), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary == {"models": 8, "with_mesh": 8, "categories": {"bottle": 4, "chair": 4}}
     chairs = ["--categories", "chair", "--split", "train", "--out", str(tmp_path / "some")]
     assert main(["library", "build", str(case.folder / "sample"), *chairs]) == 0
     assert Library.open(tmp_path / "some").categories == ("chair",)
@@ -229,6 +232,24 @@ def test_models_with_malformed_annotations_are_left_out_and_counted(
     assert main(["library", "build", str(root), "--out", str(tmp_path / "lib")]) == 0
     assert "Left out: 1 models with malformed annotations" in capsys.readouterr().err
     assert len(Library.open(tmp_path / "lib")) == 1
+
+
+def test_models_without_a_mesh_are_counted(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, *others = case.library
+    Library.from_models([replace(first, mesh_path=None), *others]).save(tmp_path / "lib")
+    assert main(["library", "show", str(tmp_path / "lib")]) == 0
+    assert capsys.readouterr().out == "8 models: 4 bottle, 4 chair; 1 without a mesh\n"
+
+
+def test_only_the_first_of_several_photos_is_a_query(
+    case: Case, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "two.json"
+    replace(case.observation, others=(case.observation,)).save(path)
+    assert main(["retrieve", str(path), *case.arguments[1:]]) == 0
+    assert f"{path}: models are ranked by the first of its 2 photos alone" in caplog.text
 
 
 def test_a_table_of_the_matches_is_printed(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
@@ -266,7 +287,9 @@ def test_matches_as_json_are_those_of_the_library(
     options = ["--sigma", "2", "--category", "chair", "--symmetries", "--loss", "cauchy", "--json"]
     assert main(["retrieve", *case.arguments, *options]) == 0
     expected = case.retrieve(sigma=2.0, category="chair", symmetries=True, loss="cauchy")
-    assert json.loads(capsys.readouterr().out) == [match.to_dict() for match in expected]
+    found = json.loads(capsys.readouterr().out)
+    assert found == [match.to_dict() for match in expected]
+    assert found[0]["camera"] == CAMERA.to_dict()
 
 
 def test_help_is_of_retrieval_alone(capsys: pytest.CaptureFixture[str]) -> None:

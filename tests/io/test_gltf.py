@@ -61,6 +61,12 @@ def test_nodes_are_placed_from_the_root_down(tmp_path: Path) -> None:
     assert (normals[:, 2] > 0).all()
 
 
+def test_a_file_without_a_scene_shows_all_its_nodes(tmp_path: Path) -> None:
+    nodes = [{"mesh": 0, "translation": [5, 0, 0]}, {"translation": [1, 0, 0], "children": [0]}]
+    mesh = read(tmp_path, nodes=nodes, scenes=[])
+    np.testing.assert_allclose(mesh.vertices, SQUARE + [6, 0, 0])
+
+
 @pytest.mark.parametrize(
     ("mode", "expected"),
     [

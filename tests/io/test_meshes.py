@@ -36,7 +36,10 @@ def write(tmp_path):
 
 @pytest.mark.parametrize(
     "face",
-    ["1 2 3", "1/1 2/2 3/3", "1//1 2//1 3//1", "1/1/1 2/2/1 3/3/1", "-4 -3 -2", "1/1 2 3//1"],
+    [
+        *("1 2 3", "1/1 2/2 3/3", "1//1 2//1 3//1", "1/1/1 2/2/1 3/3/1", "-4 -3 -2", "1/1 2 3//1"),
+        *("1/ 2/ 3/", "1// 2// 3//", "1/1/ 2/2/ 3/3/", "1/1 2/2 3/", "1 2 3 # a comment", "1 2 3#"),
+    ],
 )
 def test_obj_reads_every_form_of_corner(write, face):
     mesh = load_mesh(write(f"{SQUARE}vt 0 0\nvt 1 0\nvt 1 1\nvn 0 0 1\nf  {face}\n"))
@@ -101,6 +104,11 @@ def test_obj_accepts_tabs_continued_lines_windows_ends_and_comments(write):
 def test_obj_vertex_colors(write, color, largest):
     mesh = load_mesh(write(f"v 0 0 0 {color}\nv 1 0 0 {color}\nv 0 1 0 {color}\nf 1 2 3\n"))
     np.testing.assert_allclose(mesh.vertex_colors, [[1, 0.5, 0, 1]] * 3)
+
+
+def test_obj_vertices_without_a_color_among_others_are_white(write):
+    mesh = load_mesh(write("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0 0 0 1\nf 1 2 3\n"))
+    np.testing.assert_allclose(mesh.vertex_colors[:, :3], [[1, 0, 0], [1, 1, 1], [0, 0, 1]])
 
 
 # --- OBJ: materials
@@ -255,6 +263,9 @@ def _ply(faces: list[list[int]], *, binary: bool) -> bytes:
         ([[0, 1, 2, 3], [0, 1, 2, 4]], True),
         ([[0, 1, 2, 3], [0, 1, 2, 4]], False),
         ([[0, 1, 2, 3], [0, 1, 4], [0, 1, 2, 3, 4], [1, 2, 4]], False),
+        ([[0, 1, 2, 3], [0, 1, 4], [1, 2, 4]], True),
+        # Of the same bytes as three of the first one's size.
+        ([[0, 1, 2, 3], [0, 1, 4], [0, 1, 2, 3, 4]], True),
     ],
 )
 def test_ply_polygons_keep_their_number(write, faces, binary):
@@ -263,6 +274,27 @@ def test_ply_polygons_keep_their_number(write, faces, binary):
     for number, face in enumerate(faces):
         first = mesh.faces[np.searchsorted(mesh.polygon, number)]
         assert first.tolist() == face[:3]
+
+
+@pytest.mark.parametrize("order", ["little", "big"])
+def test_binary_ply_polygons_of_several_sizes_keep_their_colors(write, order):
+    """Also beside lists of other things, and before further elements."""
+    sign = "<" if order == "little" else ">"
+    header = (
+        f"ply\nformat binary_{order}_endian 1.0\nelement vertex 4\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        "element face 2\nproperty uchar red\nproperty list uchar uint vertex_indices\n"
+        "property list ushort float weights\nproperty uchar green\nproperty uchar blue\n"
+        "element edge 1\nproperty int vertex1\nproperty int vertex2\nend_header\n"
+    )
+    body = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], f"{sign}f8").tobytes()
+    body += struct.pack(f"{sign}BB3IH2fBB", 255, 3, 3, 0, 1, 2, 0.5, 0.25, 0, 0)
+    body += struct.pack(f"{sign}BB4IH0fBB", 0, 4, 0, 1, 2, 3, 0, 255, 0)
+    mesh = load_mesh(write(header.encode() + body + struct.pack(f"{sign}2i", 0, 1), "a.ply"))
+    assert mesh.faces.tolist() == [[3, 0, 1], [0, 1, 2], [0, 2, 3]]
+    assert mesh.polygon.tolist() == [0, 1, 1]
+    colors = [mesh.materials[number].color[:3] for number in mesh.face_material]
+    assert colors == [(1, 0, 0), (0, 1, 0), (0, 1, 0)]
 
 
 def test_ply_without_faces_is_a_data_error(write):

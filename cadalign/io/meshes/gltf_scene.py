@@ -69,7 +69,11 @@ def read_gltf(path: Path) -> Mesh:
 def _placements(file: GltfFile) -> Iterator[tuple[int, FloatArray]]:
     """Meshes and their transforms, in the order of the nodes from the scene's roots down."""
     document = file.document
-    roots = nth(document.scenes, document.scene, "scenes").nodes if document.scenes else []
+    if document.scenes:
+        roots = nth(document.scenes, document.scene, "scenes").nodes
+    else:  # a library of parts; shown are all
+        children = {child for node in document.nodes for child in node.children}
+        roots = [number for number in range(len(document.nodes)) if number not in children]
     waiting = [(root, np.eye(4)) for root in reversed(roots)]
     seen: set[int] = set()
     while waiting:

@@ -186,9 +186,18 @@ def _lengths(bodies: list[bytes], text: bytes) -> IntArray:
     return np.array([body.count(b" ") for body in bodies], dtype=np.int64) + 1
 
 
-def _parse_rows(bodies: list[bytes], *, least: int = 1) -> FloatArray:
-    """The numbers of statements that may differ in length, padded with zeros; (n, width) float."""
+def _joined(bodies: list[bytes]) -> tuple[list[bytes], bytes]:
+    """Statements without comments at their ends, and the text of all."""
     text = b" ".join(bodies)
+    if b"#" not in text:
+        return bodies, text
+    bodies = [body.partition(b"#")[0].rstrip() for body in bodies]
+    return bodies, b" ".join(bodies)
+
+
+def _parse_rows(bodies: list[bytes], *, least: int = 1, padding: float = 0.0) -> FloatArray:
+    """The numbers of statements that may differ in length, padded; (n, width) float."""
+    bodies, text = _joined(bodies)
     values = np.fromstring(text, sep=" ", dtype=np.float64)
     lengths = _lengths(bodies, text)
     if lengths.sum() != len(values) or (lengths < least).any():
@@ -198,14 +207,14 @@ def _parse_rows(bodies: list[bytes], *, least: int = 1) -> FloatArray:
         raise ValueError("too many numbers in a line")
     if (lengths == width).all():
         return np.asarray(values.reshape(len(bodies), width))
-    rows = np.zeros((len(bodies), width))
+    rows = np.full((len(bodies), width), padding)
     rows[np.arange(width) < lengths[:, None]] = values
     return rows
 
 
 def _parse_vertices(bodies: list[bytes]) -> tuple[FloatArray, FloatArray | None]:
     """Positions (n, 3), and colours (n, 4) if there are any: ``x y z [w] [r g b]``."""
-    rows = _parse_rows(bodies, least=3)
+    rows = _parse_rows(bodies, least=3, padding=1.0)  # white, where some vertices have a colour
     width = rows.shape[1]
     if width < 6:
         return np.ascontiguousarray(rows[:, :3]), None
@@ -218,13 +227,15 @@ def _parse_vertices(bodies: list[bytes]) -> tuple[FloatArray, FloatArray | None]
 
 def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
     """Corners (c, 2) as (vertex, texture coordinate or 0), as in the file, and faces' sizes."""
-    text = b" ".join(bodies)
+    bodies, text = _joined(bodies)
     sizes = _lengths(bodies, text)
     if sizes.min() < 3:
         raise ValueError("a face has fewer than 3 corners")
     total = int(sizes.sum())
     # What stays when digits and signs go is the form of each corner: "", "/" or "//".
     forms = set(text.translate(None, _DIGITS).split())
+    if b"/ " in text or text.endswith(b"/"):  # 1/ for a corner without more: read one by one
+        forms = {b""}
     doubled = text.count(b"//")
     corners = np.zeros((total, 2), dtype=np.int64)
     if not forms:
@@ -236,8 +247,7 @@ def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
     elif forms == {b"//"} and not doubled and text.count(b"/") == 2 * total:
         corners[:] = _integers(text.replace(b"/", b" "), 3 * total).reshape(total, 3)[:, :2]
     else:
-        for row, corner in enumerate(text.split()):
-            corners[row] = _parse_corner(corner)
+        corners[:] = [_parse_corner(corner) for corner in text.split()]
     return corners, sizes
 
 

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
+from cadalign.io.files import keeping, refuse_input
 
 if TYPE_CHECKING:
+    from cadalign.datasets import KeypointNet
     from cadalign.retrieval import Library
 
 
@@ -41,14 +43,20 @@ class LibraryBuild:
 
     def run(self) -> int:
         """Build the library; returns the exit code."""
-        from cadalign.batch.libraries import build_library
-        from cadalign.cli.runs import run_progress
         from cadalign.datasets import KeypointNet
-        from cadalign.evaluation.runs.folder import RunFolder
 
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
         dataset = dataset.subset(categories=self.categories, split=self.split)
-        make_folder_of(self.out)
+        with keeping(dataset.files):
+            refuse_input(self.out)
+            make_folder_of(self.out)
+            return self._build(dataset)
+
+    def _build(self, dataset: KeypointNet) -> int:
+        from cadalign.batch.libraries import build_library
+        from cadalign.cli.runs import run_progress
+        from cadalign.evaluation.runs.folder import RunFolder
+
         folder = self.out.with_name(f"{self.out.stem}_build")
         with run_progress("reading models") as on_progress:
             library, troubles = build_library(

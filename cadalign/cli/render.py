@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from cadalign.cli.common import make_folder_of, new_console, say
 from cadalign.cli.options import named_as_flags
+
+if TYPE_CHECKING:
+    from cadalign.cli.render_job import RenderJob
 
 
 @dataclass(frozen=True)
@@ -52,15 +55,18 @@ class Render:
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
+        from cadalign.cli.render_job import RenderJob
+
+        with named_as_flags(self, others={"fov_x": "--fov", "elevation": "--view"}):
+            return self._draw(RenderJob.of(self))
+
+    def _draw(self, job: RenderJob) -> int:
         from rich.progress import track
 
-        from cadalign.cli.render_job import RenderJob
         from cadalign.io.images import write_image
         from cadalign.render import write_movie
         from cadalign.render.drawing.movie import MOVIES
 
-        with named_as_flags(self):
-            job = RenderJob.of(self)
         make_folder_of(self.out)
         if self.out.suffix.lower() in MOVIES:
             frames, count = job.movie()

@@ -10,9 +10,10 @@ import numpy as np
 import tyro
 
 from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
+from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import run_progress
 from cadalign.datasets import KeypointNet
-from cadalign.io.files import keeping
+from cadalign.io.files import keeping, refuse_input
 from cadalign.render.drawing.shape_picture import draw_shape
 from cadalign.shapes.model import ShapeModel
 
@@ -40,11 +41,16 @@ class ShapeLearn:
 
     def run(self) -> int:
         """Learn the model; returns the exit code."""
+        dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
+        with keeping(dataset.files), named_as_flags(self):
+            if self.out is not None:
+                refuse_input(self.out)
+                make_folder_of(self.out)
+            return self._learn(dataset)
+
+    def _learn(self, dataset: KeypointNet) -> int:
         from cadalign.evaluation.runs.run import Progress
 
-        dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
-        if self.out is not None:
-            make_folder_of(self.out)
         with run_progress(f"learning {self.category}") as on_progress:
             model = ShapeModel.from_dataset(
                 dataset,

@@ -280,7 +280,9 @@ def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
     tries = []
     for seed in range(_CLUSTERINGS):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of clusters without vectors
+            # Of clusters without vectors, and of vectors that are all the same.
+            warnings.simplefilter("ignore", UserWarning)
+            warnings.simplefilter("ignore", RuntimeWarning)
             centres, labels = kmeans2(coefficients, count, minit="++", seed=seed)
         tries.append((float(((coefficients - centres[labels]) ** 2).sum()), seed, labels))
     labels = min(tries)[2].astype(np.int64)

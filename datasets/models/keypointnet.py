@@ -174,6 +174,13 @@ class KeypointNet:
         """The names of the splits there are, sorted."""
         return tuple(sorted(path.stem for path in (self.root / "splits").glob("*.txt")))
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files of annotations and splits."""
+        folders = (self.root / "annotations", "*.json"), (self.root / "splits", "*.txt")
+        own = [path for folder, ending in folders for path in folder.glob(ending)]
+        return (*own, *self.root.glob("*.json"))
+
     def split(self, name: str) -> frozenset[ModelKey]:
         """The (category, model id) that a split names, annotated or not.
 

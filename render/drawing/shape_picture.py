@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import DataError
 from cadalign.geometry.box import BOX_EDGES, bounds_corners
-from cadalign.io.files import write_whole
+from cadalign.io.files import printable, refuse_input, write_whole
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
 
@@ -29,13 +30,18 @@ _LABELLED = 40  # keypoints, above which their ids would cover one another
 def draw_shape(path: Path, model: ShapeModel) -> None:
     """Draw a row for each component: the mean with its box and ids, then the first modes.
 
-    A mode is drawn at -2 (blue) and +2 (orange) standard deviations from the mean (grey).
+    A mode is drawn at -2 (blue) and +2 (orange) standard deviations from the mean (grey). Raises
+    DataError if no picture has the path's ending, or the file cannot be written.
     """
     from matplotlib.figure import Figure
 
     modes = max(1, min(_MODES, max(len(each.modes) for each in model.components)))
     rows, columns = len(model.components), modes + 1
     figure = Figure(figsize=(columns * _CELL, rows * _CELL + 0.45), layout="constrained")
+    refuse_input(path)
+    if path.suffix[1:].lower() not in figure.canvas.get_supported_filetypes():
+        what, fix = "is no picture's name", "end it in .png, .jpg, .svg or .pdf"
+        raise DataError(what, where=printable(path), fix=fix)
     figure.suptitle(
         f"{model.category}: mean, and -{_DEVIATIONS:g} (blue) to +{_DEVIATIONS:g} (orange) "
         f"standard deviations along its first modes",

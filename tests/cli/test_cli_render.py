@@ -198,8 +198,9 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
         (["--background", "mauve"], InputError, "is not a colour"),
         (["--background", "transparent", "--view", "all"], InputError, "can be transparent"),
         (["--scale", "1", "0", "1"], InputError, "is not positive"),
-        (["--fov", "180"], InputError, "between 0 and 180"),
-        (["--samples", "0"], InputError, "samples"),
+        (["--fov", "180"], InputError, "--fov: 180.0 is not between 0 and 180"),
+        (["--view", "10,200"], InputError, "--view: 200 is not between -90 and 90"),
+        (["--samples", "0"], InputError, "--samples: 0 is not from 1 to 256"),
         (["--out", "t.mp4", "--seconds", "0"], InputError, "not 1 to 10000 frames"),
     ],
 )

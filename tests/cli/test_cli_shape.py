@@ -59,6 +59,15 @@ def test_refusals(sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
         capsys, "shape", "learn", sample_root, "--category", "chair", "--split", "none"
     )
     assert "unknown split 'none'" in line
+    learning = ["shape", "learn", sample_root, "--category", "chair"]
+    annotations = sample_root / "annotations" / "chair.json"
+    before = annotations.read_bytes()
+    for path in (annotations, sample_root / "splits" / "train.txt"):
+        line = refusal_line(capsys, *learning, "--out", path)
+        assert line == f"{path}: what is to be written is made from this file; give another name"
+        line = refusal_line(capsys, "library", "build", sample_root, "--out", path)
+        assert line == f"{path}: what is to be written is made from this file; give another name"
+    assert annotations.read_bytes() == before
     wrong = tmp_path / "wrong.shape"
     wrong.write_text("no shape")
     line = refusal_line(capsys, "shape", "show", wrong)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
+from cadalign.errors import DataError
 from cadalign.render.drawing.shape_picture import draw_shape, neighbour_pairs
 from cadalign.shapes.model import ShapeModel
 
@@ -25,6 +26,13 @@ def test_the_skeleton_holds_the_minimum_spanning_tree(seed: int, count: int) -> 
     graph = np.zeros((count, count))
     graph[tuple(np.transpose(sorted(pairs)))] = 1
     assert connected_components(graph)[0] == 1
+
+
+@pytest.mark.parametrize("name", ["picture.xyz", "picture"])
+def test_a_name_of_no_picture_is_refused(tmp_path: Path, name: str) -> None:
+    model = ShapeModel.from_basis(np.eye(4, 3), np.ones((1, 4, 3)), [0.1])
+    with pytest.raises(DataError, match="is no picture's name"):
+        draw_shape(tmp_path / name, model)
 
 
 @pytest.mark.long

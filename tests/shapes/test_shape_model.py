@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -172,6 +173,12 @@ def test_few_models_still_give_a_model(count: int) -> None:
     model = ShapeModel.learn(tables(count, missing=0.3))
     assert np.isfinite(model.components[0].covariance).all()
     assert (np.linalg.eigvalsh(model.components[0].covariance) > 0).all()
+
+
+def test_models_that_are_all_the_same_are_learned_without_a_warning() -> None:
+    with warnings.catch_warnings(action="error"):
+        model = ShapeModel.learn([Example(f"{row}", IDS, TABLE) for row in range(20)])
+    assert np.abs(model.mean[:7] - TABLE).max() < 1e-3
 
 
 def test_from_basis_scales_with_the_size() -> None:

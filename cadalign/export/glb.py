@@ -53,10 +53,10 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
     DataError
         If a photo cannot be read.
     """
-    placing, photos = placed_parts(exported, frame)
+    mesh, placing, photos = placed_parts(exported, frame)
     nodes: list[_Node] = [
         (f"{exported.name}_{number}", part_mesh(part), part_material(part), placing)
-        for number, part in enumerate(parts_of(exported.require_mesh()))
+        for number, part in enumerate(parts_of(mesh))
     ]
     nodes += [
         _photo_node(f"photo_{number}", photo)
@@ -64,8 +64,8 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
         if photo.plane.image is not None
     ]
     scene = trimesh.Scene()
-    for name, mesh, _, place in nodes:
-        scene.add_geometry(mesh, geom_name=name, node_name=name, transform=place)
+    for name, surface, _, place in nodes:
+        scene.add_geometry(surface, geom_name=name, node_name=name, transform=place)
 
     def complete(tree: dict[str, Any]) -> None:
         set_materials(tree, {name: material for name, _, material, _ in nodes})

@@ -9,7 +9,7 @@ photo with a margin at one side. A distorted photo is resampled to a pinhole cam
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,12 @@ from cadalign.io.files import write_text
 from cadalign.io.images import ByteImage
 
 _BORDER = 0.5  # from the corner pixel's centre to the image's border [px]
+_WHITE = (1.0, 1.0, 1.0, 1.0)
 _GROWTH = 2.0  # how much larger than the photo an undistorted one may become, each way
 _AGREES = 1e-6
 _RIM = 1.5  # how far the border's colours go on beyond the photo [px]
 _BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
+_FAR_OFF = 100.0  # coordinates over the extent
 _NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
 
 
@@ -104,21 +106,28 @@ class PlacedPhoto:
 
 def placed_parts(
     exported: AlignedObject, frame: Frame
-) -> tuple[FloatArray, tuple[PlacedPhoto, ...]]:
+) -> tuple[Mesh, FloatArray, tuple[PlacedPhoto, ...]]:
     """Place an object's model, (4, 4) float, and its photos in a scene that is measured in metres.
 
-    The scene has the axes of the frame; those of the first camera are turned to glTF's.
+    The scene has the axes of the frame; those of the first camera are turned to glTF's. A mesh far
+    from its origin, whose vertices single precision would round, is moved there, and so its place.
     """
+    mesh = exported.require_mesh()
     root = OPENGL_FLIP if frame == "camera" else np.eye(4)
     placing = root @ exported.frame_from_model(frame).cam_from_model
     placing[:3] *= exported.metres
+    low, high = mesh.bounds
+    if np.abs(mesh.bounds).max() > _FAR_OFF * np.abs(high - low).max():
+        middle = (low + high) / 2
+        mesh = replace(mesh, vertices=mesh.vertices - middle)
+        placing[:3, 3] += placing[:3, :3] @ middle
     photos = []
     for number, view in enumerate(exported.views):
         pose = root @ exported.frame_from_cam(frame, number) @ OPENGL_FLIP
         pose[:3, 3] *= exported.metres
         depth = _photo_depth(exported, number) * exported.metres
         photos.append(PlacedPhoto(photo_plane(view.camera, view.read_image()), depth, pose))
-    return placing, tuple(photos)
+    return mesh, placing, tuple(photos)
 
 
 def _photo_depth(exported: AlignedObject, number: int) -> float:
@@ -183,7 +192,7 @@ class MeshPart:
     uv : (n, 2) float or None
         Texture coordinates from the bottom left, where the material has a texture.
     colors : (n, 4) float or None
-        Vertex colours.
+        Vertex colours; the material's is white then.
     """
 
     material: Material
@@ -206,7 +215,9 @@ def parts_of(mesh: Mesh) -> Iterator[MeshPart]:
             used, uv = kept[:, 0].astype(np.int64), kept[:, 1:]
         else:
             used, inverse = np.unique(corners, return_inverse=True)
-        colors = None if mesh.vertex_colors is None else mesh.vertex_colors[used]
+        colors = None
+        if mesh.vertex_colors is not None:  # which take the place of the material's
+            colors, material = mesh.vertex_colors[used], replace(material, color=_WHITE)
         faces = inverse.reshape(-1, 3).astype(np.int64)
         yield MeshPart(material, mesh.vertices[used], faces, uv, colors)
 

@@ -7,6 +7,7 @@ photo, about the principal point. Pixar's library is an extra: ``pip install 'ca
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -38,6 +39,7 @@ class _Surface:
     uv: FloatArray | None
     color: tuple[float, ...]
     texture: str | None
+    colors: FloatArray | None = None
     is_photo: bool = False
 
 
@@ -80,8 +82,7 @@ def _require_library() -> None:
 def _write_stage(path: Path, exported: AlignedObject, frame: Frame) -> None:
     from pxr import Usd, UsdGeom
 
-    mesh = exported.require_mesh()
-    placing, photos = placed_parts(exported, frame)
+    mesh, placing, photos = placed_parts(exported, frame)
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -91,11 +92,9 @@ def _write_stage(path: Path, exported: AlignedObject, frame: Frame) -> None:
         texture = None
         if part.uv is not None and part.material.texture is not None:
             texture = _write_texture(path, f"texture_{number}", part.material.texture)
-        color = part.material.color if part.colors is None else part.colors.mean(axis=0).tolist()
-        surface = _Surface(
-            f"model/part_{number}", part.vertices, part.faces, part.uv, tuple(color), texture
-        )
-        _add_surface(stage, surface)
+        shape, color = (part.vertices, part.faces, part.uv), part.material.color
+        colors = part.colors if texture is None else None
+        _add_surface(stage, _Surface(f"model/part_{number}", *shape, color, texture, colors))
     for number, photo in enumerate(photos):
         view, plane = f"view_{number}", photo.plane
         _place(UsdGeom.Xform.Define(stage, f"/scene/{view}"), photo.pose)
@@ -151,11 +150,17 @@ def _add_surface(stage: Usd.Stage, surface: _Surface) -> None:
             "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
         )
         primvar.Set(Vt.Vec2fArray.FromNumpy(surface.uv.astype(np.float32)))
+    if surface.colors is not None:
+        primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+            "displayColor", Sdf.ValueTypeNames.Color3fArray, UsdGeom.Tokens.vertex
+        )
+        shown = [_linear(color) for color in surface.colors]
+        primvar.Set(Vt.Vec3fArray(shown))
     UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(_add_material(stage, place, surface))
 
 
 def _add_material(stage: Usd.Stage, place: str, surface: _Surface) -> Any:
-    from pxr import Gf, Sdf, UsdShade
+    from pxr import Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
     material = UsdShade.Material.Define(stage, f"{place}/material")
@@ -164,22 +169,32 @@ def _add_material(stage: Usd.Stage, place: str, surface: _Surface) -> Any:
     shader.CreateInput("roughness", types.Float).Set(1.0)
     shader.CreateInput("opacity", types.Float).Set(float(surface.color[3]))
     color = shader.CreateInput("diffuseColor", types.Color3f)
-    # USD's colours are linear light; a photo shines by itself.
-    linear = Gf.ConvertDisplayToLinear(Gf.Vec3f(*(float(value) for value in surface.color[:3])))
-    color.Set(linear)
+    color.Set(_linear(surface.color))
     if surface.texture is not None:
-        wrap = "clamp" if surface.is_photo else "repeat"
-        picture = _add_texture(stage, f"{place}/material", surface.texture, wrap)
+        picture = _add_texture(stage, f"{place}/material", surface)
         target = color
-        if surface.is_photo:
+        if surface.is_photo:  # it shines by itself
             target = shader.CreateInput("emissiveColor", types.Color3f)
         target.ConnectToSource(picture, "rgb")
+    elif surface.colors is not None:
+        reader = UsdShade.Shader.Define(stage, f"{place}/material/colors")
+        reader.CreateIdAttr("UsdPrimvarReader_float3")
+        reader.CreateInput("varname", types.String).Set("displayColor")
+        reader.CreateOutput("result", types.Float3)
+        color.ConnectToSource(reader.ConnectableAPI(), "result")
     material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
     return material
 
 
-def _add_texture(stage: Usd.Stage, place: str, file_name: str, wrap: str) -> Any:
-    from pxr import Sdf, UsdShade
+def _linear(color: Sequence[float] | FloatArray) -> Any:
+    """A colour as USD has it, in linear light."""
+    from pxr import Gf
+
+    return Gf.ConvertDisplayToLinear(Gf.Vec3f(*(float(value) for value in color[:3])))
+
+
+def _add_texture(stage: Usd.Stage, place: str, surface: _Surface) -> Any:
+    from pxr import Gf, Sdf, UsdShade
 
     types = Sdf.ValueTypeNames
     reader = UsdShade.Shader.Define(stage, f"{place}/uv")
@@ -187,10 +202,12 @@ def _add_texture(stage: Usd.Stage, place: str, file_name: str, wrap: str) -> Any
     reader.CreateInput("varname", types.String).Set("st")
     picture = UsdShade.Shader.Define(stage, f"{place}/texture")
     picture.CreateIdAttr("UsdUVTexture")
-    picture.CreateInput("file", types.Asset).Set(f"./{file_name}")
+    picture.CreateInput("file", types.Asset).Set(f"./{surface.texture}")
+    if not surface.is_photo:  # the material's colour multiplies with the texture
+        picture.CreateInput("scale", types.Float4).Set(Gf.Vec4f(*_linear(surface.color), 1))
     picture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
     for axis in ("wrapS", "wrapT"):
-        picture.CreateInput(axis, types.Token).Set(wrap)
+        picture.CreateInput(axis, types.Token).Set("clamp" if surface.is_photo else "repeat")
     picture.CreateInput("st", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
     picture.CreateOutput("rgb", types.Float3)
     return picture.ConnectableAPI()

@@ -12,6 +12,7 @@ import pytest
 from pycocotools.coco import COCO
 from support.exported import CAMERA, KEYPOINTS, LENS, POSE, aligned, turned, wedge
 
+from cadalign import Mesh
 from cadalign.datasets import load_mesh
 from cadalign.errors import InputError
 from cadalign.export import FORMATS, ExportOptions, export_object, format_of
@@ -154,6 +155,34 @@ def test_usd_places_model_camera_and_photo(tmp_path: Path, ending: str) -> None:
     allowed = exported.placed_mesh("camera").vertices * [1, -1, -1]
     gaps = np.linalg.norm(placed[:, None, :3] - allowed, axis=2).min(axis=1)
     assert gaps.max() < 1e-5
+
+
+def test_usd_has_the_vertex_colors_and_the_tint_of_textures(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdGeom, UsdShade
+
+    exported = aligned(tmp_path)
+    mesh = exported.require_mesh()
+    cloth, red = mesh.materials
+    tinted = replace(mesh, materials=(replace(cloth, color=(0.5, 1.0, 1.0, 1.0)), red))
+    path = export_object(tmp_path / "tinted.usda", replace(exported, mesh=tinted))
+    stage = Usd.Stage.Open(str(path))
+    texture = UsdShade.Shader(stage.GetPrimAtPath("/scene/model/part_0/material/texture"))
+    scale = np.array(texture.GetInput("scale").Get())
+    np.testing.assert_allclose(scale, [0.214, 1, 1, 1], atol=5e-3)  # 0.5 in linear light
+
+    colors = np.random.default_rng(0).uniform(0, 1, (len(mesh.vertices), 4))
+    colored = Mesh(mesh.vertices, mesh.faces, vertex_colors=colors, materials=(red,))
+    path = export_object(tmp_path / "colored.usda", replace(exported, mesh=colored))
+    stage = Usd.Stage.Open(str(path))
+    part = UsdGeom.Mesh(stage.GetPrimAtPath("/scene/model/part_0"))
+    points = np.array(part.GetPointsAttr().Get())
+    shown = np.array(UsdGeom.PrimvarsAPI(part).GetPrimvar("displayColor").Get())
+    rows = np.linalg.norm(points[:, None] - mesh.vertices, axis=2).argmin(axis=1)
+    np.testing.assert_allclose(shown**0.4545, colors[rows, :3], atol=0.04)
+    surface = UsdShade.Shader(stage.GetPrimAtPath("/scene/model/part_0/material/surface"))
+    source = surface.GetInput("diffuseColor").GetConnectedSources()[0][0].source
+    assert source.GetPath() == "/scene/model/part_0/material/colors"
 
 
 def test_without_usd_the_install_command_is_told(

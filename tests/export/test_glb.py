@@ -16,11 +16,13 @@ from playwright.sync_api import Browser
 from support.exported import CAMERA, LENS, POSE, aligned, photo_of, turned
 from support.three_viewer import ThreeViewer, three_script
 
-from cadalign import Camera
+from cadalign import Camera, Mesh
+from cadalign.datasets import load_mesh
 from cadalign.datasets import open as open_photos
 from cadalign.errors import DataError, InputError
 from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
 from cadalign.export.scene_parts import photo_plane
+from cadalign.geometry.mesh import Material
 from cadalign.render import Scene, cast_geometry
 from cadalign.render.viewpoints import silhouette_iou
 
@@ -130,6 +132,36 @@ def test_colors_are_linear_light(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+def test_a_mesh_far_from_its_origin_keeps_its_form(tmp_path: Path) -> None:
+    exported = aligned(tmp_path)
+    mesh, place = exported.require_mesh(), np.full(3, 1e6)
+    far = replace(mesh, vertices=mesh.vertices + place)
+    view = exported.views[0]
+    moved = POSE.translation - POSE.rotation @ (POSE.scale * place)
+    views = (replace(view, cam_from_model=replace(POSE, translation=moved)),)
+    near = load_mesh(export_object(tmp_path / "near.glb", exported))
+    found = load_mesh(export_object(tmp_path / "far.glb", replace(exported, mesh=far, views=views)))
+    np.testing.assert_allclose(found.bounds, near.bounds, atol=1e-4)
+    of_cloth = found.vertices[found.faces[found.face_material == 0]]
+    np.testing.assert_allclose(
+        of_cloth, near.vertices[near.faces[near.face_material == 0]], atol=1e-4
+    )
+
+
+def test_vertex_colors_take_the_place_of_the_material_s(tmp_path: Path) -> None:
+    exported = aligned(tmp_path)
+    mesh = exported.require_mesh()
+    colors = np.tile([0.5, 0.25, 1.0, 1.0], (len(mesh.vertices), 1))
+    grey = Material("grey", (0.2, 0.2, 0.2, 1.0))
+    colored = Mesh(mesh.vertices, mesh.faces, vertex_colors=colors, materials=(grey,))
+    path = export_object(tmp_path / "colored.glb", replace(exported, mesh=colored))
+    looks = [each for each in tree_of(path)["materials"] if each["name"] == "grey"]
+    assert looks[0]["pbrMetallicRoughness"]["baseColorFactor"] == [1, 1, 1, 1]
+    found = load_mesh(path)
+    assert found.vertex_colors is not None
+    assert np.abs(found.vertex_colors[:, :3] - [0.5, 0.25, 1.0]).max(axis=1).min() < 0.01
+
+
 def test_open3d_reads_the_object(tmp_path: Path) -> None:
     open3d = pytest.importorskip("open3d", reason="open3d is not installed")
     exported = aligned(tmp_path)

@@ -152,7 +152,6 @@ class TrackCommand(CameraOptions):
         """Estimate every track, and say how; also why some could not be."""
         from cadalign.batch.tracks import FoundTrack
         from cadalign.estimation.align import align
-        from cadalign.render.drawing.model_overlay import nearest_mesh
 
         found, failures = [], dict[str, str]()
         ransac = RansacOptions() if self.robust else None
@@ -164,7 +163,7 @@ class TrackCommand(CameraOptions):
                 failures[track.name] = str(error)
                 answer(f"track {track.name}: {error}")
                 continue
-            found.append(FoundTrack(track, result, nearest_mesh(result)))
+            found.append(FoundTrack(track, result, result.known_mesh(None)))
             inliers = int(result.inliers.sum())
             shares = [each.share for each in result.evidence if each.kind == "photo"]
             pictures = f", {sum(map(bool, shares))} of {len(shares)} pictures" if shares else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, is_number
-from cadalign.errors import InputError, quote
+from cadalign.errors import CadalignError, InputError, quote
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result_parts import (
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
     from cadalign.shapes.parts import NearestShape
+
+logger = logging.getLogger("cadalign")
 
 
 @dataclass(frozen=True, eq=False)
@@ -352,9 +355,24 @@ class ResultData:
         return warp_mesh(given, model.points_3d, self.points_3d, bounds=self.bounds)
 
     def known_mesh(self, mesh: Mesh | str | os.PathLike[str] | None) -> Mesh | None:
-        """As `mesh`; None where there is no mesh to warp."""
-        known = mesh if mesh is not None else getattr(self.model, "mesh", None)
-        return None if known is None else self.mesh(known)
+        """As `mesh`; None where there is no mesh to warp.
+
+        A training model's mesh that cannot be read is warned of (logger "cadalign").
+        """
+        from cadalign.shapes.model import ShapeModel
+
+        if mesh is not None:
+            return self.mesh(mesh)
+        if not isinstance(self.model, ShapeModel):
+            return None if self.model is None or self.model.mesh is None else self.mesh()
+        training = self.model.training
+        if training is None or not len(training) or self.nearest.mesh_path is None:
+            return None
+        try:
+            return self.mesh()
+        except CadalignError as error:
+            logger.warning("the nearest training model is not drawn: %s", error)
+            return None
 
     @property
     def nearest(self) -> NearestShape:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import CadalignError, InputError, unknown
+from cadalign.errors import InputError, unknown
 from cadalign.estimation.result import Result
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
@@ -146,8 +145,6 @@ def _drawn(scene: Scene, camera: Camera, alignment: Alignment, mode: str) -> Geo
     return RaycastRenderer().render(scene, camera, alignment)
 
 
-logger = logging.getLogger("cadalign")
-
 _INSIDE = 0.5  # least probability of a pixel of the object
 _CONTOUR_COLOR = (70, 190, 250)
 
@@ -242,24 +239,4 @@ def mesh_of(observation: Observation, result: Result) -> Mesh | None:
         mesh = load_mesh(observation.model)
         targets = result.points_3d[rows]
         return warp_mesh(mesh, np.array(list(sources.values())), targets, bounds=result.bounds)
-    return nearest_mesh(result)
-
-
-def nearest_mesh(result: Result) -> Mesh | None:
-    """The mesh of the training model nearest to a result of a learned shape, warped.
-
-    In the model's frame, before the stretch. None where no mesh is known; one that cannot be read
-    is warned of (logger "cadalign").
-    """
-    from cadalign.shapes.model import ShapeModel  # takes time to import
-
-    if not isinstance(result.model, ShapeModel):
-        return None
-    training = result.model.training
-    if training is None or not len(training) or result.nearest.mesh_path is None:
-        return None
-    try:
-        return result.mesh(load_mesh(result.nearest.mesh_path))
-    except CadalignError as error:
-        logger.warning("the nearest training model is not drawn: %s", error)
-        return None
+    return result.known_mesh(None)

@@ -10,13 +10,16 @@ import pytest
 import trimesh
 from support.exported import CAMERA, KEYPOINTS, POSE, photo_of, turned, wedge
 
-from cadalign import Model, Result, View, align, fit
+from cadalign import Model, Result, ShapeModel, View, align, fit
 from cadalign.cli import main
 from cadalign.datasets import load_mesh
+from cadalign.errors import InputError
 from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
 from cadalign.io.evidence import ImageEvidence, ObservedImage
 from cadalign.io.images import write_image
+from cadalign.io.meshes.files import write_obj_mesh
 from cadalign.io.observation import Observation
+from cadalign.shapes.examples import Example
 
 MORE = np.vstack([KEYPOINTS, wedge().vertices[2:5], [[0.1, 0.2, 0.3]]])
 
@@ -186,3 +189,25 @@ def test_results_export_themselves(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         load_mesh(path).vertices, joint.alignment.apply(wedge().vertices), atol=1e-5
     )
+
+
+def test_results_of_learned_shapes_export_the_nearest_training_mesh(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_obj_mesh(tmp_path / "wedge.obj", wedge())
+    rng, ids = np.random.default_rng(0), list(range(len(MORE)))
+    paths = [tmp_path / "wedge.obj"] * 8
+    examples = [
+        Example(f"{row}", ids, MORE * rng.uniform(0.9, 1.1, 3), wedge().bounds, path)
+        for row, path in enumerate(paths)
+    ]
+    shape = ShapeModel.learn(examples)
+    found = align(shape, View(CAMERA, CAMERA.project(POSE.apply(MORE)), ids=ids))
+    mesh = load_mesh(found.export(tmp_path / "near.obj"))
+    np.testing.assert_allclose(
+        mesh.vertices, found.alignment.apply(found.mesh().vertices), atol=1e-5
+    )
+    paths[0].unlink()
+    with pytest.raises(InputError, match="there is no mesh of the model to write"):
+        found.export(tmp_path / "gone.obj")
+    assert "the nearest training model is not drawn" in caplog.text

@@ -141,6 +141,8 @@ def _warped(
     if seen.model is None:
         return None
     mesh = load_mesh(seen.model)
+    if not aligned.ids:  # of a mask alone, or a photo: the model as it is
+        return mesh
     with in_file(path):
         model = model_of(seen, options=FitOptions(), shape_sigma=_ANY_SIGMA, mesh=mesh)
     if tuple(model.ids or ()) != aligned.ids:

@@ -75,12 +75,12 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
     Keypoints in one image, or in several views; masks, depth, gravity, the camera's height and
     known lengths. Prints the alignment and, where there is more than keypoints of one image, the
     standard deviations without each piece of evidence. --mask, --model and --camera without any
-    observation align the model to a mask alone. Writes fit.json and overlay.png,
-    overlay_1.png and so on for further views; of a file with several objects of one photo, which
-    share its camera, scene.json and a folder for each. Many observations are a run, which goes on
-    where it was killed: it writes results.parquet and results.csv with a row for each, and
-    report.html. Exit codes of a run: 0 all are aligned, 3 some failed, 1 all failed or refused, 2 a
-    wrong command line.
+    observation align the model to a mask alone, and write one, fit.observation.json. Writes
+    fit.json and overlay.png, overlay_1.png and so on for further views; of a file with several
+    objects of one photo, which share its camera, scene.json and a folder for each. Many
+    observations are a run, which goes on where it was killed: it writes results.parquet and
+    results.csv with a row for each, and report.html. Exit codes of a run: 0 all are aligned, 3 some
+    failed, 1 all failed or refused, 2 a wrong command line.
     """
 
     out: Path | None = None
@@ -161,8 +161,13 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
             observation = self.changes.applied_to(seen)
             style, status = self._style(observation, mask), waiting("fitting")
             result, views = self.fit(observation, str(mask), note=say, status=status)
-        fitted = self.fitted(mask, observation, result, views, style=style)
-        return self._write(replace(fitted, sources={"mask": mask}), mask)
+        # What was fitted, for the commands that go on from the fit.
+        path = (self.out or beside(mask, "_fit")) / "fit.observation.json"
+        with keeping(observation.files):
+            make_folder(path.parent)
+            observation.save(path)
+        fitted = self.fitted(path, observation, result, views, style=style)
+        return self._write(replace(fitted, sources={"mask": mask} | fitted.sources), mask)
 
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""

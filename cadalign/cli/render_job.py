@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, refuse_unused
 from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -67,6 +67,8 @@ class RenderJob:
         if (stretch <= 0).any():
             raise InputError(f"{command.scale} is not positive", where="--scale")
         views = tuple(view for word in command.view for view in _views(word, stretch))
+        if views and not any(isinstance(view, Angles) for _, view in views):
+            refuse_unused(command, ["size", "fov"], "beside camera files, which have their own")
         if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
         path = command.keypoints

@@ -447,6 +447,13 @@ class TestPhotoAndMaskAlone:
         overlap = cast_geometry(Scene(load_mesh(mesh)), CAMERA, result.alignment).mask
         assert (overlap & shown).sum() > 0.95 * (overlap | shown).sum()
         assert (tmp_path / "a_fit" / "overlay.png").exists()
+        # The other commands go on from it.
+        assert main(["export", str(tmp_path / "a_fit"), "--to", str(tmp_path / "a.obj")]) == 0
+        placed = result.alignment.apply(load_mesh(mesh).vertices)
+        np.testing.assert_allclose(load_mesh(tmp_path / "a.obj").vertices, placed, atol=1e-6)
+        again = tmp_path / "a_fit" / "fit.observation.json"
+        assert main(["fit", str(again), "--out", str(tmp_path / "again")]) == 0
+        assert Result.load(tmp_path / "again" / "fit.json").alignment == result.alignment
 
     def test_mask_alone_needs_a_camera(
         self, mesh: Path, shown: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]

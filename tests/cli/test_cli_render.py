@@ -130,6 +130,9 @@ def test_a_camera_file_gives_the_view(model, tmp_path):
     # The side of 0.8 x 0.6, at a depth of 2 - 0.2.
     assert np.ptp(rows) + 1 == pytest.approx(0.8 / 1.8 * camera.fx, abs=1.5)
     assert np.ptp(columns) + 1 == pytest.approx(0.6 / 1.8 * camera.fx, abs=1.5)
+    for option in (("--size", "64x48"), ("--fov", "20")):
+        with pytest.raises(InputError, match=f"{option[0]}: has no effect beside camera files"):
+            _run(model, "--out", out, "--view", tmp_path / "viewpoint.json", *option)
 
 
 @pytest.mark.long

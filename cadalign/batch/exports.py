@@ -79,7 +79,7 @@ def export_run(
     to : Path
         The file or folder to write.
     format : str, optional
-        By default the name ``to`` itself where that is a format's, or else what its ending means:
+        By default the name of ``to`` where that is a format's, or else what its ending means:
 
         - ``json``: the observation of each, and its ``fit.json`` in a folder beside it;
         - ``overlay``: each model drawn over its photo, further views as ``000000_1.png``;
@@ -105,9 +105,14 @@ def export_run(
         If the run cannot be read, or the files cannot be written.
     """
     known = (DOCUMENTS, *RUN_FORMATS)
-    name = format or (str(to) if str(to) in known else format_of(to))
+    fix = f"of a run, give one of {', '.join(known)}"
+    if format is None and to.name not in known:
+        try:
+            format = format_of(to)
+        except InputError as error:
+            raise InputError(error.what, where=error.where, fix=fix) from None
+    name = format or to.name
     if name not in known:
-        fix = f"of a run, give one of {', '.join(known)}"
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
     total = (RunFolder(run).read_config() or {}).get("tasks", 0)
     for row in rows:

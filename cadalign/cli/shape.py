@@ -136,10 +136,11 @@ def _text(model: ShapeModel) -> str:
     for number, each in enumerate(summary["components"], start=1):
         shares = each["variance_shares"]
         listed = ", ".join(f"{100 * share:.0f}" for share in shares[:_MODES])
+        held = f" the first {len(shares[:_MODES])} hold {listed} % of the variance;"
         lines.append(
-            f"  component {number}  {100 * each['weight']:.0f} %, {each['modes']} modes; the first "
-            f"{len(shares[:_MODES])} hold {listed} % of the variance; standard deviation of a "
-            f"coordinate {each['sigma']:.3g}, {each['residual_sigma']:.2g} besides the modes"
+            f"  component {number}  {100 * each['weight']:.0f} %, {each['modes']} modes;"
+            f"{held if shares else ''} standard deviation of a coordinate {each['sigma']:.3g}, "
+            f"{each['residual_sigma']:.2g} besides the modes"
         )
     counts = summary["models_with_keypoint"]
     if counts is not None:

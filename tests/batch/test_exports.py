@@ -174,6 +174,9 @@ def test_photos_of_one_name_are_told_apart(run: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format: the format 'usd' holds one fit; of a run, give"):
         export_run(run, tmp_path / "out.usdz")
+    with pytest.raises(InputError, match="does not tell the format; of a run, give one of json"):
+        export_run(run, tmp_path / "out")
+    assert export_run(run, tmp_path / "json").objects == 3
     with pytest.raises(DataError, match="not a finished run of fits"):
         export_run(tmp_path, tmp_path / "out.csv")
     with pytest.raises(InputError, match="rows: the run has no observation 99; give numbers from"):

@@ -68,6 +68,23 @@ def test_a_file_without_a_scene_shows_all_its_nodes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"nodes": [{"mesh": 0, "skin": 0}]}, "skins"),
+        ({"meshes": [{**primitive()[0], "weights": [0.5]}]}, "morph targets"),
+        ({"extensionsUsed": ["EXT_mesh_gpu_instancing"]}, "EXT_mesh_gpu_instancing"),
+    ],
+)
+def test_what_places_vertices_elsewhere_is_warned_of(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, changes: dict[str, Any], name: str
+) -> None:
+    read(tmp_path)
+    assert not caplog.text
+    read(tmp_path, **changes)
+    assert f"a.gltf: not read are {name}, by which its vertices lie elsewhere" in caplog.text
+
+
+@pytest.mark.parametrize(
     ("mode", "expected"),
     [
         (4, [[0, 1, 2], [0, 2, 3]]),

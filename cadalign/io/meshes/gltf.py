@@ -65,6 +65,7 @@ class Node(_Part):
     """A node, placed by a matrix (by columns) or by scale, rotation (x, y, z, w), translation."""
 
     mesh: Count | None = None
+    skin: Count | None = None
     children: list[Count] = field(default_factory=list)
     matrix: Annotated[list[Finite], Meta(min_length=16, max_length=16)] | None = None
     translation: Point3 = (0.0, 0.0, 0.0)
@@ -85,6 +86,7 @@ class GltfMesh(_Part):
     """The primitives of a mesh."""
 
     primitives: list[Primitive]
+    weights: list[Finite] = field(default_factory=list)  # of shapes that it may take
 
 
 class SparsePart(_Part):
@@ -201,6 +203,7 @@ class GltfDocument(_Part):
     materials: list[MaterialPart] = field(default_factory=list)
     textures: list[Texture] = field(default_factory=list)
     images: list[Image] = field(default_factory=list)
+    extensions_used: list[str] = field(default_factory=list)
     extensions_required: list[str] = field(default_factory=list)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import unquote
@@ -26,6 +27,9 @@ from cadalign.io.meshes.gltf import (
 )
 from cadalign.io.meshes.materials import WHITE, Texture, Textures
 
+logger = logging.getLogger("cadalign")
+
+_INSTANCES = "EXT_mesh_gpu_instancing"
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 # A node of some 20 bytes repeats a whole mesh: what all take together is bounded by the file.
 _FREE_BYTES, _EXPANSION = 2**27, 64
@@ -58,12 +62,32 @@ def read_gltf(path: Path) -> Mesh:
         if not primitives:
             raise DataError("the file has no faces", fix="is it whole?")
         _check_size(file, primitives)
+        _warn_of_what_moves(file)
         looks = _Looks(file)
         pieces = [
             _copies(_surface(file, primitive, looks.of(primitive.material)), transforms)
             for primitive, transforms in primitives
         ]
         return join(pieces, str(path))
+
+
+def _warn_of_what_moves(file: GltfFile) -> None:
+    """Say what places vertices elsewhere in viewers, and is not read."""
+    document = file.document
+    left_out = [
+        name
+        for name, is_there in (
+            ("skins", any(node.skin is not None for node in document.nodes)),
+            ("morph targets", any(any(mesh.weights) for mesh in document.meshes)),
+            (_INSTANCES, _INSTANCES in document.extensions_used),
+        )
+        if is_there
+    ]
+    if left_out:
+        said = (
+            "%s: not read are %s, by which its vertices lie elsewhere; export it with these applied"
+        )
+        logger.warning(said, file.path, " and ".join(left_out))
 
 
 def _placements(file: GltfFile) -> Iterator[tuple[int, FloatArray]]:

@@ -84,6 +84,9 @@ class ObservationRetrieval:
         if mask is None and seen.evidence.mask is not None and not cuts_out:
             mask = read_mask(seen.evidence.mask)  # as a fit to the observation reads it
         if not len(ids):
+            if shape is not None:
+                fix = "leave it out, or give keypoints"
+                raise InputError("has no effect on a mask alone", where="--shape", fix=fix)
             return library.retrieve(mask=mask, camera=camera, workers=workers, **vars(self.ranking))
         if shape is None and not camera.focal_known:
             what = "the focal length is unknown, without which no model's pose is searched"

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.refusals import refusal_line
 
-from cadalign import Alignment, Camera, Library, load_mesh
+from cadalign import Alignment, Camera, Library, ShapeModel, load_mesh
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DegenerateError, InputError
@@ -88,6 +89,10 @@ def test_an_observation_of_a_mask_is_ranked_by_it(
     assert main(command) == 0
     first = json.loads(capsys.readouterr().out)[0]
     assert (first["category"], first["model_id"]) == key
+    shape = ShapeModel.from_basis(np.eye(4, 3), np.ones((1, 4, 3)), [0.1], category="chair")
+    shape.save(tmp_path / "chair.shape")
+    line = refusal_line(capsys, *command[:4], "--shape", tmp_path / "chair.shape")
+    assert line.startswith("--shape: has no effect on a mask alone; leave it out")
     # Its model and pose are an observation and a fit, of which the other commands make more.
     best = Observation.load(tmp_path / "out" / "match_01.json")
     assert best.model == library[key].mesh_path

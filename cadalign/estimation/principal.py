@@ -53,7 +53,9 @@ def estimate_with_principal_point(
         step = -covariance @ (gradient + shift * prior)
         step *= min(1.0, options.principal_sigma / float(np.linalg.norm(step) or 1.0))
         if (np.abs(step) <= _SETTLED * np.sqrt(covariance.diagonal())).all():
-            return _with_principal_point(result, beside, difference, covariance, options)
+            found = _with_principal_point(result, beside, difference, covariance, options)
+            assert result.cost is not None
+            return replace(found, cost=result.cost + prior * float(shift @ shift))
         shift = shift + step
     raise DegenerateError(
         "the estimate of the principal point does not settle",

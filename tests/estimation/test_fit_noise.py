@@ -13,7 +13,11 @@ from support.problems import LENS, assert_same, fit_problem, moved, problem_of, 
 
 from cadalign import Alignment, Camera, Model, RansacOptions, View, align, fit
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem
+from cadalign.evaluation.simulation.problems import (
+    SIMULATION_CAMERA,
+    Problem,
+    simulate_problem,
+)
 from cadalign.geometry.metrics import rotation_error
 
 # --- sigma ------------------------------------------------------------------------------------
@@ -164,6 +168,19 @@ def test_result_is_a_minimum_of_the_loss(loss: str) -> None:
     for size in (1e-4, 1e-3, 1e-2):
         for _ in range(50):
             assert cost(moved(result.alignment, size * rng.standard_normal(8))) >= lowest - 1e-9
+
+
+def test_hubers_loss_is_no_larger_than_at_the_truth() -> None:
+    camera = Camera(640, 480, 935, 935, 319.5, 239.5)
+    shown = {"noise_px": 1.0, "outlier_share": 0.2, "camera": camera, "stretch": (0.7, 1.4)}
+    for seed in range(60):
+        problem = simulate_problem(np.random.default_rng(seed), points=20, depth=(5, 9), **shown)
+        result = fit(problem.points_3d, problem.points_2d, camera, loss="huber")
+        off = camera.project(problem.alignment.apply(problem.points_3d)) - problem.points_2d
+        lengths = np.linalg.norm(off, axis=1)
+        at_truth = np.where(lengths <= 2, lengths**2, 4 * lengths - 4).sum()
+        assert result.cost is not None
+        assert result.cost <= at_truth
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy"])

@@ -78,6 +78,7 @@ def test_result_is_the_minimum_over_the_principal_point() -> None:
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         moved = Camera(640, 480, 600, 600, result.camera.cx + x, result.camera.cy + y)
         assert cost(moved) > here
+    assert result.cost == pytest.approx(here, rel=1e-5)
 
 
 def test_exact_keypoints_give_it_back() -> None:

@@ -215,6 +215,16 @@ def test_renaming_the_models_axes_renames_the_result(known_axis: str, order: lis
     assert other.std.scale == pytest.approx([base.std.scale[axis] for axis in order])
 
 
+@pytest.mark.parametrize("points", [6, 8, 14])
+def test_exchanging_the_axes_that_stretch_exchanges_their_deviations(points: int) -> None:
+    problem = problem_of(8, points=points)
+    base = fit_problem(problem)
+    exchanged = problem.points_3d[:, [0, 2, 1]] * [1, 1, -1]
+    other = fit(exchanged, problem.points_2d, problem.camera)
+    assert other.std.scale == pytest.approx([base.std.scale[axis] for axis in (0, 2, 1)], rel=1e-3)
+    assert other.std.rotation_deg == pytest.approx(base.std.rotation_deg, rel=1e-3)
+
+
 @pytest.mark.parametrize("method", ["optimal", "aepnp"])
 @pytest.mark.parametrize("known_axis", ["x", "y", "z"])
 def test_known_axis_keeps_its_length(method: str, known_axis: str) -> None:

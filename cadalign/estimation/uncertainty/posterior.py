@@ -275,6 +275,9 @@ def _sample(
     """
     chart = _Chart.of(result, likelihood, widening)
     free = likelihood.options.estimated_unknowns
+    scales = np.flatnonzero((free >= 6) & (free < 9))
+    # An order that does not follow the axes' names, of which the same draws tell the same then.
+    free[scales] = free[scales][np.argsort(first.diagonal()[free[scales]], kind="stable")]
     size = len(first)
     jacobian = chart.jacobian()[:size, :size]
     proposal = (jacobian @ first @ jacobian.T)[np.ix_(free, free)] * _FIRST_INFLATION

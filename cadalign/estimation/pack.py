@@ -36,6 +36,7 @@ from cadalign.solvers.marginal.problem import Seen
 _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
+_LEAST_OF_PLANE = 6  # pixels of one whose slope is told
 _LOSS_SCALE = 3.0  # a keypoint that something hides has the depth of what hides it
 _PLAIN = FitOptions()
 
@@ -169,7 +170,7 @@ def _sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[Vie
         if view.depth_image is None:
             continue
         relative = float(cast(float, view.depth_sigma))
-        found = sample_depth(view.depth_image, view.pixels, sigma=relative)
+        found, deviations = sample_depth(view.depth_image, view.pixels, sigma=relative)
         known = np.isfinite(found)
         point, depth = np.array(rows[number], dtype=np.int64)[known], found[known]
         count = len(point)
@@ -180,7 +181,7 @@ def _sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[Vie
                 np.tile([0.0, 0.0, 1.0], (count, 1)),
                 np.zeros((count, 2)),
                 depth,
-                1.0 / np.hypot(relative * depth, shape.spread[point]),
+                1.0 / np.hypot(deviations[known], shape.spread[point]),
                 np.full(count, CAUCHY),
                 np.full(count, _LOSS_SCALE),
             )
@@ -192,32 +193,58 @@ def _sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[Vie
     return stacked(tables)
 
 
-def sample_depth(image: FloatArray, points_2d: FloatArray, *, sigma: float) -> FloatArray:
-    """Depths (n,) of keypoints in a depth image; NaN where it holds none.
+def sample_depth(
+    image: FloatArray, points_2d: FloatArray, *, sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Depths (n,) of keypoints in a depth image, and their deviations; NaN where it holds none.
 
     At a silhouette, a window about the keypoint shows the object and what is behind it: the depths
-    are split at gaps of some ``sigma`` (relative), and the nearest surface's median is taken.
+    are split at gaps of some ``sigma`` (relative), and the nearest surface's median is taken. Where
+    that surface is steep, so much as its depths differ is added to ``sigma``.
 
     Examples
     --------
     >>> image = np.full((5, 8), 9.0)
     >>> image[:, :4] = 2.0
-    >>> sample_depth(image, np.array([[3.4, 2.0], [7.0, 2.0], [60.0, 2.0]]), sigma=0.01).tolist()
-    [2.0, 9.0, nan]
+    >>> keypoints = np.array([[3.4, 2.0], [7.0, 2.0], [60.0, 2.0]])
+    >>> [each.tolist() for each in sample_depth(image, keypoints, sigma=0.01)]
+    [[2.0, 9.0, nan], [0.02, 0.09, nan]]
     """
     height, width = image.shape
-    found = np.full(len(points_2d), np.nan)
+    found, deviations = np.full((2, len(points_2d)), np.nan)
     for row, (x, y) in enumerate(points_2d):
         if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
             continue
         left, top = round(float(x)) - _RADIUS, round(float(y)) - _RADIUS
-        window = image[max(top, 0) : top + 2 * _RADIUS + 1, max(left, 0) : left + 2 * _RADIUS + 1]
-        depths = np.sort(window[np.isfinite(window)])
+        rows, columns = np.mgrid[
+            max(top, 0) : min(top + 2 * _RADIUS + 1, height),
+            max(left, 0) : min(left + 2 * _RADIUS + 1, width),
+        ].reshape(2, -1)
+        window = image[rows, columns]
+        order = np.argsort(window, kind="stable")[: np.isfinite(window).sum()]
+        depths = window[order]
         breaks = np.flatnonzero(np.diff(depths) > _GAP * sigma * depths[:-1]) + 1
-        surfaces = [part for part in np.split(depths, breaks) if len(part) >= _LEAST_PIXELS]
+        surfaces = [part for part in np.split(order, breaks) if len(part) >= _LEAST_PIXELS]
         if surfaces:
-            found[row] = np.median(surfaces[0])
-    return found
+            nearest = surfaces[0]
+            depths = window[nearest]
+            aside = np.column_stack([columns[nearest] - x, rows[nearest] - y])
+            found[row] = _depth_amid(aside, depths)
+            deviations[row] = max(sigma * found[row], depths.std())
+    return found, deviations
+
+
+def _depth_amid(aside: FloatArray, depths: FloatArray) -> float:
+    """Depth at a keypoint of a surface with ``depths`` (k,) at pixels (k, 2) aside from it.
+
+    A keypoint at the edge of what is seen has more of the surface on one side: that of the plane
+    through the depths, whose inverses are linear in the image, within the range of these.
+    """
+    columns = np.column_stack([np.ones(len(depths)), aside])
+    if len(depths) < _LEAST_OF_PLANE or np.linalg.matrix_rank(columns) < 3:
+        return float(np.median(depths))
+    inverse = np.linalg.lstsq(columns, 1 / depths, rcond=None)[0][0]
+    return float(np.clip(1 / inverse, depths.min(), depths.max()) if inverse > 0 else depths.max())
 
 
 def seen_keypoints(view: View, pixels: FloatArray, rows: list[int], options: FitOptions) -> Seen:

@@ -17,6 +17,7 @@ from cadalign.estimation.joint_robust import (
     robust_starts,
     whitened_lengths,
     with_sightings,
+    without_hidden,
 )
 from cadalign.estimation.mistakes import Support, area_of, check_support
 from cadalign.estimation.options import FitOptions, RansacOptions
@@ -167,7 +168,8 @@ def minima_at_noise(
         prior_score = -2 * float(np.log(problem.prior.weights[number]))
         minima.extend(
             Minimum(number, *each._replace(score=each.score + prior_score), problem.lenses)
-            for each in found
+            for minimum in found
+            for each in without_hidden(minimum)
         )
     if ransac is not None and minima:
         best = min(minima, key=lambda each: each.score)

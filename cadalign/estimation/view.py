@@ -72,7 +72,9 @@ class View(DeclaredEvidence):
         such depths that is registered to the photo, as an array or as a 16-bit PNG [model units, or
         the unit in which the object's size is wanted]; NaN where unknown, in an image also 0. An
         image is sampled robustly at the keypoints and, with a mask and a mesh, over the visible
-        surface; beside a photo its steps show the outline.
+        surface; beside a photo its steps show the outline. Keypoints that the object itself hides
+        are told apart by the model's mesh; without one, only those that lie some ``depth_sigma``
+        behind what is seen.
     depth_sigma : float or (n,) float
         Standard deviation of the depths, relative; by default 0.01, 1 %.
     depth_scale : float, optional

@@ -1,4 +1,4 @@
-"""Depth images over the visible surface of the object: pixels inside its mask.
+"""Depth images over the visible surface of the object: pixels inside its mask, or keypoints.
 
 A pixel's ray meets the surface at a depth that depends on the pose: the surface's tangent plane at
 the point that the ray meets moves along the ray, the point's sliding in the plane does not count to
@@ -20,17 +20,26 @@ from cadalign.estimation.contours.photo_lines import covered_cells
 from cadalign.estimation.contours.surface import PosedSurface, Surface, caster_of, surfaces_of
 from cadalign.estimation.contours.view_contour import robust_deviation
 from cadalign.estimation.estimates import poses_of
+from cadalign.estimation.joint_robust import cost_of_hidden, hidden_limits
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
-from cadalign.estimation.search import Minimum
+from cadalign.estimation.search import JointProblem, Minimum
+from cadalign.estimation.uncertainty.evidence import seen_in_cameras
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import CAUCHY
-from cadalign.solvers.joint.evidence import Planes, kept_rows, log_focals_of
-from cadalign.solvers.joint.search import score_state
+from cadalign.solvers.joint.evidence import (
+    Evidence,
+    Planes,
+    State,
+    kept_rows,
+    log_focals_of,
+    points_of,
+)
+from cadalign.solvers.joint.search import refine_joint, score_state
 
 _MARGIN = 3  # [px], to the mask's border
 _LEAST_SPACING = 8  # [px], of samples that count as independent
@@ -43,6 +52,9 @@ _ITERATIONS = 12
 _SETTLED = 0.01  # change of the cost
 _MOST_STARTS = 4
 _UNLIKELY = 60.0  # excess score of a minimum that is still tried
+_MOST_COVERED = 12
+_COVERED = 0.5  # [sigma], of a keypoint behind the surface
+_LEAST_SEEN = 3  # depths of keypoints, of which two agree by chance
 
 
 class _Samples(NamedTuple):
@@ -92,6 +104,73 @@ def fit_depths(
         found.append(_as_begun(each, sought) if is_open else _settled(each, sought))
     found.sort(key=lambda minimum: minimum.score)
     return found
+
+
+def without_covered(
+    model: Model, problem: JointProblem, minima: Sequence[Minimum]
+) -> list[Minimum]:
+    """Minima by the depths of keypoints that the model's own surface does not hide, the best first.
+
+    A depth image shows that surface in their place. Where next to none is in view, as of keypoints
+    inside of the mesh, minima stay as they are.
+    """
+    first = minima[0]
+    keypoints = len(problem.prior.ids)
+    surface = surfaces_of(model, first.points[:keypoints], "views[0].depth").surfaces[0]
+    likely = [each for each in minima if not each.score > first.score + _UNLIKELY]
+    found: dict[tuple[bytes, float], Minimum] = {}
+    for each in likely[:_MOST_COVERED]:
+        whole = problem.evidence(each.evidence.shape, each.lenses).planes
+        uncovered = _uncovered(each, whole, surface, problem.views)
+        planes = uncovered.evidence.planes
+        found.setdefault((planes.point.tobytes(), round(uncovered.score, 3)), uncovered)
+    return sorted(found.values(), key=lambda minimum: minimum.score)
+
+
+def _uncovered(minimum: Minimum, whole: Planes, surface: Surface, views: Sequence[View]) -> Minimum:
+    """The minimum by those of the ``whole`` planes that neither the surface nor others hide."""
+    evidence, state, own = minimum.evidence._replace(planes=whole), minimum.state, minimum.evidence
+    had = set(zip(own.planes.image.tolist(), own.planes.point.tolist(), strict=True))
+    rows = zip(whole.image.tolist(), whole.point.tolist(), strict=True)
+    shown = np.array([row in had for row in rows])
+    # What the score has beside its evidence and the depths that were left out, of keypoints.
+    beside = minimum.prior_score - cost_of_hidden(hidden_limits(evidence, state)[0], shown)
+    shown = np.zeros(len(whole.point), dtype=bool)
+    for _ in range(_ROUNDS):
+        covered = _is_covered(evidence, state, surface, views)
+        limits, is_near = hidden_limits(evidence, state)
+        again = ~covered & is_near
+        if again.sum() < _LEAST_SEEN or (again == shown).all():
+            break
+        shown = again
+        some = evidence._replace(planes=kept_rows(whole, shown))
+        cost, moved, _, _ = refine_joint(some, _ITERATIONS, state)
+        score = beside + score_state(some, moved) + cost_of_hidden(limits, covered | is_near)
+        if not np.isfinite(score):
+            break
+        state = moved
+        minimum = minimum._replace(evidence=some, state=state, cost=cost, score=score)
+    return minimum
+
+
+def _is_covered(
+    evidence: Evidence, state: State, surface: Surface, views: Sequence[View]
+) -> BoolArray:
+    """Marks the planes (m,) of keypoints that lie behind the surface."""
+    planes, posed = evidence.planes, surface.at(evidence.shape, state)
+    points = points_of(evidence.shape, state)[planes.point]
+    seen = seen_in_cameras(evidence, state, points, planes.image)
+    covered = np.zeros(len(points), dtype=bool)
+    for number, pose in enumerate(poses_of(evidence, state)):
+        rows = np.flatnonzero(planes.image == number)
+        if views[number].shows_surface or not len(rows):
+            continue
+        origin, model_from_ray = model_rays(pose)
+        rays = seen[rows] / seen[rows, 2:]
+        face, depth = posed.caster.first_hits(origin, rays @ model_from_ray.T)
+        nearer = (seen[rows, 2] - depth) * planes.weight[rows]
+        covered[rows] = (face >= 0) & (nearer > _COVERED)
+    return covered
 
 
 def factors_by_depths(mesh: Mesh, view: View, poses: Sequence[Alignment]) -> list[float]:

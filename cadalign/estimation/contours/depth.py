@@ -128,7 +128,10 @@ def without_covered(
 
 
 def _uncovered(minimum: Minimum, whole: Planes, surface: Surface, views: Sequence[View]) -> Minimum:
-    """The minimum by those of the ``whole`` planes that neither the surface nor others hide."""
+    """The minimum by those of the ``whole`` planes that the surface does not hide.
+
+    Where another object hides a keypoint, the depths' robust loss allows for it.
+    """
     evidence, state, own = minimum.evidence._replace(planes=whole), minimum.state, minimum.evidence
     had = set(zip(own.planes.image.tolist(), own.planes.point.tolist(), strict=True))
     rows = zip(whole.image.tolist(), whole.point.tolist(), strict=True)
@@ -137,15 +140,13 @@ def _uncovered(minimum: Minimum, whole: Planes, surface: Surface, views: Sequenc
     beside = minimum.prior_score - cost_of_hidden(hidden_limits(evidence, state)[0], shown)
     shown = np.zeros(len(whole.point), dtype=bool)
     for _ in range(_ROUNDS):
-        covered = _is_covered(evidence, state, surface, views)
-        limits, is_near = hidden_limits(evidence, state)
-        again = ~covered & is_near
+        again = ~_is_covered(evidence, state, surface, views)
         if again.sum() < _LEAST_SEEN or (again == shown).all():
             break
         shown = again
         some = evidence._replace(planes=kept_rows(whole, shown))
         cost, moved, _, _ = refine_joint(some, _ITERATIONS, state)
-        score = beside + score_state(some, moved) + cost_of_hidden(limits, covered | is_near)
+        score = beside + score_state(some, moved)
         if not np.isfinite(score):
             break
         state = moved

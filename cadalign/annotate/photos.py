@@ -21,7 +21,7 @@ from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.documents import Document, in_file, read_document
-from cadalign.io.files import read_bytes, reading, write_json
+from cadalign.io.files import printable, read_bytes, reading, write_json
 from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
 
 Pixel = tuple[float, float]
@@ -90,7 +90,7 @@ def require_text(path: Path) -> None:
         str(path.resolve()).encode()
     except UnicodeEncodeError:
         fix = "rename it, or the folder that it is in"
-        raise DataError("the path is not UTF-8", where=str(path), fix=fix) from None
+        raise DataError("the path is not UTF-8", where=printable(path), fix=fix) from None
 
 
 def find_photos(path: Path) -> list[Path]:

@@ -225,7 +225,7 @@ def test_names_that_are_not_utf_8(case: Case, caplog: pytest.LogCaptureFixture) 
         pytest.skip("this file system has no such names")
     session = case.open(image=folder, prepared=False)
     assert [each.photo.path.name for each in session.photos] == ["a.png"]
-    assert "the path is not UTF-8; rename it" in caplog.text
+    assert r"caf\udce9.png': the path is not UTF-8; rename it" in caplog.text
     assert "the path is not UTF-8; rename it" in refusal_text(lambda: case.open(image=odd))
     model = folder / os.fsdecode(b"caf\xe9.ply")
     shutil.copy(case.model, model)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -114,9 +113,7 @@ def _clear(folder: RunFolder, config: dict[str, Any]) -> None:
         return
     if not folder.is_finished and all(found.get(name) == config[name] for name in config):
         return
-    for path in (folder.results, folder.timings, folder.records, folder.config_file):
-        path.unlink(missing_ok=True)
-    shutil.rmtree(folder.parts, ignore_errors=True)
+    folder.remove()
 
 
 def _table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:

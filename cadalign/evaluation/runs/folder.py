@@ -69,7 +69,7 @@ class RunFolder:
     @property
     def sources(self) -> tuple[Path, ...]:
         """The files that pages and tables are made from."""
-        return tuple(path for path in self.path.glob("*.*") if path != self.report)
+        return self.config_file, self.results, self.timings, self.records
 
     def part(self, table: Path, index: int) -> Path:
         """A chunk's rows of the results, timings or records."""
@@ -99,11 +99,12 @@ class RunFolder:
 
     def remove(self) -> None:
         """Remove a run without pictures; the folder stays where something else is in it."""
-        tables = self.results, self.timings, self.records
+        written = [self.path / name for name in _WRITTEN]
         with self.locked():
             shutil.rmtree(self.parts, ignore_errors=True)
-            for path in (*tables, self.progress, self.config_file, self.path / _LOCK):
+            for path in (self.results, self.records, *written, self.progress, self.config_file):
                 path.unlink(missing_ok=True)
+            (self.path / _LOCK).unlink(missing_ok=True)
         with suppress(OSError):
             self.path.rmdir()
 

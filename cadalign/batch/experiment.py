@@ -112,7 +112,7 @@ class ManyEstimates:
         assert self.model is not None
         photo = None
         if found.image is not None:
-            photo = _photo(found.image, detector.images or folder)
+            photo = _photo_in(detector.images or folder, found.image)
         size = found.size or (None if photo is None else photo_size(photo))
         with in_file(found.source):
             camera = changes.read_camera(size)
@@ -173,9 +173,7 @@ def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
     return ModelKeypoints(tuple(keypoints))
 
 
-@lru_cache(maxsize=1024)
-def _photo(image: str, folder: Path) -> Path | None:
-    return photo_in(folder, image)
+_photo_in = lru_cache(maxsize=1024)(photo_in)
 
 
 def _parsed(content: bytes, name: str) -> Any:

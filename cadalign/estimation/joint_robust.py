@@ -19,6 +19,8 @@ from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, log_foca
 from cadalign.solvers.joint.search import keypoints_of, refine_joint, score_state, search_joint
 from cadalign.solvers.ransac import rigid_hypotheses
 
+LEAST_SEEN = 3
+"""Depths of keypoints that are estimated from, the least: two agree by chance."""
 OUTLIER_COST = 5.0
 """Cost of a keypoint that is left out, beyond the square of its threshold."""
 _WIDENING = 3.0  # standard deviations of a displacement that a threshold allows for
@@ -31,7 +33,6 @@ _ROUNDS = 5
 _KEPT = 4  # minima of the robust search that are settled on their inliers
 _LEAST_INLIERS = 3
 _HIDDEN = 2.5  # [sigma], least, of a keypoint that is taken for one behind what its image shows
-_LEAST_SEEN = 3  # depths of keypoints, of which two agree by chance
 _SIZES = 8  # that are tried
 _UNLIKELY_SIZE = 20.0  # excess cost of one that is
 _ITERATIONS = 30
@@ -147,7 +148,7 @@ def without_hidden(found: JointConsensus) -> list[JointConsensus]:
         shown, settled = np.zeros(len(planes.point), dtype=bool), None
         for _ in range(_ROUNDS):
             limits, again = hidden_limits(found.evidence, state)
-            if (again == shown).all() or again.sum() < min(_LEAST_SEEN, len(again)):
+            if (again == shown).all() or again.sum() < min(LEAST_SEEN, len(again)):
                 break
             shown = again
             evidence = found.evidence._replace(planes=kept_rows(planes, shown))

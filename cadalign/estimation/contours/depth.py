@@ -20,7 +20,7 @@ from cadalign.estimation.contours.photo_lines import covered_cells
 from cadalign.estimation.contours.surface import PosedSurface, Surface, caster_of, surfaces_of
 from cadalign.estimation.contours.view_contour import robust_deviation
 from cadalign.estimation.estimates import poses_of
-from cadalign.estimation.joint_robust import cost_of_hidden, hidden_limits
+from cadalign.estimation.joint_robust import LEAST_SEEN, cost_of_hidden, hidden_limits
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import ShapePrior
 from cadalign.estimation.search import JointProblem, Minimum
@@ -54,7 +54,6 @@ _MOST_STARTS = 4
 _UNLIKELY = 60.0  # excess score of a minimum that is still tried
 _MOST_COVERED = 12
 _COVERED = 0.5  # [sigma], of a keypoint behind the surface
-_LEAST_SEEN = 3  # depths of keypoints, of which two agree by chance
 
 
 class _Samples(NamedTuple):
@@ -141,7 +140,7 @@ def _uncovered(minimum: Minimum, whole: Planes, surface: Surface, views: Sequenc
     shown = np.zeros(len(whole.point), dtype=bool)
     for _ in range(_ROUNDS):
         again = ~_is_covered(evidence, state, surface, views)
-        if again.sum() < _LEAST_SEEN or (again == shown).all():
+        if again.sum() < LEAST_SEEN or (again == shown).all():
             break
         shown = again
         some = evidence._replace(planes=kept_rows(whole, shown))

@@ -291,15 +291,10 @@ def find_rims(sight: Sight, contour: Contour, reach: float, precision: float = _
     count = len(contour.points)
     intervals = 2 * min(int(np.ceil(reach / _LONGEST_STEP)), _MOST_STEPS)
     steps = np.linspace(-reach, reach, intervals + 1)
-    covered = sight.covers(contour.at(steps[:, None] + np.zeros(count)))
-    leaves = covered[:-1] & ~covered[1:]
-    middle = (steps[:-1] + steps[1:]) / 2
-    distance = np.where(leaves, np.abs(middle)[:, None], np.inf)
-    nearest = distance.argmin(axis=0)
-    found = np.isfinite(distance[nearest, np.arange(count)])
+    first, found = _nearest_exits(sight, contour, steps)
     rows = np.flatnonzero(found)
     some = contour.taken(rows)
-    inner, outer = steps[nearest[rows]], steps[nearest[rows] + 1]
+    inner, outer = steps[first[rows]], steps[first[rows] + 1]
     for _ in range(int(np.ceil(np.log2((steps[1] - steps[0]) / precision)))):
         half = (inner + outer) / 2
         inside = sight.covers(some.at(half))
@@ -314,6 +309,29 @@ def find_rims(sight: Sight, contour: Contour, reach: float, precision: float = _
     surface[rows] = points[hit]
     faces[rows] = face[hit]
     return Rims(found, offset, surface, faces)
+
+
+def _nearest_exits(sight: Sight, contour: Contour, steps: FloatArray) -> tuple[IntArray, BoolArray]:
+    """Numbers (S,) of the last steps inside of the object on normals, and which (S,) have one.
+
+    The exit nearest to the middle of ``steps``, an odd number, counts: rays are cast from there in
+    both directions until one is found, and most normals need three.
+    """
+    middle, count = len(steps) // 2, len(contour.points)
+    exits, found = np.zeros(count, dtype=int), np.zeros(count, dtype=bool)
+    rows, ring, some = np.arange(count), 0, contour
+    inward = outward = sight.covers(contour.at(np.full(count, steps[middle])))
+    while len(rows) and ring < middle:
+        ring += 1
+        places = np.repeat(steps[[middle - ring, middle + ring], None], len(rows), axis=1)
+        before, after = sight.covers(some.at(places))
+        inside, outside = before & ~inward, outward & ~after
+        exits[rows] = np.where(inside, middle - ring, middle + ring - 1)
+        found[rows] = inside | outside
+        further = ~found[rows]
+        rows, inward, outward = rows[further], before[further], after[further]
+        some = contour.taken(rows)
+    return exits, found
 
 
 def without_steep(contour: Contour, rims: Rims, bias: FloatArray | float = 0.0) -> Rims:

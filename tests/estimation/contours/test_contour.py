@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple, cast
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,8 +14,10 @@ from cadalign.errors import InputError
 from cadalign.estimation.contours.contour import (
     SPACING,
     Contour,
+    Sight,
     contour_of,
     crossings,
+    find_rims,
     mask_contour,
 )
 from cadalign.estimation.contours.view_contour import (
@@ -138,3 +142,42 @@ def test_the_nearest_of_two_lines_is_taken_on_either_side(shift: float) -> None:
     place, normal = np.array([[18.5 + shift, 2.0]]), np.array([[1.0, 0.0]])
     found = crossings(level, place, normal, np.array([2.0]))
     assert found == pytest.approx([(19.5 if shift < 0 else 21.5) - place[0, 0]], abs=0.02)
+
+
+class Stripes(NamedTuple):
+    """A sight of stripes that are parallel to the y axis, between pairs of ``edges`` [px]."""
+
+    edges: list[float]
+
+    def covers(self, pixels: np.ndarray) -> np.ndarray:
+        return np.asarray(np.searchsorted(self.edges, pixels[..., 0]) % 2 == 1)
+
+    def hits(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(len(pixels), dtype=int), np.column_stack([pixels, np.ones(len(pixels))])
+
+
+@given(
+    edges=st.lists(st.floats(-40, 40), min_size=2, max_size=8, unique=True),
+    starts=st.lists(st.floats(-30, 30), min_size=1, max_size=5),
+    reach=st.floats(1, 40),
+)
+def test_the_exit_nearest_to_each_sample_is_its_rim(
+    edges: list[float], starts: list[float], reach: float
+) -> None:
+    sight, count = Stripes(sorted(edges)), len(starts)
+    points = np.column_stack([starts, np.zeros(count)])
+    contour = Contour(points, np.tile([1.0, 0.0], (count, 1)), np.zeros(count, dtype=int))
+    rims = find_rims(cast(Sight, sight), contour, reach)
+    steps = np.linspace(-reach, reach, 2 * int(min(np.ceil(reach / 1.5), 24)) + 1)
+    covered = sight.covers(contour.at(steps[:, None] + np.zeros(count)))
+    for start, column, found, offset in zip(
+        starts, covered.T, rims.found, rims.offset, strict=True
+    ):
+        (exits,) = np.nonzero(column[:-1] & ~column[1:])
+        assert found == bool(len(exits))
+        if not found:
+            continue
+        middles = (steps[exits] + steps[exits + 1]) / 2
+        nearest = exits[np.argmin(np.round(np.abs(middles), 9))]
+        assert steps[nearest] <= offset <= steps[nearest + 1]
+        assert np.abs(np.array(sight.edges[1::2]) - start - offset).min() < 0.02

@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.estimation.prior import ShapePrior
 from cadalign.geometry.alignment import Alignment
-from cadalign.shapes.parts import BoxMargins
+from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.joint.covariance import JointCovariance
 from cadalign.solvers.joint.evidence import Evidence, State, points_of
 from cadalign.solvers.marginal.equations import force_of
@@ -102,25 +103,23 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
     return np.asarray((axes * [y * z, x * z, x * y]) @ axes.T / 2)
 
 
-def with_box(
-    evidence: Evidence, state: State, keypoints: int, margins: BoxMargins
-) -> tuple[Evidence, State]:
+def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evidence, State]:
     """Evidence and state whose box has those faces that outermost keypoints determine at these.
 
     Such a face varies with its keypoint. The box remains the linear one where measured distances
     determine it, and without keypoints.
     """
-    shape = evidence.shape
-    rows = np.unique(evidence.sightings.point)
-    rows = rows[rows < keypoints]
-    if len(evidence.offsets.value) or not len(shape.modes) or not len(rows):
+    shape, keypoints = evidence.shape, len(prior.ids)
+    seen = np.unique(evidence.sightings.point)
+    seen = seen[seen < keypoints]
+    if len(evidence.offsets.value) or not len(shape.modes) or not len(seen):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
-    bounds, own = placed_box(points, rows, margins)
+    bounds, own = placed_box(points, keypoints, seen, prior)
     axes = np.arange(3)
     mean, modes = shape.mean.copy(), shape.modes.copy()
     displacements = state.displacements.copy()
-    mean[-2:] = mean[own, axes] + bounds - points[own, axes]
+    mean[-2:] = mean[own, axes] + (bounds - points[own, axes])
     modes[:, -2:] = modes[:, own, axes]
     displacements[-2:] = displacements[own, axes]
     placed = evidence._replace(shape=shape._replace(mean=mean, modes=modes))
@@ -128,16 +127,23 @@ def with_box(
 
 
 def placed_box(
-    points: FloatArray, rows: IntArray, margins: BoxMargins
+    points: FloatArray, keypoints: int, seen: IntArray, model: ShapePrior | ShapeModel
 ) -> tuple[FloatArray, IntArray]:
     """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
 
-    Either keypoints that are seen, ``rows``, or the box's own corners.
+    These are outermost ones of the ``keypoints``, the first of the points, or the last two, the
+    corners of the linear box. Where the ``model`` has no box, it is the extent of all keypoints;
+    otherwise margins tell where those that are ``seen`` determine it.
     """
-    bounds = margins.bounds(points[-2:], points[rows])
-    outermost = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
-    own = len(points) - np.array([[2], [1]])
-    return bounds, np.where(bounds != points[-2:], outermost, own)
+    linear, rows = points[-2:], seen if model.has_box else np.arange(keypoints)
+    extreme = rows[np.array([points[rows].argmin(axis=0), points[rows].argmax(axis=0)])]
+    if not model.has_box:
+        return points[extreme, np.arange(3)], extreme
+    own = np.broadcast_to(len(points) - np.array([[2], [1]]), (2, 3))
+    if model.box_margins is None:
+        return linear, own
+    bounds = model.box_margins.bounds(linear, points[rows])
+    return bounds, np.where(bounds != linear, extreme, own)
 
 
 def widen_box(points: FloatArray, rows: IntArray) -> None:
@@ -148,7 +154,7 @@ def widen_box(points: FloatArray, rows: IntArray) -> None:
 
 
 def with_boxes(
-    mixture: Mixture, seen: Seen, minima: Minima, count: int, margins: BoxMargins
+    mixture: Mixture, seen: Seen, minima: Minima, count: int, model: ShapeModel
 ) -> tuple[Mixture, Minima]:
     """A component for each of the first minima, with the box that `with_box` gives."""
     if not mixture.covariances.any():
@@ -157,8 +163,8 @@ def with_boxes(
     means, covariances = mixture.means[component], mixture.covariances[component]
     for k in range(count):
         points = shape_at(mixture, component[k], seen, force_of(minima.states[k]))
-        bounds, rows = placed_box(points, seen.points, margins)
-        means[k, -2:] = means[k, rows, axes] + bounds - points[rows, axes]
+        bounds, rows = placed_box(points, len(model.ids), seen.points, model)
+        means[k, -2:] = means[k, rows, axes] + (bounds - points[rows, axes])
         own = (3 * rows + axes).ravel()
         covariances[k, -6:] = covariances[k, own]
         covariances[k, :, -6:] = covariances[k, :, own].T

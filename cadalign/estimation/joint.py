@@ -280,8 +280,7 @@ def _undetermined_error() -> DegenerateError:
 
 def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimate:
     keypoints, evidence, state = len(prior.ids), minimum.evidence, minimum.state
-    if prior.box_margins is not None:
-        evidence, state = with_box(evidence, state, keypoints, prior.box_margins)
+    evidence, state = with_box(evidence, state, prior)
     scale = np.exp(state.log_scales)
     rows = np.r_[:keypoints, -2:0]  # without what stands between keypoints and box
     stretched = points_of(evidence.shape, state)[rows]

@@ -38,8 +38,8 @@ class ShapePrior:
     """Gaussian components of a shape, and what is known of its scales.
 
     The rows of a component are the keypoints with ``ids`` (m,), then the least and the greatest
-    corner of the box. ``inflation``, ``degrees_of_freedom``, ``box_margins`` and ``few_keypoints``
-    are those of `cadalign.ShapeModel`.
+    corner of the box. ``inflation``, ``degrees_of_freedom``, ``has_box``, ``box_margins`` and
+    ``few_keypoints`` are those of `cadalign.ShapeModel`.
     """
 
     ids: tuple[Hashable, ...]
@@ -49,6 +49,7 @@ class ShapePrior:
     up: FloatArray | None
     inflation: float = 1.0
     degrees_of_freedom: float | None = None
+    has_box: bool = True
     box_margins: BoxMargins | None = None
     few_keypoints: FewKeypoints | None = None
 
@@ -126,6 +127,7 @@ def _of_category(model: ShapeModel) -> ShapePrior:
         up,
         inflation=model.inflation,
         degrees_of_freedom=model.degrees_of_freedom,
+        has_box=model.has_box,
         box_margins=model.box_margins,
         few_keypoints=model.few_keypoints,
     )

@@ -136,10 +136,8 @@ def align_single(
     likelihoods = np.exp((minima.scores[0] - minima.scores[:count]) / 2)
     likelihoods = likelihoods[likelihoods >= LEAST_LIKELIHOOD]
     inflation = inflation_with(len(rows), model.inflation, model.few_keypoints)
-    placed = mixture, minima
-    if model.box_margins is not None:
-        placed = with_boxes(mixture, seen, minima, len(likelihoods), model.box_margins)
-    likely = posteriors_of(placed[0], seen, placed[1], len(likelihoods), inflation)
+    placed, chosen = with_boxes(mixture, seen, minima, len(likelihoods), model)
+    likely = posteriors_of(placed, seen, chosen, len(likelihoods), inflation)
     estimates = [
         Estimate(
             likely.points[k],

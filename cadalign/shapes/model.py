@@ -72,8 +72,8 @@ class ShapeModel:
     components: tuple[ShapeComponent, ...]
     """The mixture; weights sum to 1."""
     has_box: bool = True
-    """Whether the rows of the box were learned or given; otherwise they are the extent of the
-    mean's keypoints and move with these."""
+    """Whether the rows of the box were learned or given; otherwise the box of an estimate is the
+    extent of all its keypoints."""
     up_axis: Literal["x", "y", "z"] | None = None
     """The model axis that points up, None where it is not known."""
     reflection: Reflection | None = None
@@ -244,9 +244,9 @@ class ShapeModel:
         ids, names : (m,) int or str, optional
             Semantic ids or names of the keypoints, one of both; by default ``0 ... m - 1``.
         box : (2, 3) float, optional
-            Least and greatest corner of the mean shape's bounding box; by default the extent of its
-            keypoints. With each mode it moves by the shift and the stretch along each axis that fit
-            the keypoints' motion best.
+            Least and greatest corner of the mean shape's bounding box. With each mode it moves by
+            the shift and the stretch along each axis that fit the keypoints' motion best. By
+            default the box of an estimate is the extent of all its keypoints.
         residual_sigma : float
             Standard deviation per coordinate of what the modes leave [model units].
         size_sigma : float or (3,) float, optional

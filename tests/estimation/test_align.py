@@ -154,8 +154,34 @@ class TestSimilarModel:
         with pytest.raises(InputError, match="dimension"):
             plain.radius(0.5, dimension=0)
 
+    @pytest.mark.parametrize("views", [1, 2])
+    def test_a_box_that_is_not_given_is_the_extent_of_all_keypoints(self, views: int) -> None:
+        """Its stated standard deviations are those of the errors; a linear box was 20 off."""
+        model, errors = spreads(0.05), []
+        component = model.components[0]
+        for seed in range(60):
+            rng = np.random.default_rng(seed)
+            shape = component.mean + np.tensordot(rng.normal(size=3), component.modes, 1)
+            some = np.sort(rng.permutation(10)[:7])  # others than these may be the outermost
+            given = [
+                seen(
+                    shape[some],
+                    truth_of((1.0, 1.0, 1.0)),
+                    turned(30.0 * number),
+                    noise=rng.normal(0, 1, (7, 2)),
+                    ids=some.tolist(),
+                )
+                for number in range(views)
+            ]
+            result = align(model, given)
+            assert np.allclose(result.bounds[0], result.points_3d.min(axis=0))
+            assert np.allclose(result.bounds[1], result.points_3d.max(axis=0))
+            lengths, true = np.ptp(result.bounds, axis=0), np.ptp(shape[:-2], axis=0)
+            errors.append(np.log(lengths / true) / np.sqrt(result.covariance.diagonal()[6:]))
+        assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.25
+
     def test_the_box_ends_at_keypoints_that_its_faces_are_near(self) -> None:
-        model = spreads(0.05)
+        model = replace(spreads(0.05), has_box=True)
         view = seen(model.components[0].mean[:-2], truth_of((1.0, 1.0, 1.0)), np.eye(4))
         near = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
         result = align(replace(model, box_margins=near), view)

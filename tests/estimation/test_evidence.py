@@ -338,7 +338,8 @@ def test_points_that_are_no_keypoints_end_no_box() -> None:
     state = State(pose, np.zeros(0), np.zeros(3), np.zeros(len(modes)), np.zeros_like(mean))
     margins = BoxMargins(np.full((2, 3), 0.01), np.full((2, 3), 9.0))
     farthest = int(mean[2:12, 0].argmax()) + 2
-    placed, _ = with_box(evidence, state, farthest, margins)
+    some = replace(prior, ids=prior.ids[:farthest], has_box=True, box_margins=margins)
+    placed, _ = with_box(evidence, state, some)
     known = mean[:farthest]
     expected = [known.min(axis=0) - 0.01, known.max(axis=0) + 0.01]
     np.testing.assert_allclose(placed.shape.mean[-2:], expected)

@@ -18,8 +18,9 @@ MEAN = np.random.default_rng(0).uniform(-0.5, 0.5, (9, 3))
 def make_shape(residual_sigma: float = 0.0, modes: int = 4) -> ShapeModel:
     rng = np.random.default_rng(1)
     directions = rng.standard_normal((modes, 9, 3))
+    box = [MEAN.min(axis=0), MEAN.max(axis=0)]
     return ShapeModel.from_basis(
-        MEAN, directions, np.full(modes, 0.05), residual_sigma=residual_sigma
+        MEAN, directions, np.full(modes, 0.05), box=box, residual_sigma=residual_sigma
     )
 
 

@@ -256,9 +256,8 @@ class _KnownScene:
             return turned_covariance(facing.covariance(), turns[0])
         evidence = evidence_of(self.prior, self.views, self.size)
         evidence, state = widened(evidence, self._state(evidence), self.prior.inflation)
-        margins, known = self.prior.box_margins, is_exact(evidence)
-        if margins is not None:  # the box that results state of a learned shape
-            evidence, state = with_box(evidence, state, len(self.points_3d), margins)
+        known = is_exact(evidence)
+        evidence, state = with_box(evidence, state, self.prior)
         if isinstance(self.model, Model) and any(view.mask is not None for view in self.views):
             # With OpenCV and embree.
             from cadalign.estimation.contours.view_contour import with_contours

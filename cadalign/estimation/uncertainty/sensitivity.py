@@ -310,10 +310,10 @@ def _corners(result: ResultData, optimum: JointOptimum) -> tuple[IntArray, IntAr
     seen = np.unique(evidence.sightings.point)
     seen = seen[seen < count]
     own = count + np.array([[0, 0, 0], [1, 1, 1]])
-    margins = cast(ShapeModel, result.model).box_margins
-    if margins is not None and not len(evidence.offsets.value):
+    if not len(evidence.offsets.value):
         linear = points_of(evidence.shape, state)[-2:] / np.exp(state.log_scales)
-        _, own = placed_box(np.concatenate([result.points_3d, linear]), seen, margins)
+        points = np.concatenate([result.points_3d, linear])
+        _, own = placed_box(points, count, seen, cast(ShapeModel, result.model))
     given = result.points_3d[seen]
     for side, outermost in enumerate((given.argmin(axis=0), given.argmax(axis=0))):
         at_corner = np.abs(result.bounds[side] - given[outermost, np.arange(3)]) < _NEAR

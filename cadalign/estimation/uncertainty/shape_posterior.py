@@ -45,9 +45,9 @@ class ShapePosterior(NamedTuple):
     """Knowledge of an object's shape from one image and a shape model.
 
     ``shapes`` is a mixture over the stacked rows: x, y, z of each keypoint of the shape model, then
-    of the least and the greatest corner of the box [model units]. ``log_evidence`` is the log of
-    the probability density of the image's whitened keypoints, up to a constant, given that the
-    object is of the category: it compares shape models that have all of them.
+    of the least and the greatest corner of its linear box [model units]. ``log_evidence`` is the
+    log of the probability density of the image's whitened keypoints, up to a constant, given that
+    the object is of the category: it compares shape models that have all of them.
     """
 
     shapes: Gaussians

@@ -73,6 +73,17 @@ def test_an_instance_opens_with_layers_numbers_and_warnings(opened: Opened, plai
     expect(dialog.locator(".warnings")).to_have_count(0)
 
 
+def test_layers_that_an_instance_lacks_are_not_offered(opened: Opened, tmp_path: Path) -> None:
+    exhibits = payload_of(Recipe())["exhibits"]
+    for exhibit in exhibits.values():
+        exhibit.update(gt=None, points_2d=[])
+    page = opened(write_page(tmp_path / "report.html", Recipe(), exhibits=exhibits))
+    dialog = open_first(page)
+    expect(dialog.get_by_role("checkbox", name="prediction")).to_be_visible()
+    for label in ("ground truth", "keypoints"):
+        expect(dialog.get_by_role("checkbox", name=label)).to_have_count(0)
+
+
 @pytest.mark.long
 def test_boxes_and_keypoints_are_where_the_camera_sees_them(opened: Opened, plain: str) -> None:
     payload = payload_of(Recipe())

@@ -311,6 +311,9 @@ export class Viewer {
   drawSolid(exhibit, mesh, method, fresh) {
     this.solid.hidden = this.layers.hidden = !exhibit;
     if (!exhibit) return;
+    const lacks = { g: !exhibit.gt, k: !exhibit.points_2d?.length };
+    for (const box of this.layers.querySelectorAll("input"))
+      box.parentElement.hidden = lacks[box.value] ?? false;
     try {
       this.scene ??= new Scene3D(this.canvas);
     } catch {

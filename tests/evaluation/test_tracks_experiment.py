@@ -146,6 +146,11 @@ def test_frames_without_a_pose_are_left_out() -> None:
     assert found["depth_error_relative"] == pytest.approx(0.1)
     assert (found["flips"], found["rotation_in_95"]) == (0, 1)
     assert np.isnan(found["yaw_error_deg"])
+    est[2], est[1::2], covariances[:] = gt[2] * np.append(np.ones(11), 1.1), np.nan, np.nan
+    found = track_errors(TrackEstimate(est, covariances), gt)
+    columns = ("relative_translation", "jitter_deg", "rotation_in_95")
+    assert np.isnan([found[name] for name in columns]).all()
+    assert found["absolute_translation"] == pytest.approx(0.4)
 
 
 @pytest.mark.slow

@@ -56,6 +56,23 @@ def test_a_constant_twist_has_no_jitter_and_noise_has() -> None:
     assert rotation_jitter_deg(noisy) == pytest.approx(np.degrees(0.01 * np.sqrt(6)), rel=0.3)
 
 
+def test_motions_over_frames_without_a_pose_do_not_count() -> None:
+    poses = screw(np.array([0.1, 0.2, 0.0, 0.3, 0.0, 0.1]))
+    other = screw(np.array([0.1, 0.25, 0.0, 0.3, 0.1, 0.1]))
+    whole = relative_pose_error(est=other, gt=poses)
+    other[[4, 5, 8]] = np.nan
+    assert rotation_jitter_deg(other) < 1e-5
+    lost = relative_pose_error(est=other, gt=poses)
+    assert (lost.rotation_deg, lost.translation) == pytest.approx(
+        (whole.rotation_deg, whole.translation), rel=1e-9
+    )
+    other[1::2] = np.nan
+    with pytest.raises(InputError, match="no two frames that far apart have a pose"):
+        relative_pose_error(est=other, gt=poses)
+    with pytest.raises(InputError, match="no three successive frames have a pose"):
+        rotation_jitter_deg(other)
+
+
 def test_half_turns_are_flips() -> None:
     poses = screw(np.zeros(6), frames=4)
     wrong = poses.copy()

@@ -180,6 +180,7 @@ class TestLevel:
         assert level == pytest.approx(0.5)
         assert probability_level(np.array([0.1, 0.0, 0.0]), covariance) == 1.0
         assert probability_level(np.ones(3), np.zeros((3, 3))) is None
+        assert probability_level(np.ones(3), np.full((3, 3), np.nan)) is None
 
 
 class TestRun:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.photos.kitti_keypoints import (
     HIDDEN,
@@ -33,6 +33,7 @@ from cadalign.evaluation.experiments.tracks import COLUMNS, METHODS, TracksOptio
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.evaluation.metrics.errors import (
+    PoseErrors,
     absolute_pose_error,
     count_flips,
     relative_pose_error,
@@ -260,16 +261,24 @@ class TrackVideos(Setting):
 def track_errors(estimate: TrackEstimate, gt: FloatArray, *, has_yaw: bool = False) -> Row:
     """Errors of an estimated track over the frames that it has, by column.
 
-    ``gt`` (P, 12) are the true poses, ``has_yaw`` says that they are those of KITTI's cars. Raises
-    InputError if fewer than three frames have a pose.
+    ``gt`` (P, 12) are the true poses, ``has_yaw`` says that they are those of KITTI's cars. Motions
+    and jitter are those of successive frames, NaN where none have a pose. Raises InputError if
+    fewer than three frames have one.
     """
-    has = np.isfinite(estimate.poses).all(axis=1)
+    has: BoolArray = np.asarray(np.isfinite(estimate.poses).all(axis=1))
     if has.sum() < 3:
         raise InputError(f"only {has.sum()} frames have a pose", where="frames")
     est, true = estimate.poses[has], gt[has]
     turns, true_turns = est[:, :9].reshape(-1, 3, 3), true[:, :9].reshape(-1, 3, 3)
     angles = angles_between(turns, true_turns)
-    absolute, relative = (f(est=est, gt=true) for f in (absolute_pose_error, relative_pose_error))
+    absolute = absolute_pose_error(est=est, gt=true)
+    relative, jitter = PoseErrors(np.nan, np.nan), np.nan
+    path = np.where(has[:, None], estimate.poses, np.nan)
+    follows = has[1:] & has[:-1]
+    if follows.any():
+        relative = relative_pose_error(est=path, gt=gt)
+    if (follows[1:] & follows[:-1]).any():
+        jitter = rotation_jitter_deg(path)
     yaws = [yaw_of_car(a) - yaw_of_car(b) for a, b in zip(turns, true_turns, strict=True)]
     yaw = np.median(np.abs(np.angle(np.exp(1j * np.array(yaws))))) if has_yaw else np.nan
     levels = [
@@ -287,7 +296,7 @@ def track_errors(estimate: TrackEstimate, gt: FloatArray, *, has_yaw: bool = Fal
         "absolute_translation": absolute.translation,
         "relative_rotation_deg": relative.rotation_deg,
         "relative_translation": relative.translation,
-        "jitter_deg": rotation_jitter_deg(est),
+        "jitter_deg": jitter,
         "flips": count_flips(est=est, gt=true),
         "rotation_in_95": float((stated <= _NOMINAL).mean()) if len(stated) else np.nan,
     }

@@ -129,9 +129,11 @@ def probability_level(
     >>> probability_level(np.zeros(2), np.zeros((2, 2))) is None
     True
     """
+    if not np.isfinite(covariance).all():
+        return None
     values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
     free = values > _NO_VARIANCE * max(float(values[-1]), 0.0)
-    if not np.isfinite(values).all() or not free.any():
+    if not free.any():
         return None
     parts = vectors.T @ error
     if (parts[~free] ** 2 > 1e-6 * values[-1]).any():

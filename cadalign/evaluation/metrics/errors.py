@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
@@ -178,21 +178,32 @@ def absolute_pose_error(*, est: FloatArray, gt: FloatArray) -> PoseErrors:
 def relative_pose_error(*, est: FloatArray, gt: FloatArray, step: int = 1) -> PoseErrors:
     """Root mean square error of the motions between frames that are ``step`` frames apart.
 
-    A motion is that of the body in its own axes, ``inv(T_k) T_k+step``. Raises InputError if there
-    are other frames than true ones, or fewer than that.
+    A motion is that of the body in its own axes, ``inv(T_k) T_k+step``. Those of frames without a
+    pose, which are NaN, do not count. Raises InputError if there are other frames than true ones,
+    or no such motion.
     """
     _check(est, gt, least=step + 1)
-    return PoseErrors.of(_motions(est, step), _motions(gt, step))
+    motions, true = _motions(est, step), _motions(gt, step)
+    has = _finite(motions, what="no two frames that far apart have a pose")
+    return PoseErrors.of(motions[has], true[has])
 
 
 def rotation_jitter_deg(poses: FloatArray) -> float:
     """Standard deviation of the second difference of the rotation [degrees], per axis.
 
-    Zero for a turn at constant speed. Raises InputError for fewer than three frames.
+    Zero for a turn at constant speed. Frames without a pose are NaN. Raises InputError if no three
+    successive frames have one.
     """
     _check(poses, poses, least=3)
-    turns = np.array([vector_from_rotation(each) for each in _rotations(_motions(poses, 1))])
-    return float(np.degrees(np.sqrt((np.diff(turns, axis=0) ** 2).mean())))
+    motions = _motions(poses, 1)
+    lost = np.full(3, np.nan)
+    turns = [
+        vector_from_rotation(each) if np.isfinite(each).all() else lost
+        for each in _rotations(motions)
+    ]
+    changes = np.diff(turns, axis=0)
+    changes = changes[_finite(changes, what="no three successive frames have a pose")]
+    return float(np.degrees(np.sqrt((changes**2).mean())))
 
 
 def count_flips(*, est: FloatArray, gt: FloatArray) -> int:
@@ -212,6 +223,14 @@ def _motions(poses: FloatArray, step: int) -> FloatArray:
     turns = (back @ _rotations(second)).reshape(-1, 9)
     moves = np.einsum("nij,nj->ni", back, second[:, 9:] - first[:, 9:])
     return np.concatenate([turns, moves], axis=1)
+
+
+def _finite(rows: FloatArray, *, what: str) -> BoolArray:
+    """Mask of the finite rows; raises InputError, which says ``what``, where there is none."""
+    has = np.isfinite(rows).all(axis=1)
+    if not has.any():
+        raise InputError(what, where="est")
+    return np.asarray(has)
 
 
 def _check(est: FloatArray, gt: FloatArray, *, least: int) -> None:

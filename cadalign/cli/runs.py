@@ -22,6 +22,7 @@ from rich.text import Text
 
 from cadalign.cli.common import beside, exit_code, new_console, print_json, print_table, say
 from cadalign.cli.options import flags_of, with_flags
+from cadalign.errors import DataError
 from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
@@ -43,7 +44,16 @@ _ON_PAGE = 5000
 
 
 def conclude(spec: Spec, run: Run, *, json: bool) -> int:
-    """Write a finished run's summary and figures, and say what came out; returns the exit code."""
+    """Write a finished run's summary and figures, and say what came out; returns the exit code.
+
+    Raises DataError if the run has no row.
+    """
+    if not len(run.results):
+        given = run.config.get("categories")
+        what = "there is nothing that the run was made of"
+        what += f": no object is of the categories {', '.join(given)}" if given else ""
+        fix = "give other categories or data, and another folder (--out), or remove this one"
+        raise DataError(what, where=str(run.folder.path), fix=fix)
     summaries = spec.write(run)
     found = spec.conclude(run, summaries)
     if json:
@@ -161,7 +171,8 @@ def _say_reasons(reasons: Sequence[tuple[str, int]], *, most: int = _MOST_REASON
         say(f"failed {count:,}: {reason}")
     rest = reasons[most:]
     if rest:
-        say(f"failed {sum(count for _, count in rest):,}: {len(rest):,} other reasons")
+        others = "another reason" if len(rest) == 1 else f"{len(rest):,} other reasons"
+        say(f"failed {sum(count for _, count in rest):,}: {others}")
 
 
 def run_folder(command: ManyCommand, options: ManyOptions) -> RunFolder:

@@ -19,7 +19,7 @@ from cadalign.arrays import FloatArray
 from cadalign.evaluation.methods.method import LIMIT, fit_methods
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import HIGH, Metric
-from cadalign.evaluation.runs.work import OK
+from cadalign.evaluation.runs.work import FAILED, OK
 from cadalign.evaluation.summary import Quartiles, known
 from cadalign.io.files import write_whole
 
@@ -363,16 +363,16 @@ _SHARE = replace(metrics.COVERED, key="share", label="objects", better=HIGH)
 def cumulative(runs: Sequence[Run], metric: Metric, places: FloatArray, *, title: str) -> Plot:
     """Shares of the objects with at most an error, or at least an overlap, by method.
 
-    ``metric`` is a column of the result tables, of which failures count as never within; ``places``
-    (k,) are the errors, in the column's unit.
+    ``metric`` is a column of the result tables, of which failures count as never within, while rows
+    that were left out, skipped or have no value do not count; ``places`` (k,) are the errors, in
+    the column's unit.
     """
     traces = []
     for index, run in enumerate(runs):
         for method in run.methods:
-            chosen = run.cells["method"] == method
-            solved = chosen & (run.cells["status"] == OK)
-            errors = known(run.cells[metric.key][solved])
-            count = max(int(chosen.sum()), 1)
+            chosen, status = run.cells["method"] == method, run.cells["status"]
+            errors = known(run.cells[metric.key][chosen & (status == OK)])
+            count = max(len(errors) + int((chosen & (status == FAILED)).sum()), 1)
             within = (
                 errors >= places[:, None] if metric.better == HIGH else errors <= places[:, None]
             )

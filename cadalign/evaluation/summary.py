@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 ALL = "all"
 """Name of the summary over all categories."""
+MEAN = "mean of categories"
+"""Name of the summary of the categories' own values."""
 
 
 @dataclass(frozen=True)
@@ -249,7 +251,9 @@ def summaries_of(
     ``single``: also of all cells where there is a single category.
     """
     categories = sorted(set(cells["category"].tolist()))
-    parts = [(name, where(cells, cells["category"] == name)) for name in categories]
+    groups = [f"category {name}" if name in (ALL, MEAN) else name for name in categories]
+    chosen = (where(cells, cells["category"] == name) for name in categories)
+    parts = list(zip(groups, chosen, strict=True))
     if single or len(parts) > 1:
         parts.append((ALL, cells))
     return [

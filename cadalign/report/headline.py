@@ -155,7 +155,6 @@ def _reasons(index: int, run: Run, group: Metric, wanted: str) -> list[Failure]:
 # As text ------------------------------------------------------------------------------------------
 
 FORMATS = ("md", "csv", "latex")
-_NOTHING = "-"
 _LATEX: dict[int, str] = str.maketrans(
     {
         "\\": r"\textbackslash{}",
@@ -249,9 +248,7 @@ def _table(
         labels = [*names_of_row, look_of(row.method).label]
         cells = [label.translate(escapes) for label in labels]
         for column in headline.columns:
-            value = row.cells[column.key]
-            text = _NOTHING if value is None else f"{value:.{column.digits}f}"
-            text = text.translate(escapes)
+            text = column.rounded(row.cells[column.key]).translate(escapes)
             cells.append(best.format(text) if column.key in row.best else text)
         rows.append(cells)
     return [text.translate(escapes) for text in _head(headline, names)], rows

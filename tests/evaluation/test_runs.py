@@ -33,7 +33,7 @@ from cadalign.evaluation.runs.parallel import (
 )
 from cadalign.evaluation.runs.run import Progress, execute, workers_of
 from cadalign.evaluation.runs.tables import ROW_GROUP, read_table, write_rows, write_tables
-from cadalign.evaluation.runs.work import AbortError, Columns, Plan, Rows
+from cadalign.evaluation.runs.work import AbortError, Columns, Plan, Rows, reason_of
 from cadalign.io import files
 
 MAIN = "import sys; from cadalign.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -126,6 +126,8 @@ def test_tasks_that_raise_become_failed_rows_and_spare_the_others(tmp_path: Path
     failed = {row["task"]: row["reason"] for row in rows if row["square"] is None}
     assert failed == {3: "ValueError: cannot square 3", 50: "ValueError: cannot square 50"}
     assert len(rows) == 100
+    assert reason_of(RuntimeError("no\n luck ")) == "RuntimeError: no luck"
+    assert reason_of(ValueError()) == "ValueError"
 
 
 def test_there_are_no_more_processes_than_chunks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -435,8 +435,7 @@ def test_a_run_whose_views_show_too_few_keypoints_says_so_and_counts_no_failure(
     for row in found["headline"]["rows"]:
         counts = [row["cells"][name] for name in ("instances", "failed", "skipped")]
         assert counts == [0, 0, 2]
-        assert row["cells"]["rotation_error_deg"] is None
-        assert row["cells"].get("success_5deg_5pct") is None
+        assert row["cells"].keys() == {"instances", "failed", "skipped"}
     assert found["headline"]["failures"] == []
     skipped = found["headline"]["skipped"]
     assert [(f["method"], f["count"]) for f in skipped] == [("optimal", 2), ("aepnp", 2)]
@@ -640,7 +639,7 @@ def test_an_unfinished_retrieval_shows_the_rates_that_there_are(tmp_path: Path) 
     found = report(tmp_path, folder.path)
     assert found["runs"][0]["state"] == "finished"
     rows = [row["cells"] for row in found["headline"]["rows"]]
-    assert [(row["instances"], row["milliseconds"]) for row in rows] == [(20, None)] * 2
+    assert [(row["instances"], row.get("milliseconds")) for row in rows] == [(20, None)] * 2
 
 
 # --- refusals --------------------------------------------------------------------------------

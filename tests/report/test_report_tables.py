@@ -56,6 +56,11 @@ def test_markdown_has_best_values_bold() -> None:
     )
 
 
+def test_huge_numbers_are_written_by_their_power_of_ten() -> None:
+    assert COLUMNS[1].text(1.5e300) == "1.5e+300"
+    assert COLUMNS[1].text(-123456.7) == "-123456.700"
+
+
 def test_latex_is_a_booktabs_table_with_groups_apart() -> None:
     assert table_text(headline(), ["run"], format="latex") == (
         "% needs \\usepackage{booktabs,textcomp}\n"

@@ -65,7 +65,7 @@ class EstimatesOptions(PhotoOptions):
 
 
 def method_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """A name for each file: its own without the ending, with its folder's where that is needed.
+    """A name for each file: its own, with its folder's and with the ending where that is needed.
 
     Raises InputError if a file is given twice.
     """
@@ -77,8 +77,9 @@ def method_names(paths: Sequence[Path]) -> tuple[str, ...]:
         f"{path.absolute().parent.name}/{path.stem}" if path.stem in general else path.stem
         for path in paths
     ]
-    if len(set(names)) < len(names):
-        names = [path.with_suffix("").as_posix() for path in paths]
+    whole = [path.as_posix() for path in paths]
+    for longer in ([path.with_suffix("").as_posix() for path in paths], whole):
+        names = longer if len(set(names)) < len(names) else names
     return tuple(names)
 
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 import tyro
 
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods.registry import is_registered
 from cadalign.evaluation.metrics import table as metrics
@@ -31,6 +31,8 @@ from cadalign.evaluation.registry import Spec, count_failures
 from cadalign.evaluation.runs.work import FAILED, LEFT_OUT, OK, UNREADABLE, Columns, Plan
 from cadalign.evaluation.summary import (
     ALL,
+    MEAN,
+    Conclusion,
     ConsoleTable,
     Summary,
     mean_of,
@@ -95,7 +97,6 @@ class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
                 protocols.check_method(name)
 
 
-MEAN = "mean of categories"
 GALLERY = (
     *(metric for each in protocols.SETS for metric in each.medians),
     metrics.RMS,
@@ -268,6 +269,15 @@ def _describe(run: Run) -> str:
     return f"{text}, {whose} {keypoints}are simulated: projected with the true pose, {noise:g} px"
 
 
+def _conclude(run: Run, summaries: Sequence[Summary]) -> Conclusion:
+    """Counts, and categories that no object is of."""
+    found = count_failures(run, summaries, apart=LEFT_OUT)
+    missing = set(run.config.get("categories") or ()).difference(run.cells["category"].tolist())
+    names = ", ".join(quote(name) for name in sorted(missing))
+    note = ", ".join(filter(None, (found.note, names and f"no object is a {names}")))
+    return replace(found, note=note)
+
+
 SPEC = Spec(
     options=PhotosOptions,
     plan=plan,
@@ -276,7 +286,7 @@ SPEC = Spec(
     summarize=summarize,
     table=console_table,
     plots=plots,
-    conclude=partial(count_failures, apart=LEFT_OUT),
+    conclude=_conclude,
     topic="alignment to photos",
     describe=_describe,
     metrics=GALLERY,

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 LOW, HIGH = "low", "high"
+_HUGE = 1e9  # as shown; all digits of more would be as long as a line
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,13 @@ class Metric:
     def text(self, value: Any) -> str:
         """Format a value in the unit, rounded; a dash for what is missing or not finite."""
         shown = self.shown(value)
-        return "-" if shown is None else f"{shown:.{self.digits}f}"
+        return self.rounded(shown)
+
+    def rounded(self, shown: float | None) -> str:
+        """Format a value that is in the unit, or None; a huge one by its power of ten."""
+        if shown is None:
+            return "-"
+        return f"{shown:.3g}" if abs(shown) >= _HUGE else f"{shown:.{self.digits}f}"
 
     def page(self) -> dict[str, Any]:
         """The metric for the page."""
@@ -66,8 +73,8 @@ class Metric:
 
 
 def told(metric: Metric, numbers: Sequence[float | None]) -> bool:
-    """True for a column worth showing, of these numbers, None where there is none."""
-    known = [number for number in numbers if number is not None]
+    """True for a column worth showing, of these numbers, None or NaN where there is none."""
+    known = [number for number in numbers if number is not None and not np.isnan(number)]
     return any(known) if metric == SKIPPED else bool(known)
 
 

@@ -87,7 +87,10 @@ def status_of(error: Exception) -> str:
 
 def reason_of(error: Exception) -> str:
     """An error in one line; errors of other packages with their type's name."""
-    return str(error) if isinstance(error, CadalignError) else f"{type(error).__name__}: {error}"
+    if isinstance(error, CadalignError):
+        return str(error)
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 @dataclass(frozen=True)

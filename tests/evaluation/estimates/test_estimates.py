@@ -154,6 +154,7 @@ def test_names_of_methods() -> None:
     paths = [Path("a/results.csv"), Path("b/scene_gt.json"), Path("c/scene_gt.json")]
     assert method_names(paths) == ("results", "b/scene_gt", "c/scene_gt")
     assert method_names([Path("a/x.csv"), Path("b/x.csv")]) == ("a/x", "b/x")
+    assert method_names([Path("a/x.csv"), Path("a/x.json")]) == ("a/x.csv", "a/x.json")
     with pytest.raises(InputError, match="is given twice"):
         method_names([Path("a.csv"), Path("a.csv")])
 

@@ -399,6 +399,49 @@ class TestPage:
         assert len(files) == 2
         assert (out / "summary.csv").read_text().startswith("category,method,instances")
 
+    def test_curves_and_tables_leave_the_same_objects_out(self, tmp_path: Path) -> None:
+        root = write_pix3d(tmp_path / "data", photos=4)
+        entries = json.loads((root / "pix3d.json").read_text())
+        for entry in entries[:3]:
+            entry["model"] = "model/renamed.obj"
+        del entries[2]["img_size"]
+        write_json(root / "pix3d.json", entries)
+        found = done(root, tmp_path / "run", methods=("rigid+mask",))
+        status = found.results["status"].to_pylist()
+        assert status == ["left out", "left out", "failed", "ok"]
+        (*_, every) = (line for line in SPEC.summarize(found) if line.group == "all")
+        assert every.values["accuracy_pi_6"] == 0.5
+        curves = {plot.id: plot.traces[0] for plot in SPEC.plots([found])}
+        assert curves["within_rotation_error_deg"].y[-1] == 50
+        assert curves["within_box_iou"].y[0] == 50
+        shown = SPEC.shown_columns(SPEC.summarize(found), [found])
+        keys = {column.key for column in shown}
+        assert "accuracy_pi_6" in keys
+        assert not keys & {"scan2cad_aligned", "yaw_error_deg", "average_recall"}
+
+    def test_categories_may_have_the_names_of_summaries(self, tmp_path: Path) -> None:
+        root = write_pix3d(tmp_path / "data", photos=3)
+        entries = json.loads((root / "pix3d.json").read_text())
+        for entry, name in zip(entries, ("all", "mean of categories", "table"), strict=True):
+            entry["category"] = name
+        write_json(root / "pix3d.json", entries)
+        found = done(root, tmp_path / "run", methods=("rigid",))
+        counts = {line.group: line.values["instances"] for line in SPEC.summarize(found)}
+        assert counts == {
+            "category all": 1, "category mean of categories": 1, "table": 1, "all": 3,
+            "mean of categories": 3,
+        }  # fmt: skip
+
+    def test_categories_that_no_object_is_of_are_named(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        command = ["evaluate", "photos", str(write_pix3d(tmp_path / "data", photos=2))]
+        command += ["--workers", "0", "--methods", "truth", "--out"]
+        assert main([*command, str(tmp_path / "some"), "--categories", "table", "sofas"]) == 0
+        assert "no object is a 'sofas'" in capsys.readouterr().err
+        assert main([*command, str(tmp_path / "none"), "--categories", "sofas"]) == 1
+        assert "no object is of the categories sofas" in capsys.readouterr().err
+
     def test_simulated_keypoints_are_named_so(self, tmp_path: Path) -> None:
         found = done(write_bop(tmp_path / "data"), tmp_path / "run", methods=("rigid",))
         assert SPEC.summarize(found)[0].group == "obj_000001, simulated"

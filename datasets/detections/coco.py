@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 from msgspec import Meta, field
@@ -79,6 +79,9 @@ class _Category(ForeignDocument):
                 raise InputError(f"{quote(name)} occurs twice", where=f"keypoints[{row}]")
 
 
+_Entry = TypeVar("_Entry", _Image, _Category)
+
+
 class _File(ForeignDocument):
     """COCO's annotations, or MMPose's predictions: the last two fields."""
 
@@ -129,22 +132,32 @@ def _bare(data: Any, where: str) -> ImageKeypoints:
 
 
 def _from_annotations(data: _File) -> Iterator[_Reader]:
-    images = {image.id: image for image in data.images or []}
-    names = {category.id: category.keypoints for category in data.categories or []}
+    images, categories = _by_id(data.images, "images"), _by_id(data.categories, "categories")
     for row, entry in enumerate(data.annotations):
         where = f"annotations[{row}]"
-        yield where, partial(_annotated, entry, where, images, names)
+        yield where, partial(_annotated, entry, where, images, categories)
+
+
+def _by_id(entries: Sequence[_Entry] | None, where: str) -> dict[_Id, _Entry]:
+    """Images or categories by their ids; raises DataError for an id of two."""
+    found: dict[_Id, _Entry] = {}
+    for row, entry in enumerate(entries or ()):
+        if found.setdefault(entry.id, entry) != entry:
+            what = f"{quote(entry.id)} is the id of another entry, too"
+            fix = "give each an id of its own; are these several files joined to one?"
+            raise DataError(what, where=f"{where}[{row}].id", fix=fix)
+    return found
 
 
 def _annotated(
-    data: Any, where: str, images: dict[_Id, _Image], names: dict[_Id, list[str] | None]
+    data: Any, where: str, images: dict[_Id, _Image], categories: dict[_Id, _Category]
 ) -> ImageKeypoints | None:
     """The keypoints of an annotation; None where none of them is labelled."""
     entry: _Object = convert(data, _Object, where)
     if entry.num_keypoints == 0:
         return None
-    category = None if entry.category_id is None else names.get(entry.category_id)
-    found = _image_keypoints(entry, where, names=category)
+    category = None if entry.category_id is None else categories.get(entry.category_id)
+    found = _image_keypoints(entry, where, names=None if category is None else category.keypoints)
     if not images:
         return found
     if entry.image_id is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
+from codecs import BOM_UTF8
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping, Sequence
 from contextlib import contextmanager
@@ -295,6 +296,8 @@ def parse(raw: Raw, kind: type[T] | Any, *, path: Path, where: str) -> T | Any:
 
 
 def _decode(data: bytes | Raw, kind: Any, name: str, where: Path | str) -> Any:
+    if isinstance(data, bytes):
+        data = data.removeprefix(BOM_UTF8)
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError:

@@ -101,8 +101,8 @@ class KittiCars(PhotoDataset):
     offset in P2 is added to the labels' locations. Where a calibration file is missing, so are the
     camera and the offset.
 
-    ``categories`` are KITTI's types to take. Raises DataError if there is none of these files, or
-    none can be read.
+    ``categories`` are KITTI's types to take of the labels. Raises DataError if there is none of
+    these files, or none can be read.
     """
 
     kind = "KITTI"
@@ -115,7 +115,7 @@ class KittiCars(PhotoDataset):
         self, root: str | os.PathLike[str], *, categories: Iterable[str] = ("Car",)
     ) -> None:
         folder = as_path(root, "root")
-        self._categories = frozenset(categories)
+        self._categories = frozenset([categories] if isinstance(categories, str) else categories)
         bad: dict[str, DataError] = {}
         self._frames = list(_list_frames(folder, bad))
         if not self._frames and not bad:

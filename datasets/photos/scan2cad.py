@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, is_whole
 from cadalign.datasets.models.categories import name_of_synset
 from cadalign.datasets.models.shapenet import MESH_FILES
 from cadalign.datasets.photos.dataset import (
@@ -127,6 +127,8 @@ class Scan2CAD(PhotoDataset):
     ------
     DataError
         If there are no annotations, they cannot be read, or there is no frame of any scan.
+    InputError
+        If ``every`` is no positive whole number.
     """
 
     kind = "Scan2CAD"
@@ -145,6 +147,9 @@ class Scan2CAD(PhotoDataset):
         shapenet: str | os.PathLike[str] | None = None,
         every: int = 1,
     ) -> None:
+        if not (is_whole(every) and every > 0):
+            fix = "give 1, 2, 3 ..."
+            raise InputError(f"{every!r} is not a number of frames", where="every", fix=fix)
         folder, self.annotations = _annotation_file(as_path(root, "root"))
         self._entries = read_list(self.annotations)
         frames = [folder / name for name in _FRAME_FOLDERS]

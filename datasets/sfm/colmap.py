@@ -77,7 +77,7 @@ class Colmap(CorrespondenceSet):
     DataError
         If files are missing, cut short or malformed, or a name or number occurs twice. Asking for
         an image raises it if the image observes points that don't exist, or its camera's model is
-        none of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV.
+        none that `cadalign.Camera.from_dict` reads.
 
     Examples
     --------
@@ -144,13 +144,17 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
     """Write a model without points as text, whose cameras other programs read.
 
     Cameras that are equal are written once. Refused are poses with a scale, and names that are
-    missing, hold a line break or occur twice.
+    missing, occur twice, or hold white space, where other programs end them.
     """
     if not views:
         raise InputError("give at least one view", where="views")
     names = [view.name for view in views]
-    if len(set(names)) < len(names) or any(not n or "\n" in n or n != n.strip() for n in names):
+    if len(set(names)) < len(names) or not all(names):
         raise InputError("every view needs an image name of its own", where="views")
+    for number, name in enumerate(names):
+        if name.split() != [name]:
+            what = f"COLMAP's text files end the name {quote(name)} at its white space"
+            raise InputError(what, where=f"views[{number}]", fix="rename the photo")
     numbers: dict[Camera, int] = {}
     images, cameras = [], []
     for number, view in enumerate(views, start=1):

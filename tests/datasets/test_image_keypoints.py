@@ -75,6 +75,16 @@ def test_coco_annotations_have_names_flags_and_images(tmp_path: Path) -> None:
     assert (second.image, second.size) == ("cats/b.jpg", (320, 240))
 
 
+@pytest.mark.parametrize("name", ["images", "categories"])
+def test_an_id_of_two_images_or_categories_is_refused(tmp_path: Path, name: str) -> None:
+    same = ANNOTATIONS[name][0]
+    assert len(read(tmp_path, {**ANNOTATIONS, name: [*ANNOTATIONS[name], same]})) == 2
+    other = {**same, "file_name": "dogs/a.jpg", "keypoints": ["tail"]}
+    row = len(ANNOTATIONS[name])
+    with pytest.raises(DataError, match=rf"{name}\[{row}\].id: .* is the id of another entry, too"):
+        read(tmp_path, {**ANNOTATIONS, name: [*ANNOTATIONS[name], other]})
+
+
 def flat(scores: list[float]) -> list[float]:
     return [n for point, score in zip(POINTS, scores, strict=True) for n in (*point, score)]
 

@@ -51,6 +51,13 @@ def test_problems_are_counted_once_and_few_are_logged(tmp_path, caplog):
     assert "counted only" in caplog.records[-1].message
 
 
+def test_files_may_begin_with_a_byte_order_mark(tmp_path):
+    write_bop(tmp_path)
+    for path in tmp_path.rglob("*.json"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(list(cadalign.datasets.open(tmp_path))) == 2
+
+
 def test_what_is_missing_is_told(tmp_path):
     found = PhotoObject("3", "chair")
     with pytest.raises(DataError, match="object 3: this object has no mask"):

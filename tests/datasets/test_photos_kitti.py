@@ -71,7 +71,8 @@ def test_labels_of_the_object_benchmark(tmp_path):
     matrix = np.array(P2.split()[1:], dtype=float).reshape(3, 4)
     u, v, w = matrix @ [2.0, 0.95, 20.0, 1.0]
     np.testing.assert_allclose(photo.camera.project([car.truth.box.center]), [[u / w, v / w]])
-    assert len(KittiCars(tmp_path, categories=("Van",))[0].objects) == 1
+    for one in (("Van",), "Van"):
+        assert len(KittiCars(tmp_path, categories=one)[0].objects) == 1
 
 
 def test_labels_of_the_tracking_benchmark(tmp_path):

@@ -19,7 +19,7 @@ from support.photo_data import (
 
 import cadalign.datasets
 from cadalign.datasets import Scan2CAD
-from cadalign.errors import DataError
+from cadalign.errors import DataError, InputError
 
 
 @pytest.fixture
@@ -76,6 +76,13 @@ def test_symmetries_turn_about_y_through_the_centre(tmp_path, name, motions, axe
     for motion in symmetry.poses(max_step=1.0):
         np.testing.assert_allclose(motion @ [*center, 1], [*center, 1], atol=1e-12)
         np.testing.assert_allclose(motion[:3, 1], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("every", [0, -1, 1.5])
+def test_a_step_that_is_no_number_of_frames_is_refused(root, every):
+    assert len(Scan2CAD(root, every=2)) == 1
+    with pytest.raises(InputError, match=f"every: {every} is not a number of frames"):
+        Scan2CAD(root, every=every)
 
 
 def test_objects_out_of_view_are_left_out(root):

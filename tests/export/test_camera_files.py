@@ -130,6 +130,11 @@ def test_colmap_writes_equal_cameras_once(tmp_path):
     assert len((tmp_path / "cameras.txt").read_text().splitlines()) == 1
 
 
+def test_names_that_other_programs_would_cut_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"views\[1\]: .* end the name 'b c.jpg' at"):
+        write_colmap(tmp_path, [_view(PLAIN, "a.jpg", 0), _view(PLAIN, "b c.jpg", 40)])
+
+
 def test_real_colmap_model_is_read(tmp_path):
     data = os.environ.get("CADALIGN_DATA")
     if not data:

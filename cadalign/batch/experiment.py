@@ -22,6 +22,7 @@ from cadalign.datasets.detections.image_keypoints import (
 )
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.evaluation.options import absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import FAILED, Columns, Plan, Row, Rows
 from cadalign.geometry.camera import Camera
@@ -101,7 +102,7 @@ class ManyEstimates:
             seen = self._detected(task.content, folder)
         else:
             if task.content is None:
-                data = parse_json(read_text(Path(task.name)), task.name)
+                data = parse_json(read_text(folder / Path(task.name).name), task.name)
             else:
                 data = _parsed(task.content, task.name)
             seen = self.options.read(data, task.name, folder=folder)
@@ -152,7 +153,8 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
     }
     drawn_in = folder.made_for_pictures() if options.pictures else None
     chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
-    return Plan(ManyEstimates(options, model, drawn_in), tasks, config, chunk)
+    estimates = ManyEstimates(absolute_paths(options), model, drawn_in)
+    return Plan(estimates, tasks, config, chunk)
 
 
 def _model_keypoints(options: ManyOptions) -> ModelKeypoints:

@@ -28,6 +28,7 @@ from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.result import Result
 from cadalign.estimation.results import Results
+from cadalign.evaluation.options import absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Chunk, Workers
 from cadalign.evaluation.runs.run import OnProgress, execute, workers_of
@@ -158,7 +159,7 @@ def stream_fits(
     >>> for number, found in stream_fits(camera_feed(), similar=True):  # doctest: +SKIP
     ...     print(number, found.alignment.translation)
     """
-    experiment = ManyEstimates(options_of(options))
+    experiment = ManyEstimates(absolute_paths(options_of(options)))
     pool = workers_of(workers, dask)
     size = 1 if not workers and dask is None else _STREAMED
     for _, rows in pool(experiment, _chunks(observations, size)):

@@ -46,6 +46,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.options import absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import OnProgress, execute
 from cadalign.evaluation.runs.tables import DONE_ANEW, read_groups
@@ -151,7 +152,7 @@ def build_library(
 
 def _task(dataset: KeypointNet, key: tuple[str, str]) -> ModelTask:
     try:
-        return ModelTask(*key, dataset[key])
+        return ModelTask(*key, absolute_paths(dataset[key]))
     except DataError as error:
         return ModelTask(*key, None, str(error))
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from cadalign.errors import InputError, unknown
 from cadalign.evaluation.methods.registry import register_method
 from cadalign.evaluation.metrics.registry import refuse_taken, register_metric
-from cadalign.evaluation.options import ExperimentOptions, tuples
+from cadalign.evaluation.options import ExperimentOptions, absolute_paths, tuples
 from cadalign.evaluation.portable import names_of
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
@@ -165,6 +165,8 @@ def prepared(
     options: ExperimentOptions, folder: RunFolder, *, workers: int | None, dask: str | None
 ) -> tuple[Plan[Any], Workers]:
     """The plan and the workers of `run`."""
+    if dask is not None:
+        options, folder = absolute_paths(options), absolute_paths(folder)
     count = options.default_workers if workers is None else workers
     pool = workers_of(count, dask, threads=options.threads)
     spec = spec_named(options.experiment)

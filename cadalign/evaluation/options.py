@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from dataclasses import KW_ONLY, asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeVar, cast
 
 import tyro
 
 from cadalign.errors import InputError, unknown
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,6 +235,20 @@ class PluginOption:
     """Functions to run beside the methods, module:function or name=module:function; the module may
     be a file, such as mine.py:solve. They take points_3d, points_2d and a camera, or a model and
     its views, and return an alignment. A module alone registers its methods itself."""
+
+
+def absolute_paths(value: T) -> T:
+    """The value with the paths in it absolute, for workers that were started elsewhere."""
+    found: Any = value
+    if isinstance(value, Path):
+        found = value.absolute()
+    elif isinstance(value, tuple) and not hasattr(value, "_fields"):
+        found = tuple(absolute_paths(each) for each in value)
+    elif is_dataclass(value) and not isinstance(value, type):
+        found = copy(value)
+        for each in fields(value):
+            object.__setattr__(found, each.name, absolute_paths(getattr(value, each.name)))
+    return cast(T, found)
 
 
 def tuples(options: dict[str, Any]) -> dict[str, Any]:

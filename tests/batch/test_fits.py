@@ -20,10 +20,12 @@ import pytest
 
 import cadalign
 from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
+from cadalign.batch.experiment import plan_run
 from cadalign.batch.fits import options_of, run_many
 from cadalign.batch.options import FitRunOptions
 from cadalign.batch.table import COLUMNS
 from cadalign.errors import DataError, InputError
+from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
@@ -179,6 +181,26 @@ def test_a_dask_worker_killed_in_between_loses_nothing(tmp_path: Path) -> None:
     assert killed
     for name in ("results.parquet", "records.parquet"):
         assert (tmp_path / "hit" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+
+
+def test_workers_may_have_been_started_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (seen,) = observations(1)
+    Path("given").mkdir()
+    seen.save("given/one.json")
+    options = FitRunOptions(
+        inputs=(Path("given"),), estimate=ObservationFit(shape=Path("chair.shape"))
+    )
+    monkeypatch.setattr(FitRunOptions, "contents", lambda self: {})
+    plan = plan_run(options, RunFolder(Path("run")))
+    tasks = plan.tasks[:1]
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    (row,) = plan.experiment.evaluate(tasks).rows
+    assert row["reason"].startswith(f"{tmp_path / 'chair.shape'}: ")
+    assert row["source"] == "given/one.json"
 
 
 def test_bad_observations_are_rows_and_stop_nothing(tmp_path: Path) -> None:

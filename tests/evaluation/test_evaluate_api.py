@@ -7,14 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.photo_sets import write_pix3d
 
 import cadalign
 from cadalign import Mesh
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
+from cadalign.evaluation.api import prepared
 from cadalign.evaluation.instances.instance import make_instance
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.registry import known_options, spec_named
+from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.render import Scene
 
 
@@ -48,6 +51,33 @@ def test_retrieval(sample_root: Path) -> None:
     assert set(table.protocol) == {"leave-in", "leave-out"}
     assert (table[table.protocol == "leave-in"]["rank"] == 1).all()
     assert (table.seconds[table.status == "ok"] > 0).all()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("experiment", "options"),
+    [
+        ("keypointnet", {"methods": ("optimal",), "visibility": "rays"}),
+        ("unseen", {"methods": ("shape",), "meshes": True}),
+        ("photos", {"methods": ("rigid",)}),
+    ],
+)
+def test_workers_of_a_cluster_may_have_been_started_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, experiment: str, options: dict[str, Any]
+) -> None:
+    if experiment == "photos":
+        write_pix3d(tmp_path / "data", photos=2)
+    else:
+        cadalign.datasets.write_sample_dataset(tmp_path / "data", per_category=12)
+        options |= {"categories": ("car",), "max_models": 1}
+    monkeypatch.chdir(tmp_path)
+    chosen = spec_named(experiment).options(Path("data"), **options)
+    plan, _ = prepared(chosen, RunFolder(Path("run")), workers=None, dask="tcp://nowhere:8786")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    rows = plan.experiment.evaluate(plan.tasks[:1]).rows
+    assert [row["status"] for row in rows] == ["ok"]
+    assert plan.config["root"] == str(tmp_path / "data")
 
 
 @pytest.mark.long

@@ -21,7 +21,7 @@ from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.documents import Document, in_file, read_document
-from cadalign.io.files import printable, read_bytes, reading, write_json
+from cadalign.io.files import listed, printable, read_bytes, reading, write_json
 from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
 
 Pixel = tuple[float, float]
@@ -97,7 +97,7 @@ def find_photos(path: Path) -> list[Path]:
     """List the photos of a folder by name, numbers in order, or the given photo."""
     with reading(path):
         in_folder, exists = path.is_dir(), path.exists()
-        entries = list(path.iterdir()) if in_folder else []
+        entries = listed(path) if in_folder else []
     if in_folder:
         photos = [p for p in entries if p.suffix.lower() in PHOTO_ENDINGS and p.is_file()]
         stems = {p.stem for p in photos}

@@ -24,7 +24,7 @@ from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 from cadalign.evaluation.runs.work import fingerprint, fingerprint_of_files
 from cadalign.io.documents import read_json
-from cadalign.io.files import open_input, read_bytes
+from cadalign.io.files import listed, open_input, read_bytes
 from cadalign.io.observation import (
     DETECTOR,
     LINES,
@@ -199,7 +199,7 @@ def _sources_of(path: Path) -> list[Source]:
 
 def _of_folder(folder: Path) -> list[Source]:
     """The observations of a folder, whose other JSON files are passed over."""
-    files = [path for path in sorted(folder.iterdir()) if path.is_file()]
+    files = [path for path in listed(folder) if path.is_file()]
     lines: list[Source] = [Lines(path) for path in files if path.suffix.lower() in LINES]
     single = [path for path in files if path.suffix.lower() == ".json"]
     found = [path for path in single if _kind_of_file(path) in (OBSERVATION, _DAMAGED)]

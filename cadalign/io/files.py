@@ -120,6 +120,15 @@ def as_path(given: object, where: str = "path") -> Path:
     return Path(text)
 
 
+def listed(folder: Path, pattern: str | None = None) -> list[Path]:
+    """The entries of a folder, or those that match a pattern, sorted, without hidden ones.
+
+    Archives made on a Mac have a hidden file ``._a.mat`` beside each ``a.mat``, which is none.
+    """
+    entries = folder.iterdir() if pattern is None else folder.glob(pattern)
+    return sorted(path for path in entries if path.name[0] != ".")
+
+
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
     """Convert errors of the file system, and of text that is not UTF-8, to `DataError`."""

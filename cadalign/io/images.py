@@ -18,7 +18,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray
 from cadalign.errors import DataError, brief
 from cadalign.geometry.camera import Camera
-from cadalign.io.files import as_path, open_input, reading, write_whole
+from cadalign.io.files import as_path, listed, open_input, reading, write_whole
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -255,7 +255,7 @@ def frame_numbers(images: Iterable[str]) -> dict[str, int]:
 
 def _photos(folder: Path) -> list[Path]:
     with reading(folder):
-        found = sorted(each for each in folder.iterdir() if each.suffix.lower() in PHOTO_ENDINGS)
+        found = [each for each in listed(folder) if each.suffix.lower() in PHOTO_ENDINGS]
     if not found:
         raise DataError("there is no photo in it", where=str(folder), fix="give PNG or JPEG files")
     return found

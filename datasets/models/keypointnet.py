@@ -30,7 +30,7 @@ from cadalign.datasets.models.shapenet import MeshLocator
 from cadalign.errors import DataError, InputError, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.io.files import as_path, read_text
+from cadalign.io.files import as_path, listed, read_text
 from cadalign.io.meshes.files import load_mesh
 
 logger = logging.getLogger("cadalign")
@@ -164,7 +164,7 @@ class KeypointNet:
         self._allowed: frozenset[ModelKey] | None = None
         self._with_mesh = False
         folder = self.root / "annotations"
-        self._files = {path.stem: path for path in folder.glob("*.json") if path.stem != _ALL}
+        self._files = {path.stem: path for path in listed(folder, "*.json") if path.stem != _ALL}
         self._loaded = {} if self._files else self._load_all(folder)
         self.categories = tuple(sorted({*self._files, *self._loaded}))
         """The categories' names, sorted."""
@@ -172,7 +172,7 @@ class KeypointNet:
     @property
     def splits(self) -> tuple[str, ...]:
         """The names of the splits there are, sorted."""
-        return tuple(sorted(path.stem for path in (self.root / "splits").glob("*.txt")))
+        return tuple(path.stem for path in listed(self.root / "splits", "*.txt"))
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -35,7 +35,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
-from cadalign.io.files import as_path, damaged, read_text
+from cadalign.io.files import as_path, damaged, listed, read_text
 from cadalign.io.images import photo_size
 
 _OBJECT, _TRACKING = ("label_2", "image_2"), ("label_02", "image_02")
@@ -165,7 +165,7 @@ def _list_frames(
             with leaving_out(str(root / name), problems):
                 yield from list_them(root / name, problems)
     for (labels, images), place in product(_LAYOUTS, (root, root / "training")):
-        for path in sorted((place / labels).glob("*.txt")):
+        for path in listed(place / labels, "*.txt"):
             image, calibration = place / images, place / "calib" / path.name
             if labels == _OBJECT[0]:
                 yield _LabelFrame(path.stem, path, image / f"{path.stem}.png", calibration)

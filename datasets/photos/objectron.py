@@ -39,7 +39,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import convert
-from cadalign.io.files import as_path, open_input, write_json
+from cadalign.io.files import as_path, listed, open_input, write_json
 from cadalign.io.images import ByteImage
 
 ANNOTATIONS = "annotations"
@@ -169,7 +169,7 @@ class Objectron(PhotoDataset):
 
 def list_annotations(folder: Path) -> list[Path]:
     """List the annotation files: ``.pbdata``, and ``.json`` in ``annotations``; four levels."""
-    found = (path for pattern in _PATTERNS for path in folder.glob(pattern))
+    found = (path for pattern in _PATTERNS for path in listed(folder, pattern))
     return sorted(path for path in found if path.name != _GEOMETRY)
 
 

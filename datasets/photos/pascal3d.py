@@ -40,7 +40,7 @@ from cadalign.io.documents import (
     in_file,
     read_document,
 )
-from cadalign.io.files import as_path
+from cadalign.io.files import as_path, listed
 from cadalign.io.images import photo_size
 
 ANNOTATIONS = "Annotations"
@@ -85,8 +85,8 @@ class Pascal3D(PhotoDataset):
         # Annotation files, and the category whose objects each annotates; None for all.
         place = folder / ANNOTATIONS
         self._records: list[tuple[Path, str | None]] = [
-            *((path, None) for path in sorted(place.glob("*.mat"))),
-            *((p, p.parent.name.rpartition("_")[0] or None) for p in sorted(place.glob("*/*.mat"))),
+            *((path, None) for path in listed(place, "*.mat")),
+            *((p, p.parent.name.rpartition("_")[0] or None) for p in listed(place, "*/*.mat")),
         ]
         if not self._records:
             what = f"there are no {ANNOTATIONS}/*.mat nor {ANNOTATIONS}/*/*.mat"
@@ -123,7 +123,7 @@ def find_image(root: Path, name: str) -> Path | None:
 def cad_model(root: Path, category: str, index: int) -> CadModel | None:
     """The CAD model of a number from 1; None where the category has no file."""
     folders = (root / name for name in _CAD_FOLDERS)
-    folder = next((folder for folder in folders if any(folder.glob("*.mat"))), None)
+    folder = next((folder for folder in folders if listed(folder, "*.mat")), None)
     if folder is None or not existing(folder / f"{category}.mat"):
         return None
     which = folder / f"{category}.mat", category, index
@@ -284,7 +284,7 @@ class Pascal3DDetections(PhotoDataset):
         folder = as_path(root, "root")
         self._records: list[tuple[str, int]] = []  # category and number of the CAD model
         names: list[str] = []
-        for path in sorted((folder / DETECTED).glob("*.mat")):
+        for path in listed(folder / DETECTED, "*.mat"):
             found = read_structs(path, "annot")[0]
             with in_file(path):
                 images, categories = found.texts("imgname"), found.texts("class")
@@ -315,7 +315,7 @@ class Pascal3DDetections(PhotoDataset):
     def _keypoints(self, name: str) -> PhotoKeypoints | None:
         if self._observed is None:
             self._observed = {}
-            for path in sorted((self.root / _OBSERVATIONS).glob("*.json")):
+            for path in listed(self.root / _OBSERVATIONS, "*.json"):
                 try:
                     observation = read_document(path, _Observation)
                     self._observed[Path(observation.image).stem] = observation.keypoints

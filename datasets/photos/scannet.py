@@ -15,7 +15,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import in_file
-from cadalign.io.files import damaged, made_folder, read_text, write_text
+from cadalign.io.files import damaged, listed, made_folder, read_text, write_text
 from cadalign.io.images import photo_size
 
 # The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
@@ -71,7 +71,7 @@ def _in_scene_folder(folder: Path) -> Iterator[ScanNetFrame]:
     intrinsics = first_existing(folder / name for name in _INTRINSICS)
     if intrinsics is None:
         return
-    for image in (folder / "color").glob("*"):
+    for image in listed(folder / "color", "*"):
         if image.suffix.lower() in _IMAGES:
             yield ScanNetFrame(image.stem, image, folder / "pose" / f"{image.stem}.txt", intrinsics)
 

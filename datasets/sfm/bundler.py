@@ -19,7 +19,7 @@ from cadalign.datasets.sfm.correspondences import Correspondences, Correspondenc
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import OPENGL_AXES
-from cadalign.io.files import as_path, damaged, read_text
+from cadalign.io.files import as_path, damaged, listed, read_text
 from cadalign.io.images import open_photo
 
 ImageSize = tuple[int, int]
@@ -124,7 +124,7 @@ def _find_file(path: Path) -> Path:
     if not path.is_dir():
         raise DataError("no such file", where=str(path), fix="give a bundle.out")
     for pattern in PATTERNS:
-        found = sorted(path.glob(pattern))
+        found = listed(path, pattern)
         if len(found) == 1:
             return found[0]
         if found:
@@ -149,7 +149,7 @@ def _find_photos(file: Path, count: int) -> tuple[list[str], list[Path | None]]:
         places = ((listing.parent / n, listing.parent / "images" / Path(n).name) for n in names)
         return names, [next(filter(Path.is_file, place), None) for place in places]
     folder = file.parent / "images"
-    found = sorted(folder.iterdir()) if folder.is_dir() else []
+    found = listed(folder) if folder.is_dir() else []
     found = [path for path in found if path.suffix.lower() in _IMAGE_SUFFIXES]
     if len(found) == count:
         return [path.name for path in found], [*found]

@@ -190,15 +190,16 @@ def test_workers_may_have_been_started_elsewhere(
     (seen,) = observations(1)
     Path("given").mkdir()
     seen.save("given/one.json")
+    Path("given/._one.json").write_bytes(b"Mac OS X")  # of an archive
     options = FitRunOptions(
         inputs=(Path("given"),), estimate=ObservationFit(shape=Path("chair.shape"))
     )
     monkeypatch.setattr(FitRunOptions, "contents", lambda self: {})
     plan = plan_run(options, RunFolder(Path("run")))
-    tasks = plan.tasks[:1]
+    (task,) = plan.tasks[:]
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    (row,) = plan.experiment.evaluate(tasks).rows
+    (row,) = plan.experiment.evaluate([task]).rows
     assert row["reason"].startswith(f"{tmp_path / 'chair.shape'}: ")
     assert row["source"] == "given/one.json"
 

@@ -149,6 +149,14 @@ def test_splits(root):
         dataset.split("test")
 
 
+def test_hidden_files_of_archives_made_on_a_mac_are_passed_over(root):
+    for path in ("annotations/._chair.json", "splits/._train.txt"):
+        (root / path).write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X")
+    dataset = KeypointNet(root)
+    assert (dataset.categories, dataset.splits) == (("chair", "mug"), ("test", "train"))
+    assert len(dataset) == 3
+
+
 def test_subsets_narrow_each_other(root):
     dataset = KeypointNet(root)
     chairs = dataset.subset(categories=["chair"])

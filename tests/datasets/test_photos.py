@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.files import write_json
 from support.photo_data import write_bop, write_photo, write_scan2cad, write_text
+from support.photo_sets import WRITERS
 
 import cadalign
 import cadalign.datasets
@@ -56,6 +57,18 @@ def test_files_may_begin_with_a_byte_order_mark(tmp_path):
     for path in tmp_path.rglob("*.json"):
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert len(list(cadalign.datasets.open(tmp_path))) == 2
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_hidden_files_of_archives_made_on_a_mac_are_passed_over(tmp_path, kind):
+    WRITERS[kind](tmp_path)
+    names = cadalign.datasets.open(tmp_path).names
+    for path in [path for path in tmp_path.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\26\7\0\2\0\0Mac OS X")
+    found = cadalign.datasets.open(tmp_path)
+    assert found.names == names
+    assert len(list(found)) == len(names)
+    assert found.problems == {}
 
 
 def test_what_is_missing_is_told(tmp_path):

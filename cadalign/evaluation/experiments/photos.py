@@ -153,7 +153,7 @@ def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
         *(replace(metrics.RMS, symbol="rms px"), metrics.QUERY_MILLISECONDS),
         *run.metrics,
     )
-    shown = [c for c in columns if not all(np.isnan(each[c.key]) for each in summaries)]
+    shown = [c for c in columns if metrics.told(c, [each.number(c.key) for each in summaries])]
     has_simulated = any(protocols.SIMULATED in each.group for each in summaries)
     more = f"; {protocols.SIMULATED}: keypoints projected with the true pose, with noise"
     return ConsoleTable.of(

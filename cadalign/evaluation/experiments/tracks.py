@@ -124,11 +124,10 @@ _SHOWN = (
 def console_table(run: Run, summaries: Sequence[Summary]) -> ConsoleTable:
     """The summaries for the console, without columns that no video has."""
     columns = (metrics.INSTANCES, metrics.FAILED, *_SHOWN, metrics.QUERY_MILLISECONDS, *run.metrics)
-    numbers = {each.key: [s.number(each.key) for s in summaries] for each in columns}
     return ConsoleTable.of(
         "Medians over the videos, per category and method",
         summaries,
-        [c for c in columns if any(c.shown(number) is not None for number in numbers[c.key])],
+        [c for c in columns if metrics.told(c, [s.number(c.key) for s in summaries])],
         note="a video's rotation and depth error are its frames' median, R90 their 90th percentile",
         narrow=True,
         wraps=True,

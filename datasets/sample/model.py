@@ -7,7 +7,7 @@ tessellation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -247,12 +247,11 @@ def finish(draft: Draft, *, category: str, model_id: str, offset: FloatArray) ->
     scaled = ((whole.vertices - center) / diagonal + offset).astype(np.float32).astype(np.float64)
     faces = whole.faces[_areas(scaled[whole.faces]) > _TINY_AREA]  # rounding flattens some
     mesh = Mesh(scaled, faces, vertex_colors=whole.vertex_colors, source=whole.source)
-    keypoints = []
-    for semantic_id, place in sorted(draft.places.items()):
-        face, weights = closest_barycentric(
-            mesh.triangles, (np.array(place) - center) / diagonal + offset
-        )
-        xyz = weights @ mesh.triangles[face]
+    keypoints, triangles = [], mesh.triangles
+    places = [(np.array(place) - center) / diagonal + offset for place in draft.places.values()]
+    found = dict(zip(draft.places, closest_barycentric(triangles, places), strict=True))
+    for semantic_id, (face, weights) in sorted(found.items()):
+        xyz = weights @ triangles[face]
         vertex = int(np.argmin(np.linalg.norm(mesh.vertices - xyz, axis=1)))
         keypoints.append(SampleKeypoint(semantic_id, xyz, face, weights, vertex))
     kept = draft.mirrored, draft.turned, draft.round
@@ -276,15 +275,18 @@ def split_creases(mesh: Mesh) -> Mesh:
     return replace(mesh, vertices=mesh.vertices[origin], faces=faces, vertex_colors=colors)
 
 
-def closest_barycentric(triangles: FloatArray, point: FloatArray) -> tuple[int, FloatArray]:
-    """The triangle nearest to ``point`` (3,), and its nearest point's barycentric coordinates."""
+def closest_barycentric(
+    triangles: FloatArray, points: Sequence[FloatArray]
+) -> Iterator[tuple[int, FloatArray]]:
+    """The triangle nearest to each point (3,), and its nearest point's barycentric coordinates."""
     functions: Any = trimesh.triangles
     centroid = triangles.mean(axis=1)
     radius = np.linalg.norm(triangles - centroid[:, None], axis=2).max(axis=1)
-    distance = np.linalg.norm(centroid - point, axis=1)
-    near = np.flatnonzero(distance - radius <= distance.min())
-    closest = functions.closest_point(triangles[near], np.broadcast_to(point, (len(near), 3)))
-    best = int(np.argmin(np.linalg.norm(closest - point, axis=1)))
-    face = int(near[best])
-    weights = functions.points_to_barycentric(triangles[[face]], closest[[best]])[0].clip(0)
-    return face, weights / weights.sum()
+    for point in points:
+        distance = np.linalg.norm(centroid - point, axis=1)
+        near = np.flatnonzero(distance - radius <= distance.min())
+        closest = functions.closest_point(triangles[near], np.broadcast_to(point, (len(near), 3)))
+        best = int(np.argmin(np.linalg.norm(closest - point, axis=1)))
+        face = int(near[best])
+        weights = functions.points_to_barycentric(triangles[[face]], closest[[best]])[0].clip(0)
+        yield face, weights / weights.sum()

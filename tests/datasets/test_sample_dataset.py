@@ -308,8 +308,9 @@ def test_keypoints_are_placed_on_the_surface_or_close_to_it(category: str) -> No
         draft = MAKERS[category](np.random.default_rng(index), index)
         triangles = np.concatenate([part.triangles for part in draft.parts])
         size = np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0))
-        for place in map(np.array, draft.places.values()):
-            face, weights = closest_barycentric(triangles, place)
+        places = [np.array(place) for place in draft.places.values()]
+        found = closest_barycentric(triangles, places)
+        for place, (face, weights) in zip(places, found, strict=True):
             assert np.linalg.norm(weights @ triangles[face] - place) < 0.02 * size
 
 
@@ -462,7 +463,7 @@ def test_closest_point_of_a_triangle_beats_all_others() -> None:
     samples = rng.dirichlet((1, 1, 1), size=2000)
     for _ in range(40):
         triangle, point = rng.normal(size=(1, 3, 3)), rng.normal(size=3) * 2
-        _, weights = closest_barycentric(triangle, point)
+        ((_, weights),) = closest_barycentric(triangle, [point])
         assert weights.min() >= 0
         assert weights.sum() == pytest.approx(1.0)
         found = np.linalg.norm(weights @ triangle[0] - point)

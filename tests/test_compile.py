@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from llvmlite import binding
+from support.forked import Program
 
 from cadalign.compile import files
 from cadalign.compile.decorators import kernels_needed
@@ -49,15 +50,17 @@ print(sum(kernels.twice.stats.cache_hits.values()))
 """
 
 
-def use(folder: Path, values: str) -> subprocess.Popen[str]:
-    code = USE.format(folder=str(folder), values=values)
-    pipe = subprocess.PIPE
-    return subprocess.Popen([sys.executable, "-c", code], stdout=pipe, stderr=pipe, text=True)
+# Forked from a process that has compiled code loaded, and knows where it is kept.
+ANEW = "from cadalign.compile import files; files._folder.cache_clear(); "
 
 
-def hits(process: subprocess.Popen[str]) -> int:
-    out, error = process.communicate(timeout=300)
-    assert process.returncode == 0, error
+def use(folder: Path, values: str) -> Program:
+    return Program(ANEW + USE.format(folder=str(folder), values=values))
+
+
+def hits(process: Program) -> int:
+    out, error = process.communicate()
+    assert process.poll() == 0, error
     return int(out)
 
 
@@ -88,7 +91,15 @@ print(sum(one.stats.cache_hits.values()))
 """
 
 
-def call(folder: Path, module: str, value: float, **environment: str) -> int:
+def call(folder: Path, module: str, value: float, cache: Path) -> int:
+    """Call a kernel in a process; gives how often code was found on disk."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("NUMBA_CACHE_DIR", str(cache))
+        return hits(Program(ANEW + CALL.format(folder=str(folder), module=module, value=value)))
+
+
+def call_anew(folder: Path, module: str, value: float, **environment: str) -> int:
+    """The same in an interpreter of its own, which reads Numba's settings when it starts."""
     code = CALL.format(folder=str(folder), module=module, value=value)
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -108,16 +119,16 @@ def write(folder: Path, term: str) -> None:
 
 @pytest.mark.long
 def test_code_is_found_by_the_content_of_its_sources(tmp_path: Path) -> None:
-    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    cache = tmp_path / "cache"
     write(tmp_path / "a", "1.0")
-    assert call(tmp_path / "a", "kernels", 2.0, **cache) == 0
-    assert call(tmp_path / "a", "kernels", 2.0, **cache) == 1
+    assert call(tmp_path / "a", "kernels", 2.0, cache) == 0
+    assert call(tmp_path / "a", "kernels", 2.0, cache) == 1
     write(tmp_path / "b", "1.0")  # another checkout of the same
-    assert call(tmp_path / "b", "kernels", 2.0, **cache) == 1
+    assert call(tmp_path / "b", "kernels", 2.0, cache) == 1
     write(tmp_path / "a", "2.0")
-    assert call(tmp_path / "a", "kernels", 3.0, **cache) == 0
+    assert call(tmp_path / "a", "kernels", 3.0, cache) == 0
     write(tmp_path / "a", "1.0")  # back to the older version
-    assert call(tmp_path / "a", "kernels", 2.0, **cache) == 1
+    assert call(tmp_path / "a", "kernels", 2.0, cache) == 1
 
 
 def test_a_hash_changes_with_whatever_is_imported(
@@ -153,7 +164,7 @@ def test_a_hash_changes_with_whatever_is_imported(
 def test_nothing_is_lost_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     write(tmp_path / "a", "1.0")
-    assert call(tmp_path / "a", "kernels", 2.0, NUMBA_CACHE_DIR=str(tmp_path / "file")) == 0
+    assert call(tmp_path / "a", "kernels", 2.0, tmp_path / "file") == 0
 
 
 def emptied(data: bytes) -> bytes:
@@ -172,7 +183,7 @@ def zeroed(data: bytes) -> bytes:
 @pytest.mark.long
 @pytest.mark.parametrize(("damage", "ending"), [(emptied, ".nbi"), (zeroed, ".nbi"), (cut, ".nbc")])
 def test_damaged_code_is_compiled_anew_and_told_in_one_line(
-    tmp_path: Path, damage: Callable[[bytes], bytes], ending: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[bytes], bytes], ending: str
 ) -> None:
     (tmp_path / "a").mkdir()
     source = SOURCES.format(imports="", term="1.0")
@@ -182,24 +193,21 @@ def test_damaged_code_is_compiled_anew_and_told_in_one_line(
         + source.replace("x + 1.0", "inner(x)").split("import kernel")[1]
     )
     cache = tmp_path / "cache"
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(cache))
     code = CALL.format(folder=str(tmp_path / "a"), module="kernels", value=2.0)
 
-    def run() -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-c", code]
-        return subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    def run() -> tuple[str, list[str]]:
+        out, err = Program(ANEW + code).communicate()
+        return out, err.splitlines()
 
-    assert (run().stdout, run().stdout) == ("0\n", "1\n")
+    assert (run(), run()) == (("0\n", []), ("1\n", []))
     files = sorted(cache.glob(f"*{ending}"))
     assert len(files) == 2
     for path in files:
         path.write_bytes(damage(path.read_bytes()))
-    again = run()
-    assert again.stdout == "0\n"
     told = f"{cache}: some of the compiled code is damaged; it is compiled anew"
-    assert again.stderr.splitlines() == [told]
-    after = run()
-    assert (after.stdout, after.stderr) == ("1\n", "")
+    assert run() == ("0\n", [told])
+    assert run() == ("1\n", [])
 
 
 SHIPPED = """
@@ -210,15 +218,15 @@ files.SHIPPED = pathlib.Path({shipped!r})
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("needs", "hits"), [("fma", 1), ("feature-of-2099", 0)])
+@pytest.mark.parametrize(("needs", "found"), [("fma", 1), ("feature-of-2099", 0)])
 def test_shipped_code_is_used_by_any_processor_that_can(
-    tmp_path: Path, needs: str, hits: int
+    tmp_path: Path, needs: str, found: int
 ) -> None:
     built = {"NUMBA_CACHE_DIR": str(tmp_path / "built"), "NUMBA_CPU_FEATURES": ""}
     name = "x86-64-v3" if platform.machine() in ("x86_64", "AMD64") else "generic"
     write(tmp_path / "a", "1.0")
-    assert call(tmp_path / "a", "kernels", 2.0, **built, NUMBA_CPU_NAME=name) == 0
-    features = [needs] if needs in binding.get_host_cpu_features() or not hits else []
+    assert call_anew(tmp_path / "a", "kernels", 2.0, **built, NUMBA_CPU_NAME=name) == 0
+    features = [needs] if needs in binding.get_host_cpu_features() or not found else []
     target = {
         "triple": binding.get_process_triple(),
         "cpu": name,
@@ -230,9 +238,8 @@ def test_shipped_code_is_used_by_any_processor_that_can(
     source = tmp_path / "b" / "kernels.py"
     top = SHIPPED.format(shipped=str(tmp_path / "built"))
     (tmp_path / "b" / "main.py").write_text(f"{top}from kernels import one\n")
-    empty = {"NUMBA_CACHE_DIR": str(tmp_path / "empty")}
     assert source.is_file()
-    assert call(tmp_path / "b", "main", 2.0, **empty) == hits
+    assert call(tmp_path / "b", "main", 2.0, tmp_path / "empty") == found
 
 
 class Terminal(io.StringIO):

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from support.annotating import Case, place
+from support.forked import MAIN, Program
 from support.refusals import refusal_line, refusal_text
 
 from cadalign.annotate.actions import perform
@@ -27,7 +28,6 @@ from cadalign.io.observation import Observation
 
 pytestmark = pytest.mark.long
 
-PROGRAM = "import sys; from cadalign.cli import main; sys.exit(main())"
 BUSY = f"""
 import cv2
 import numpy as np
@@ -38,7 +38,7 @@ def warm_up(session):
         cv2.GaussianBlur(np.zeros((300, 300, 3), np.uint8), (0, 0), 15)
 
 Session.warm_up = warm_up
-{PROGRAM}
+{MAIN}
 """
 LOCK = "*annotate-lock"
 
@@ -46,7 +46,7 @@ LOCK = "*annotate-lock"
 class Annotator:
     """A process of `cadalign annotate`."""
 
-    def __init__(self, process: subprocess.Popen[str]) -> None:
+    def __init__(self, process: Program | subprocess.Popen[str]) -> None:
         assert process.stdout is not None
         self.process = process
         url = process.stdout.readline().strip()
@@ -65,14 +65,22 @@ class Annotator:
     def end(self, how: signal.Signals = signal.SIGINT) -> tuple[int, str]:
         self.process.send_signal(how)
         _, err = self.process.communicate(timeout=60)
-        return self.process.returncode, err
+        status = self.process.poll()
+        assert status is not None
+        return status, err
 
 
 @contextmanager
-def annotator(case: Case, *arguments: object, program: str = PROGRAM) -> Iterator[Annotator]:
-    command = [sys.executable, "-c", program, "annotate", "--no-open", "--model", str(case.model)]
-    given = [*command, "--camera", str(case.camera), *map(str, arguments)]
-    process = subprocess.Popen(given, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+def annotator(case: Case, *arguments: object, program: str = "") -> Iterator[Annotator]:
+    """An annotator; a ``program`` in place of the command has an interpreter of its own."""
+    given = ["annotate", "--no-open", "--model", case.model, "--camera", case.camera, *arguments]
+    process: Program | subprocess.Popen[str]
+    if program:
+        command = [sys.executable, "-c", program, *map(str, given)]
+        pipe = subprocess.PIPE
+        process = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True)
+    else:
+        process = Program(MAIN, *given)
     try:
         yield Annotator(process)
     finally:

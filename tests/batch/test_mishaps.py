@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from PIL import Image
+from support.forked import MAIN, Program
 
 import cadalign
 from cadalign import Camera, Observation
@@ -32,7 +31,8 @@ from cadalign.io.images import write_image
 CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 POINTS = np.random.default_rng(1).uniform(-1, 1, (8, 3))
 PIXELS = CAMERA.project(POINTS + [0.1, 0.2, 6.0])
-CODE = "import sys; from cadalign.cli import main; sys.exit(main())"
+# The system refuses what exceeds it, as a full disk does.
+LIMITED = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000)); {MAIN}"
 
 
 def lines(path: Path, count: int, **fields: Any) -> Path:
@@ -58,18 +58,10 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(
     run = RunFolder(tmp_path / "run")
     arguments = ["fit", str(source), "--no-picture", "--out", str(run.path), "--workers", "0"]
 
-    def limit() -> None:  # the system refuses what exceeds it, as a full disk does
-        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
-
-    ended = subprocess.run(
-        [sys.executable, "-c", CODE, *arguments, "--method", "aepnp"],
-        preexec_fn=limit,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert ended.returncode == 1
-    (line,) = ended.stderr.splitlines()
+    ended = Program(LIMITED, *arguments, "--method", "aepnp")
+    _, told = ended.communicate()
+    assert ended.poll() == 1
+    (line,) = told.splitlines()
     assert "cannot be written (File too large); make room" in line
     done = len(list(run.parts.glob("???????.parquet")))
     assert done == 64
@@ -92,14 +84,10 @@ def test_a_file_system_without_room_is_one_line(tmp_path: Path) -> None:
         pytest.skip("file systems cannot be mounted here")
     try:
         command = ["fit", str(lines(tmp_path / "o.jsonl", 640)), "--no-picture", "--workers=0"]
-        ended = subprocess.run(
-            [sys.executable, "-c", CODE, *command, f"--out={disk / 'run'}", "--method=aepnp"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert ended.returncode == 1
-        (line,) = ended.stderr.splitlines()
+        ended = Program(MAIN, *command, f"--out={disk / 'run'}", "--method=aepnp")
+        _, told = ended.communicate()
+        assert ended.poll() == 1
+        (line,) = told.splitlines()
         assert "cannot be written (No space left on device); make room" in line
         parts = RunFolder(disk / "run").parts
         assert [path for path in parts.iterdir() if path.name.startswith(".unfinished")] == []

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from support.forked import MAIN, Program
 
 import cadalign
 from cadalign import Camera, Library, Observation, Result, Results
@@ -154,26 +151,25 @@ def test_killed_and_shared_among_workers_it_gives_the_same_bytes(
     case: Case, tmp_path: Path
 ) -> None:
     queries = tmp_path / "q.jsonl"
-    queries.write_text(4 * case.queries.read_text())
+    queries.write_text(3 * case.queries.read_text())
     arguments = ["retrieve", str(queries), *case.arguments[1:], "--no-picture"]
-    code = "import sys; from cadalign.cli import main; sys.exit(main())"
-    calm, hit, two = (RunFolder(tmp_path / name) for name in ("calm", "hit", "two"))
-    for folder, workers in ((calm, "0"), (two, "2")):
+    calm, hit, one = (RunFolder(tmp_path / name) for name in ("calm", "hit", "one"))
+    for folder, workers in ((calm, "0"), (one, "1")):
         assert main([*arguments, "--out", str(folder.path), "--workers", workers]) == 0
     again = [*arguments, "--out", str(hit.path), "--workers"]
-    process = subprocess.Popen([sys.executable, "-c", code, *again, "1"])
+    process = Program(MAIN, *again, "0")
     end = time.monotonic() + 120
     while len(list(hit.parts.glob("???????.parquet"))) < 3 and time.monotonic() < end:
         assert process.poll() is None, "it ended before it was killed"
         time.sleep(0.005)
-    os.kill(process.pid, signal.SIGKILL)
+    process.kill()
     process.wait()
     assert not hit.is_finished
     assert main([*again, "0"]) == 0
     for name in ("results.parquet", "records.parquet", "results.csv", "run.json"):
         expected = (calm.path / name).read_bytes()
         assert (hit.path / name).read_bytes() == expected, name
-        assert (two.path / name).read_bytes() == expected, name
+        assert (one.path / name).read_bytes() == expected, name
 
 
 def test_another_library_is_another_run(

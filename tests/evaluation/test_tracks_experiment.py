@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import signal
-import subprocess
-import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.forked import Program
 from support.refusals import refusal_line
 
 import cadalign
@@ -111,8 +110,7 @@ def test_a_killed_run_goes_on_to_the_same_bytes(root: Path, tmp_path: Path) -> N
     options = TracksOptions(root, frames=12, methods=("smooth", "online"))
     whole, broken = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "broken")
     run(options, whole, workers=0, dask=None)
-    command = [sys.executable, "-c", _KILLED, str(root), str(broken.path)]
-    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    assert Program(_KILLED, root, broken.path).wait() == -signal.SIGKILL
     assert broken.parts.is_dir()
     assert not broken.results.exists()
     run(options, broken, workers=0, dask=None)

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import http.client
 import json
-import multiprocessing
-import os
 import re
 import shutil
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
@@ -24,6 +20,7 @@ from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
 from support.annotating import Case
+from support.forked import MAIN, Program
 
 _LATEST = 2.5  # after the first action that an annotator is killed [s]
 
@@ -89,7 +86,7 @@ def kill_at_random(case: Case, *, rounds: int, seed: int) -> Iterator[Killed]:
                     last = content(annotator.act(action))
                     shadow.act(action)
                     answered, action = answered + 1, None
-            annotator.process.join()
+            annotator.process.wait()
             expected = [last]
             if action is not None:
                 shadow.act(action)
@@ -99,34 +96,18 @@ def kill_at_random(case: Case, *, rounds: int, seed: int) -> Iterator[Killed]:
             yield Killed(answered, action is not None, found, tuple(expected), action)
     finally:
         annotator.kill()
-        annotator.process.join()
-
-
-def _annotate(arguments: list[str], output: Connection) -> None:
-    """Run the command in this process, with its output to the other end of a pipe."""
-    os.dup2(output.fileno(), 1)
-    sys.stdout = os.fdopen(1, "w", buffering=1)
-    from cadalign.cli import main
-
-    main(["annotate", "--no-open", *arguments])
+        annotator.process.wait()
 
 
 class _Annotator:
-    """A process of `cadalign annotate`, forked from one that has compiled code loaded."""
+    """A process of `cadalign annotate`."""
 
     def __init__(self, case: Case) -> None:
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["__main__", "support.warm"])
-        answers, output = context.Pipe(duplex=False)
-        arguments = [str(case.photo), str(case.model), "--camera", str(case.camera)]
-        arguments += ["--keypoints", str(case.keypoints)]
-        self.process = context.Process(target=_annotate, args=(arguments, output), daemon=True)
-        self.process.start()
-        output.close()
-        with os.fdopen(os.dup(answers.fileno())) as lines:
-            found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=(.+)\n", lines.readline())
-        assert found
-        self._answers = answers
+        arguments = [case.photo, case.model, "--camera", case.camera, "--keypoints", case.keypoints]
+        self.process = Program(MAIN, "annotate", "--no-open", *arguments)
+        line = self.process.stdout.readline()
+        found = re.fullmatch(r"http://127\.0\.0\.1:(\d+)/\?token=(.+)\n", line)
+        assert found, line
         self._port, self._token = int(found[1]), found[2]
 
     def act(self, action: dict[str, Any]) -> dict[str, Any]:
@@ -137,7 +118,7 @@ class _Annotator:
         return self._ask("GET", "/state/0", None)
 
     def kill(self) -> None:
-        self.process.kill()  # SIGKILL
+        self.process.kill()
 
     def _ask(self, method: str, path: str, body: str | None) -> dict[str, Any]:
         connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=120)

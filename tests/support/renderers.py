@@ -8,9 +8,14 @@ from cadalign.render import Renderer, make_renderer
 from cadalign.render.probe import probe_renderer
 
 
-def renderer_or_skip(name: str) -> Renderer:
-    """A renderer; the test is skipped where it does not work."""
+def skip_unless_works(name: str) -> None:
+    """Skip the test where a renderer does not work."""
     found = probe_renderer(name)
     if not found.works:
         pytest.skip(f"{name} does not work here: {found.detail}")
+
+
+def renderer_or_skip(name: str) -> Renderer:
+    """A renderer; the test is skipped where it does not work."""
+    skip_unless_works(name)
     return make_renderer(name)

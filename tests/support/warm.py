@@ -1,4 +1,4 @@
-"""Imported by a process that annotators are forked from: all modules and compiled code loaded."""
+"""Imported by a process that others are forked from: modules and compiled code are loaded."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ import numpy as np
 
 import cadalign.annotate.opening
 import cadalign.annotate.server
-import cadalign.cli.annotate  # noqa: F401
+import cadalign.batch.fits
+import cadalign.cli.annotate
+import cadalign.cli.evaluate
+import cadalign.evaluation.instances.views
+import cadalign.evaluation.plots
+import cadalign.evaluation.runs.run  # noqa: F401
 from cadalign.annotate.estimate import warm_up
 from cadalign.evaluation.simulation.problems import simulate_problem
 

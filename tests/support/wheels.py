@@ -78,7 +78,14 @@ class Environment:
         made = cls(folder, home)
         (made.site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
         pip = [sys.executable, "-m", "pip", "--python", str(folder / "bin" / "python")]
-        install = ["install", "--quiet", "--no-index", "--no-deps", "--force-reinstall"]
+        install = [
+            "install",
+            "--quiet",
+            "--no-index",
+            "--no-deps",
+            "--force-reinstall",
+            "--no-compile",
+        ]
         subprocess.run([*pip, *install, str(wheel)], check=True)
         return made
 

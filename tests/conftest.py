@@ -75,10 +75,13 @@ def pytest_collect_directory(path: Path, parent: pytest.Collector) -> pytest.Col
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Let the processes of xdist begin with long modules: in the end none works on one alone."""
+    """Let the processes of xdist begin with long modules: in the end none works on one alone.
+
+    Those of the whole package are the longest, and need few kernels.
+    """
     if hasattr(config, "workerinput"):
         long = {item.path for item in items if item.get_closest_marker("long")}
-        items.sort(key=lambda item: (item.path not in long, item.path))
+        items.sort(key=lambda item: (item.path not in long, len(item.path.parts), item.path))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -28,7 +28,7 @@ from cadalign.render import (
 )
 from cadalign.render.drawing.canvas import composite
 
-root = write_sample_dataset(Path(tempfile.mkdtemp()), per_category=60, categories=("chair", "car"))
+root = write_sample_dataset(Path(tempfile.mkdtemp()), per_category=20, categories=("chair", "car"))
 dataset = KeypointNet(root)
 library = cadalign.Library.from_dataset(dataset)
 print(library)

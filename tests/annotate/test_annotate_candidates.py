@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, expect
 from support.annotating import (
     IDLE,
     Case,
@@ -97,10 +97,14 @@ def similar(original: Similar, tmp_path: Path) -> Similar:
     return replace(original, case=case, keypoints=case.folder / original.keypoints.name)
 
 
-def true_mask(case: Case) -> np.ndarray:
-    scene = case.instance.scene
-    assert scene is not None
-    return np.asarray(cast_geometry(scene, case.instance.camera, case.instance.cam_from_model).mask)
+def masked(similar: Similar) -> Session:
+    """A session with the true mask, of which the search is made once for all tests."""
+    instance = similar.case.instance
+    assert instance.scene is not None
+    mask = cast_geometry(instance.scene, instance.camera, instance.cam_from_model).mask
+    session = similar.open()
+    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+    return session
 
 
 def is_nearest(session: Session, similar: Similar) -> bool:
@@ -115,9 +119,7 @@ def is_nearest(session: Session, similar: Similar) -> bool:
 
 @pytest.mark.long
 def test_clicks_leave_one_of_what_a_mask_allows(similar: Similar) -> None:
-    session = similar.open()
-    runs = list(encode_runs(true_mask(similar.case)))
-    perform(session, 0, {"do": "mask_load", "runs": runs})
+    session = masked(similar)
     page = page_state(session, 0)
     assert page["alignment"]["status"] == "done", page["alignment"]
     first = page["by_mask"]
@@ -151,8 +153,7 @@ def test_clicks_leave_one_of_what_a_mask_allows(similar: Similar) -> None:
 
 @pytest.mark.long
 def test_a_choice_among_those_that_are_left(similar: Similar) -> None:
-    session = similar.open()
-    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(true_mask(similar.case)))})
+    session = masked(similar)
     last = page_state(session, 0)["by_mask"]["candidates"][-1]["number"]
     live, _ = session.live(session.photos[0])
     assert live.candidates is not None
@@ -169,23 +170,11 @@ def test_a_choice_among_those_that_are_left(similar: Similar) -> None:
 
 @pytest.mark.long
 def test_pairs_that_no_candidate_predicts_ask_for_more(similar: Similar) -> None:
-    session = similar.open()
-    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(true_mask(similar.case)))})
+    session = masked(similar)
     perform(session, 0, {"do": "suggested", "uv": [2.0, 2.0]})
     page = page_state(session, 0)["alignment"]
     assert page["status"] == "none"
     assert page["message"].endswith("2 more pairs to the first alignment.")
-
-
-def drag_box(page: Page, case: Case) -> None:
-    rows, columns = np.nonzero(true_mask(case))
-    page.keyboard.press("x")
-    page.mouse.move(*place_of_pixel(page, (columns.min() - 8.0, rows.min() - 8.0)))
-    page.mouse.down()
-    page.mouse.move(*place_of_pixel(page, (columns.max() + 8.0, rows.max() + 8.0)), steps=4)
-    page.mouse.up()
-    page.wait_for_timeout(50)
-    wait(page, IDLE)
 
 
 @pytest.mark.long
@@ -193,12 +182,10 @@ def drag_box(page: Page, case: Case) -> None:
 def test_the_page_asks_for_clicks_until_one_is_left(
     browser: Browser, similar: Similar, *, by_keys: bool
 ) -> None:
-    session = similar.open()
+    session = masked(similar)
     with opened_page(browser, session) as page:
-        drag_box(page, similar.case)
         expect(page.get_by_text("The mask allows several alignments")).to_be_visible()
         expect(page.get_by_text("Click in the photo: ")).to_be_visible()
-        page.keyboard.press("Escape")  # from the box to points
         count = page.evaluate("annotator.state.by_mask.candidates.length")
         assert page.locator(".candidates svg").count() == count
         for clicks in range(1, 4):

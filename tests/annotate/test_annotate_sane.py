@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.annotating import aligned_once, place
 
 from cadalign import Alignment, Box, Camera
-from cadalign.annotate.actions import perform
 from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
@@ -24,7 +24,6 @@ from cadalign.evaluation.instances.instance import load_scene, make_instance
 from cadalign.geometry.metrics import box_iou
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
-from cadalign.render import RaycastRenderer
 
 MOUSE = 2.0  # standard deviation of a click [px]
 RENDERED = 17
@@ -59,7 +58,7 @@ def natural_order(points: FloatArray) -> list[int]:
 
 
 def rendered(root: Path, folder: Path) -> Iterator[Scripted]:
-    """ShapeNet models in random views, photographed as they are, given stretched by 0.5 to 2."""
+    """ShapeNet models in random views, given stretched by 0.5 to 2, with photos that are grey."""
     number = 0
     for model in KeypointNet(root):
         if model.mesh_path is None or model.mesh_path.suffix != ".obj":
@@ -76,8 +75,8 @@ def rendered(root: Path, folder: Path) -> Iterator[Scripted]:
                 return
             own = folder / f"{number}"
             own.mkdir()
-            frame = RaycastRenderer().render(scene, instance.camera, instance.cam_from_model)
-            write_image(own / "photo.png", frame.composite())
+            size = instance.camera.height, instance.camera.width, 3
+            write_image(own / "photo.png", np.full(size, 200, np.uint8))
             stretch = 1 / instance.gt.scale
             write_mesh(own / "model.ply", scene.mesh.vertices * stretch, scene.mesh.faces)
             rng = np.random.default_rng([view, number])
@@ -178,16 +177,14 @@ def test_twenty_annotations_are_sane_from_the_fourth_pair(
 ) -> None:
     assert len(scripted) == 20
     errors: dict[int, list[float]] = {4: [], 6: [], 8: []}
-    overlapping = 0
-    beyond = []
+    overlapping, beyond = 0, []
     for case in scripted:
         session = opened(case, calibrated=True)
         state = session.photos[0]
-        for count, (u, v) in enumerate(case.points_2d.tolist(), start=1):
-            perform(session, 0, {"do": "place_uv", "uv": [u, v]})
-            perform(session, 0, {"do": "place_keypoint", "keypoint": count - 1})
-            if count < 4:
-                continue
+        for count in sorted({*range(4, min(len(case.points_2d), 8) + 1), len(case.points_2d)}):
+            with aligned_once(session):
+                for row in range(len(state.document.pairs), count):
+                    place(session, row, case.points_2d[row].tolist())
             live, _ = session.live(state)
             assert isinstance(live, LiveAlignment)
             assert live.result is not None, (case.name, count, live.message)
@@ -217,9 +214,9 @@ def test_unknown_focal_length_is_saved_with_its_prior(
 ) -> None:
     for case in photographed(real_data / "real" / "kitti_cars", tmp_path):
         session = opened(case, calibrated=False)
-        for keypoint, (u, v) in enumerate(case.points_2d[:7].tolist()):
-            perform(session, 0, {"do": "place_uv", "uv": [u, v]})
-            perform(session, 0, {"do": "place_keypoint", "keypoint": keypoint})
+        with aligned_once(session):
+            for keypoint, uv in enumerate(case.points_2d[:7].tolist()):
+                place(session, keypoint, uv)
         live, _ = session.live(session.photos[0])
         assert isinstance(live, LiveAlignment)
         assert live.result is not None
@@ -234,7 +231,7 @@ def check_fit_agrees(session: Session, case: Scripted, capsys: pytest.CaptureFix
     page = live.result
     assert page is not None
     path = session.photos[0].owner.files.observation
-    assert main(["fit", str(path), "--json", "--out", str(path.parent / "x")]) == 0
+    assert main(["fit", str(path), "--json", "--no-picture"]) == 0
     command = json.loads(capsys.readouterr().out)
     assert page.covariance is not None
     fitted = Alignment.from_dict(command["alignment"])

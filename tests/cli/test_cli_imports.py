@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,27 +27,33 @@ HEAVY = {
 }
 MODULES_OF_A_FIT = 60  # of cadalign
 IN_EVERY_FIT = {"numba", "numpy"}
+OTHERS = (["--similar"], ["--robust"])
 
 
-def modules_of(*arguments: str, code: int = 0) -> set[str]:
-    """The modules that a command imports in a process of its own."""
-    program = (
-        "import json, sys\nfrom cadalign.cli import main\n"
-        "try:\n    code = main(sys.argv[1:])\nexcept SystemExit as stop:\n    code = stop.code\n"
-        "print('\\n' + json.dumps([code, sorted(sys.modules)]))"
-    )
+PROGRAM = """
+import json, sys
+from cadalign.cli import main
+found = []
+for arguments in json.loads(sys.argv[1]):
+    try:
+        code = main(arguments)
+    except SystemExit as stop:
+        code = stop.code
+    found.append([code or 0, sorted(sys.modules)])
+print("\\n" + json.dumps(found))
+"""
+
+
+def modules_after(*commands: Sequence[str]) -> list[tuple[int, set[str]]]:
+    """Exit codes of commands, one after the other in one process, and the modules it has then."""
     done = subprocess.run(
-        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, timeout=600
+        [sys.executable, "-c", PROGRAM, json.dumps(commands)],
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     assert done.returncode == 0, done.stderr
-    found, modules = json.loads(done.stdout.splitlines()[-1])
-    assert (found or 0) == code, done.stderr
-    return set(modules)
-
-
-def imported_by(*arguments: str, code: int = 0) -> set[str]:
-    """Of the heavy packages, those that a command imports in a process of its own."""
-    return HEAVY & modules_of(*arguments, code=code)
+    return [(code, set(modules)) for code, modules in json.loads(done.stdout.splitlines()[-1])]
 
 
 @pytest.fixture(scope="module")
@@ -63,18 +70,21 @@ def observation(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Observation(problem.points_3d, problem.points_2d, camera, image=photo, model=model).save(
         folder / "seen.json"
     )
-    imported_by("fit", str(folder / "seen.json"))  # compiling imports more than reading code does
+    command = ["fit", str(folder / "seen.json")]
+    modules_after(command, *([*command, *each] for each in OTHERS))  # compiling imports more
     return folder / "seen.json"
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["fti"]])
-def test_the_list_of_commands_imports_nothing_heavy(arguments: list[str]) -> None:
-    assert imported_by(*arguments, code=2 if arguments == ["fti"] else 0) == set()
+def test_the_list_of_commands_imports_nothing_heavy() -> None:
+    found = modules_after(["--help"], ["--version"], ["fti"])
+    assert [(code, HEAVY & modules) for code, modules in found] == [(0, set())] * 2 + [(2, set())]
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_help_of_a_command_imports_no_more_than_numpy(command: str) -> None:
-    assert imported_by(command, "--help") <= {"numpy", "rich"}
+def test_help_of_a_command_imports_no_more_than_numpy() -> None:
+    """In one process for all commands: the first that imports more is named."""
+    found = modules_after(*([command, "--help"] for command in sorted(COMMANDS)))
+    for command, (code, modules) in zip(sorted(COMMANDS), found, strict=True):
+        assert (code, HEAVY & modules - {"numpy", "rich"}) == (0, set()), command
 
 
 def test_the_list_of_commands_has_the_first_sentence_of_each() -> None:
@@ -83,24 +93,30 @@ def test_the_list_of_commands_has_the_first_sentence_of_each() -> None:
         assert " ".join(paragraph.split()) == summary
 
 
-def test_a_fit_without_picture_imports_the_solvers_alone(observation: Path) -> None:
-    assert imported_by("fit", str(observation), "--json", "--no-picture") == IN_EVERY_FIT
+@pytest.fixture(scope="module")
+def fits(observation: Path) -> list[set[str]]:
+    """The modules after fits without picture, with one, and with two more options."""
+    fit, more = ["fit", str(observation)], (["--json", "--no-picture"], [], *OTHERS)
+    found = modules_after(*([*fit, *options] for options in more))
+    assert [code for code, _ in found] == [0] * 4
+    return [modules for _, modules in found]
 
 
-def test_following_a_fit_takes_few_modules(observation: Path) -> None:
-    modules = modules_of("fit", str(observation), "--json", "--no-picture")
-    own = {name for name in modules if name.split(".")[0] == "cadalign"}
+def test_a_fit_without_picture_imports_the_solvers_alone(fits: list[set[str]]) -> None:
+    assert HEAVY & fits[0] == IN_EVERY_FIT
+
+
+def test_following_a_fit_takes_few_modules(fits: list[set[str]]) -> None:
+    own = {name for name in fits[0] if name.split(".")[0] == "cadalign"}
     assert len(own) <= MODULES_OF_A_FIT, sorted(own)
 
 
-def test_a_fit_imports_what_draws_its_picture_besides(observation: Path) -> None:
-    found = imported_by("fit", str(observation))
-    assert found - {"embreex"} == {*IN_EVERY_FIT, "PIL", "cv2"}
+def test_a_fit_imports_what_draws_its_picture_besides(fits: list[set[str]]) -> None:
+    assert HEAVY & fits[1] - {"embreex"} == {*IN_EVERY_FIT, "PIL", "cv2"}
 
 
-@pytest.mark.parametrize("flag", ["--similar", "--robust"])
-def test_other_fits_import_no_mesh_library(observation: Path, flag: str) -> None:
-    assert "trimesh" not in imported_by("fit", str(observation), flag)
+def test_other_fits_import_no_mesh_library(fits: list[set[str]]) -> None:
+    assert ["trimesh" in modules for modules in fits[2:]] == [False, False]
 
 
 # --- times -----------------------------------------------------------------------------------

@@ -131,14 +131,15 @@ def test_damaged_files_are_told(tmp_path):
 
 
 @pytest.mark.long
-def test_ten_thousand_photos_take_little_time(tmp_path):
-    write_bop(tmp_path, photos=10_000, images=False)
+def test_thousands_of_photos_take_little_time(tmp_path):
+    """Were it the square of their number that time grows with, ten thousand would take 60 s."""
+    write_bop(tmp_path, photos=4000, images=False)
     camera = {"fx": 500, "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480}
     write_json(tmp_path / "camera.json", camera)
     begin = time.process_time()
     summary = Bop(tmp_path).summary()
-    assert time.process_time() - begin < 60
-    assert (summary.photos, summary.objects, summary.images) == (10_000, 10_000, 0)
+    assert time.process_time() - begin < 60 * 0.4**2
+    assert (summary.photos, summary.objects, summary.images) == (4000, 4000, 0)
 
 
 @pytest.mark.long

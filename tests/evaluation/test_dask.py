@@ -29,7 +29,7 @@ distributed = pytest.importorskip(
 
 pytestmark = pytest.mark.long
 
-KIND = SweepOptions("points", values=(8, 20), runs=600, methods=("optimal", "aepnp-paper", "limit"))
+KIND = SweepOptions("points", values=(8, 20), runs=200, methods=("optimal", "aepnp-paper", "limit"))
 
 
 @pytest.fixture(scope="module")

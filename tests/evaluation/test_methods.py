@@ -243,14 +243,14 @@ def run_bytes(out: Path, **options: Any) -> bytes:
 @pytest.mark.long
 def test_worker_processes_get_functions_of_this_file(tmp_path: Path) -> None:
     alone = run_bytes(tmp_path / "alone")
-    assert run_bytes(tmp_path / "processes", workers=2) == alone
+    assert run_bytes(tmp_path / "processes", workers=1) == alone
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     distributed = pytest.importorskip("distributed", reason="Dask is not installed")
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
     ) as cluster:
         yield cluster
 

@@ -50,9 +50,9 @@ class Row:
         )
 
 
-def simulated_row(points: int, noise_px: float, *, seed: int = 0) -> list[Problem]:
-    rng = np.random.default_rng([seed, points, round(1000 * noise_px)])
-    return [simulate_problem(rng, points=points, noise_px=noise_px) for _ in range(PROBLEMS)]
+def simulated_row(points: int, noise_px: float, *, count: int = PROBLEMS) -> list[Problem]:
+    rng = np.random.default_rng([0, points, round(1000 * noise_px)])
+    return [simulate_problem(rng, points=points, noise_px=noise_px) for _ in range(count)]
 
 
 def linearized(
@@ -159,7 +159,9 @@ def assert_at_the_limit(problems: list[Problem], noise_px: float) -> None:
     [(6, 1.0), (7, 1.0), (10, 1.0), (20, 1.0), (100, 2.0), (1024, 10.0)],
 )
 def test_errors_are_at_the_cramer_rao_bound(points: int, noise_px: float) -> None:
-    assert_at_the_limit(simulated_row(points, noise_px), noise_px)
+    # Where errors are near Gaussian, a quarter of the draws knows their median to 4 %.
+    count = PROBLEMS if points < 1000 else PROBLEMS // 4
+    assert_at_the_limit(simulated_row(points, noise_px, count=count), noise_px)
 
 
 def real_problems(real_data: Path, category: str, count: int) -> Iterator[Problem]:
@@ -185,7 +187,7 @@ def real_problems(real_data: Path, category: str, count: int) -> Iterator[Proble
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("category", ["chair", "airplane", "mug", "bathtub"])
+@pytest.mark.parametrize("category", ["chair", "airplane"])
 def test_errors_on_real_keypoints_are_at_the_cramer_rao_bound(
     real_data: Path, category: str
 ) -> None:
@@ -276,10 +278,10 @@ def test_optimum_is_hardly_ever_missed(points: int, allowed: float) -> None:
 
 @pytest.mark.long
 def test_five_points_give_the_true_mode_first_or_among_the_alternatives() -> None:
-    problems = simulated_row(5, 1.0)
+    problems = simulated_row(5, 1.0, count=PROBLEMS // 2)
     modes = refined_from_truth(Row.of(problems))
     there = np.flatnonzero(are_modes(modes))
-    assert len(there) > 0.98 * PROBLEMS
+    assert len(there) > 0.98 * len(problems)
     named = 0
     for b in there:
         problem = problems[b]
@@ -321,7 +323,7 @@ def test_covariance_is_calibrated() -> None:
 @pytest.mark.long
 def test_covariance_at_the_truth_is_the_cramer_rao_bound() -> None:
     """What `fit` reports for noise-free keypoints is the bound computed here."""
-    problems = simulated_row(12, 0.0)[:200]
+    problems = simulated_row(12, 0.0, count=200)
     bound = bound_covariances(Row.of(problems), 1.0)
     batch = fit_batch(
         [p.points_3d for p in problems], [p.points_2d for p in problems], problems[0].camera
@@ -338,7 +340,7 @@ def test_covariance_at_the_truth_is_the_cramer_rao_bound() -> None:
 @pytest.mark.parametrize("method", ["optimal", "aepnp"])
 @pytest.mark.parametrize(("points", "noise_px"), [(6, 1.0), (7, 5.0), (20, 1.0), (100, 10.0)])
 def test_all_results_are_valid_alignments(method: str, points: int, noise_px: float) -> None:
-    problems = simulated_row(points, noise_px)
+    problems = simulated_row(points, noise_px, count=PROBLEMS // 4)
     batch = fit_batch(
         [p.points_3d for p in problems],
         [p.points_2d for p in problems],
@@ -364,7 +366,7 @@ def test_all_results_are_valid_alignments(method: str, points: int, noise_px: fl
 @pytest.mark.long
 def test_linear_solver_is_several_times_as_accurate_as_the_papers() -> None:
     """The paper's simulation at 1024 points and 2 px."""
-    problems = simulated_row(1024, 2.0)[:1000]
+    problems = simulated_row(1024, 2.0, count=500)
     better = np.median(fit_errors(problems, 2.0, "aepnp")["R"])
     paper = np.median(fit_errors(problems, 2.0, "aepnp-paper")["R"])
     assert better < 1.3

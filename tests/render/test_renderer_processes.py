@@ -9,7 +9,7 @@ import sys
 
 import pytest
 import trimesh
-from support.renderers import renderer_or_skip
+from support.renderers import renderer_or_skip, skip_unless_works
 
 from cadalign import Camera, Mesh
 from cadalign.errors import RenderError
@@ -24,25 +24,25 @@ _POOL_SCRIPT = """
 import json, multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 from cadalign import Camera
-from cadalign.render import Scene, look_at, make_renderer
-from cadalign.render.probe import ball
+from cadalign.render import Scene, look_at
+from cadalign.render.probe import ball, load_renderer
 
 def draw(azimuth):
     camera = Camera.from_fov(160, 120, fov_x=50)
     view = look_at(azimuth=azimuth, elevation=20, distance=5, scale=(1, 0.5, 2))
-    frame = make_renderer("pyrender").render(Scene(ball(3)), camera, view)
+    frame = load_renderer("pyrender", None).render(Scene(ball(3)), camera, view)
     return int(frame.color.astype(int).sum())
 
 if __name__ == "__main__":
     alone = [draw(azimuth) for azimuth in (0, 40, 80, 120)]
-    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         print(json.dumps([alone, list(pool.map(draw, (0, 40, 80, 120)))]))
 """
 
 
 @pytest.mark.long
 def test_a_spawned_pool_draws_with_pyrender_after_the_parent_has(tmp_path):
-    renderer_or_skip("pyrender")
+    skip_unless_works("pyrender")
     script = tmp_path / "pool.py"
     script.write_text(_POOL_SCRIPT)
     done = subprocess.run(
@@ -80,18 +80,18 @@ _MEMORY_SCRIPT = """
 import sys
 import numpy as np
 from cadalign import Camera
-from cadalign.render import Scene, look_at, make_renderer
-from cadalign.render.probe import ball
+from cadalign.render import Scene, look_at
+from cadalign.render.probe import ball, load_renderer
 
 def resident():
     with open("/proc/self/status") as status:
         return next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
 
-renderer = make_renderer(sys.argv[1])
+renderer = load_renderer(sys.argv[1], None)
 camera = Camera.from_fov(160, 120, fov_x=50)
 scenes = [Scene(ball(3)), Scene(ball(4))]
-for number in range(200):
-    if number == 40:
+for number in range(80):
+    if number == 25:
         before = resident()
     view = look_at(azimuth=3.6 * number, elevation=20, distance=6)
     frame = renderer.render(scenes[number // 10 % 2], camera, view)
@@ -103,8 +103,8 @@ print(resident() - before)
 @pytest.mark.long
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs /proc")
 @pytest.mark.parametrize("name", ["raycast", "open3d", "pyrender"])
-def test_memory_stays_flat_over_200_frames(name):
-    renderer_or_skip(name)
+def test_memory_stays_flat_over_many_frames(name):
+    skip_unless_works(name)
     done = subprocess.run(
         [sys.executable, "-c", _MEMORY_SCRIPT, name],
         capture_output=True,
@@ -114,5 +114,5 @@ def test_memory_stays_flat_over_200_frames(name):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     # 50 kB a frame: less than one frame's colours and depths, which would be kept by a leak.
-    assert int(done.stdout.splitlines()[-1]) < 8_000, "kB more than after 40 frames"
+    assert int(done.stdout.splitlines()[-1]) < 2_750, "kB more than after 25 frames"
     assert "GLError" not in done.stderr

@@ -19,7 +19,7 @@ import logging
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, cast
 
 import cv2
@@ -49,6 +49,7 @@ logger = logging.getLogger("cadalign")
 MOST_ALIGNED = 8
 """Models that are aligned with a mask, so that a list of matches is no longer."""
 
+_MOST_MESHES = 32
 _REACH = 24.0  # [px], farther away is no rim
 _SHORTFALL = 0.05
 _GRAB_ROUNDS = 5
@@ -61,6 +62,12 @@ class OutlineStore:
     def __init__(self, table: ModelTable) -> None:
         self._table = table
         self._known: dict[int, Whitened | None] = {}
+        # Silhouettes are known by their mesh: that of a model comes up again in the next mask.
+        self._mesh = lru_cache(_MOST_MESHES)(lambda row: table.model(row).load_mesh())
+
+    def mesh(self, row: int) -> Mesh:
+        """The mesh of a row of the table, the same one as long as few others were asked for."""
+        return self._mesh(row)
 
     def of(self, rows: list[int], workers: int) -> list[Whitened | None]:
         """Outlines of some rows of the table; None where a mesh is missing or cannot be read."""
@@ -118,8 +125,10 @@ def rank_by_mask(
     resembling = [row for _, row in sorted(overlapping)[:MOST_ALIGNED]]
     view = View(camera, mask=inside)
     with ThreadPoolExecutor(worker_count(workers)) as pool:
-        models = [table.model(row) for row in resembling]
-        rough = pool.map(partial(_roughly_aligned, view=view, options=options), models)
+        rough = pool.map(
+            lambda row: _roughly_aligned(table.model(row), outlines.mesh(row), view, options),
+            resembling,
+        )
         aligned = [found for found in rough if found is not None]
         is_any_met = any(each.is_met for each in aligned)
         aligned = list(pool.map(partial(_aligned, view=view, is_any_met=is_any_met), aligned))
@@ -163,9 +172,10 @@ class _Aligned(NamedTuple):
         return len(self.residuals) / self.correlation
 
 
-def _roughly_aligned(model: LibraryModel, view: View, options: RetrievalOptions) -> _Aligned | None:
+def _roughly_aligned(
+    model: LibraryModel, mesh: Mesh, view: View, options: RetrievalOptions
+) -> _Aligned | None:
     """A model aligned with a mask that shows all of it; None if it cannot be."""
-    mesh = model.load_mesh()
     given = Model(mesh=mesh, stretch=options.stretch, stretch_sigma=options.stretch_sigma)
     try:
         found = align_outline(given, view)

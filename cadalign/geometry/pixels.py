@@ -235,14 +235,19 @@ def _undistort_fisheye(
     image: FloatArray, coefficients: tuple[float, ...]
 ) -> tuple[FloatArray, BoolArray]:
     """Undo a fisheye's distortion, from a table of the radial part."""
+    radius = np.hypot(image[:, 0], image[:, 1])
+    theta = np.interp(radius, *_radii(coefficients))
+    start = image * (theta / np.where(radius == 0, 1.0, radius))[:, None]
+    return undistort(image, "fisheye", coefficients, start=start)
+
+
+@lru_cache(maxsize=64)
+def _radii(coefficients: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
+    """Radii in a fisheye's image, and their angles [rad], both (`_TABLE`,)."""
     n1, n2, n3, n4, *_ = _terms("fisheye", coefficients)
     angles = np.linspace(0.0, largest_angle("fisheye", coefficients), _TABLE)
     s = angles * angles
-    factors = 1 + s * (n1 + s * (n2 + s * (n3 + s * n4)))
-    radius = np.hypot(image[:, 0], image[:, 1])
-    theta = np.interp(radius, angles * factors, angles)
-    start = image * (theta / np.where(radius == 0, 1.0, radius))[:, None]
-    return undistort(image, "fisheye", coefficients, start=start)
+    return angles * (1 + s * (n1 + s * (n2 + s * (n3 + s * n4)))), angles
 
 
 def distort(
@@ -279,17 +284,17 @@ def undistort(
 ) -> tuple[FloatArray, BoolArray]:
     """Invert `distort` by Newton's method from ``start`` (n, 2), and say where that succeeded."""
     normalized = distorted.copy() if start is None else start
-    active = np.arange(len(distorted))
-    for _ in range(_NEWTON_STEPS):
+    active, errors = np.arange(len(distorted)), np.empty(len(distorted))
+    for steps in range(_NEWTON_STEPS + 1):
         value, jacobian = distort(normalized[active], kind, coefficients)
         error = value - distorted[active]
+        errors[active] = largest = np.abs(error).max(axis=1, initial=0.0)
         (a, b), (c, d) = jacobian.transpose(1, 2, 0)
         determinant = a * d - b * c
         # Past the fold of the lens model the search would find a point that is not seen.
-        going = (np.abs(error).max(axis=1) >= 1e-14) & (determinant > 0)
-        going &= np.isfinite(determinant)
+        going = (largest >= 1e-14) & (determinant > 0) & np.isfinite(determinant)
         active, error = active[going], error[going]
-        if not len(active):
+        if not len(active) or steps == _NEWTON_STEPS:
             break
         a, b, c, d, determinant = (row[going] for row in (a, b, c, d, determinant))
         x, y = error.T
@@ -297,5 +302,4 @@ def undistort(
         normalized[active] -= step
     lost = ~np.isfinite(normalized).all(axis=1)
     normalized[lost] = distorted[lost]
-    error = np.abs(distort(normalized, kind, coefficients)[0] - distorted).max(axis=1, initial=0.0)
-    return normalized, np.asarray((error < 1e-9) & ~lost)
+    return normalized, np.asarray((errors < 1e-9) & ~lost)

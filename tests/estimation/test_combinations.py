@@ -1,7 +1,9 @@
 """Every combination of model, evidence, focal length, noise and outliers aligns.
 
-All pairs of them are in the quick part, whose results are drawn, too; the long one adds cells until
-every model is aligned with every piece of evidence and focal length, noise and outliers in turns.
+All pairs of them are in the quick part, of whose results some are drawn, so that each choice is;
+the long one adds cells until every model is aligned with every piece of evidence and focal length,
+noise and outliers in turns. A focal length's own prior only takes the place of the usual one: it
+has the pairs alone.
 """
 
 from __future__ import annotations
@@ -40,11 +42,24 @@ LARGEST_LOG_FOCAL = 0.4
 PAIRS = covering(2)
 
 
+def drawn() -> set[Cell]:
+    """Cells that have every value, each the first with one that those before it lack."""
+    values, cells = set[tuple[int, str]](), set[Cell]()
+    for cell in PAIRS:
+        if not values.issuperset(enumerate(cell)):
+            values.update(enumerate(cell))
+            cells.add(cell)
+    return cells
+
+
+DRAWN = drawn()
+
+
 def rarer() -> list[Cell]:
     """Models, evidence and focal lengths of no pair's cell; noise and outliers take turns."""
     turns = list(product(NOISES, OUTLIERS))
     tested = {cell[:3] for cell in PAIRS}
-    frequent = product(MODELS, EVIDENCE, FOCALS)
+    frequent = product(MODELS, EVIDENCE, ("known", "estimate"))
     cells = [Cell(*each, *turns[5 * k % len(turns)]) for k, each in enumerate(frequent)]
     return [cell for cell in cells if cell[:3] not in tested]
 
@@ -56,7 +71,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("cell", PAIRS, ids=str)
 def test_all_pairs(cell: Cell, folder: Path) -> None:
-    assert_drawn(check(cell, folder), folder)
+    result = check(cell, folder)
+    if cell in DRAWN:
+        assert_drawn(result, folder)
 
 
 @pytest.mark.long

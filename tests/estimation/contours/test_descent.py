@@ -73,7 +73,7 @@ def test_exact_masks_end_within_the_stated_uncertainty(real_data: Path, seed: in
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [12, 13, 15])
+@pytest.mark.parametrize("seed", [12, 15])
 def test_keypoints_that_leave_the_distance_open_are_no_bad_start(
     sample_root: Path, seed: int
 ) -> None:
@@ -105,7 +105,7 @@ def test_far_objects_of_open_stretch_end_within_the_stated_uncertainty(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("shift", [0.0, 0.5, -0.5])
+@pytest.mark.parametrize("shift", [0.5, -0.5])
 def test_a_mask_of_the_other_pixel_convention_is_within_the_stated_uncertainty(
     sample_root: Path, shift: float
 ) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import cycle, islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -160,12 +161,12 @@ def test_damaged_masks_still_help(sample_root: Path, kind: str) -> None:
         assert abs(residuals.offset) == pytest.approx(2, abs=0.5)
 
 
-@pytest.mark.parametrize("kind", ["exact", "dilated", "eroded", "smoothed"])
-def test_deviations_are_those_of_the_errors(sample_root: Path, kind: str) -> None:
+@pytest.mark.parametrize("kinds", [["exact"], ["dilated", "eroded"], ["smoothed"]])
+def test_deviations_are_those_of_the_errors(sample_root: Path, kinds: list[str]) -> None:
     dataset = KeypointNet(sample_root)
     whitened = []
     for category in ("chair", "vessel", "car"):
-        for seed in range(4):
+        for seed, kind in enumerate(islice(cycle(kinds), 3)):
             case = case_of(dataset[category][0], seed)
             mask = damaged_mask(case.mask, kind, np.random.default_rng(seed))
             result = align(case.model, case.view(mask=mask))
@@ -205,7 +206,7 @@ class TestOtherObjects:
     def test_neighbours_are_named_at_least_19_times_of_20(self, sample_root: Path) -> None:
         dataset = KeypointNet(sample_root)
         models = [dataset[category][0] for category in ("bottle", "car", "chair", "vessel")]
-        cases = [case_of(model, seed) for seed in range(5) for model in models]
+        cases = [case_of(model, seed) for seed in range(3) for model in models]
         named = []
         for number, case in enumerate(cases):
             columns = np.flatnonzero(case.mask.any(axis=0))
@@ -213,7 +214,8 @@ class TestOtherObjects:
             neighbour = np.roll(cases[(7 * number + 1) % len(cases)].mask, step, axis=1)
             warnings = align(case.model, case.view(mask=neighbour)).warnings
             named.append(any(text.startswith("views[0].mask contradicts") for text in warnings))
-        assert np.mean(named) >= 0.95
+        # If one of 5 were missed, all 12 would be named no more often than 19 of 20.
+        assert all(named)
 
 
 class TestStarts:

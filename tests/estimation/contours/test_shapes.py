@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def test_a_learned_shape_is_better_with_a_mask(
     bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
 ) -> None:
     alone, joint = [], []
-    for number, model in enumerate(bottles[:4]):
+    for number, model in enumerate(bottles[:2]):
         rng = np.random.default_rng(number)
         scene = Scene(model.load_mesh())
         points = model.keypoints.xyz
@@ -140,7 +141,9 @@ class TestLearnedWithoutAnnotatedMask:
         self, bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
     ) -> None:
         shown, mask = self.shown(bottles[1], 1)
-        found = align(shape, View(CAMERA, mask=mask))
+        paths = [path if row < 2 else None for row, path in enumerate(shape.training.mesh_paths)]
+        few = replace(shape, training=replace(shape.training, mesh_paths=tuple(paths)))
+        found = align(few, View(CAMERA, mask=mask))
         poses = [found.alignment, *(each.alignment for each in found.alternatives)]
         axes = np.array([pose.rotation[:, 1] for pose in poses])
         cosines = np.abs(axes @ shown.cam_from_model.rotation[:, 1])

@@ -23,7 +23,7 @@ from cadalign import Model, Size, View, align
 
 pytestmark = pytest.mark.long
 
-SEEDS = 20
+SEEDS = 12
 Case = tuple[list[View], Size | None]
 
 
@@ -105,7 +105,8 @@ def test_the_wrong_piece_is_named(
 ) -> None:
     found = warnings_of(build, range(SEEDS))
     named = [any(text.startswith(f"{name} contradicts") for text in each) for each in found]
-    assert np.mean(named) >= 0.95
+    # If one of 5 were missed, all 12 would be named no more often than 19 of 20.
+    assert all(named)
 
 
 def test_consistent_evidence_is_not_accused() -> None:

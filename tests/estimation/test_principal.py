@@ -152,7 +152,7 @@ def seen_by_cropped(seed: int, views: int, shape_sigma: float) -> tuple[Model, l
 )
 def test_align_finds_it_as_well_as_stated(views: int, shape_sigma: float) -> None:
     inside = []
-    for seed in range(40):
+    for seed in range(25):
         model, seen, camera = seen_by_cropped(seed, views, shape_sigma)
         result = align(model, seen, principal_sigma=SIGMA)
         assert result.principal_std is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -256,6 +257,7 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
     assert str(refusal.value) == message
 
 
+@cache
 def sfm_images(real_data: Path) -> list[Any]:
     from cadalign.datasets import Bundler, Colmap
 

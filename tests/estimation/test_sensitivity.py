@@ -101,11 +101,11 @@ def errors_of_fit(problem: Problem, rng: np.random.Generator, **options: Any) ->
 @pytest.mark.parametrize(
     ("count", "options"),
     [
-        (120, {}),
-        (50, {"loss": "cauchy"}),
-        (50, {"loss": "huber"}),
-        (20, {"focal": "estimate"}),
-        (40, {"stretch": "y", "known_axis": "z", "stretch_sigma": 0.1}),
+        (40, {}),
+        (30, {"loss": "cauchy"}),
+        (30, {"loss": "huber"}),
+        (12, {"focal": "estimate"}),
+        (20, {"stretch": "y", "known_axis": "z", "stretch_sigma": 0.1}),
     ],
     ids=lambda value: str(value),
 )
@@ -254,7 +254,7 @@ def test_derivatives_of_every_estimate(
 ) -> None:
     rng, errors = np.random.default_rng(1), []
     settles = "principal_sigma" in options  # it does to a thousandth of a standard deviation
-    for seed in range(4 if views > 1 else 8):
+    for seed in range(3 if views > 1 else 6):
         pixels = seen_by(camera, views, seed)
         if camera.is_wide or all(camera.contains(each).all() for each in pixels):
             step, view = 0.1 if settles else 0.02, seed % views

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -351,6 +352,7 @@ class TestPictures:
         return View(self.CAMERA, **given), truth
 
     @staticmethod
+    @cache  # silhouettes are known by the mesh
     def mesh() -> Mesh:
         """Two blocks: a seat and a back."""
         blocks = [trimesh.creation.box([1.0, 0.2, 0.6]), trimesh.creation.box([0.3, 0.6, 0.2])]

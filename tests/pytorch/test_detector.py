@@ -54,7 +54,7 @@ def test_training_lowers_loss_and_held_out_errors_by_a_factor(
         return float(np.median(np.linalg.norm(pixels - held_out.points_2d, axis=2)))
 
     before = error()
-    losses = train(detector, known, steps=200, batch=16, rate=3e-3)
+    losses = train(detector, known, steps=120, batch=16, rate=3e-3)
     assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:10])
     assert error() < before / 1.4
     calibrated = detector.calibrated(held_out)
@@ -83,7 +83,7 @@ def test_the_pose_layer_lowers_its_loss_in_training(
         values.append(float(loss.detach().mean()))
         return loss
 
-    train(detector, known, steps=150, batch=12, rate=1e-3, pose_loss=through_the_fit)
+    train(detector, known, steps=110, batch=12, rate=1e-3, pose_loss=through_the_fit)
     assert np.mean(values[-10:]) < 0.5 * np.mean(values[:10])
 
 

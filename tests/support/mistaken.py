@@ -64,7 +64,7 @@ def examples(root: Path, category: str) -> tuple[Example, ...]:
 def learned(root: Path, category: str) -> ShapeModel:
     """The shape of a category, learned from every other model."""
     known = examples(root, category)[::2]
-    return ShapeModel.learn(known[:100], category=category, up_axis="y")
+    return ShapeModel.learn(known[:100], category=category, components=1, up_axis="y")
 
 
 def sighting(

@@ -64,16 +64,23 @@ class SightedKeypoints:
             covariances[own] = np.linalg.inv(from_pixels.swapaxes(1, 2) @ from_pixels)
         return cls(cameras, image, pixels, covariances)
 
-    def seen_in(self, evidence: Evidence, log_ratios: FloatArray) -> Evidence:
+    def seen_in(
+        self, evidence: Evidence, log_ratios: FloatArray, *, only: int | None = None
+    ) -> Evidence:
         """The evidence with these keypoints, from lenses at focal lengths times exp(log ratio).
 
-        The rays remain relative to the cameras' focal lengths.
+        The rays remain relative to the cameras' focal lengths. With ``only`` one of the keypoints
+        in another place, the evidence has the others as they are.
         """
         given = evidence.sightings
         rays, slopes = given.rays.copy(), given.slopes.copy()
         whitening = given.whitening.copy()
         for v, (camera, log_ratio) in enumerate(zip(self.cameras, log_ratios, strict=True)):
             own = np.flatnonzero(self.image == v)
+            if only is not None:
+                own = own[own == only]
+            if not len(own):
+                continue
             ratio, lens = float(np.exp(log_ratio)), _at_focal(camera, log_ratio)
             pixels = np.ascontiguousarray(self.pixels[own])
             there = rays_of(pixels, lens, clips=True)
@@ -264,17 +271,20 @@ class JointOptimum:
         return self._at(row)
 
     def _with_principal(self, axis: FloatArray, change: float) -> _Place:
-        return self._seen(self.keypoints, change * axis)
+        shift = change * axis
+        keypoints = replace(self.keypoints, pixels=self.keypoints.pixels - shift)
+        evidence = keypoints.seen_in(self.evidence, self._log_focals)
+        return _Place(evidence, self.row, keypoints, shift)
 
     def _with_pixel(self, keypoint: int, axis: int, change: float) -> _Place:
         pixels = self.keypoints.pixels.copy()
         pixels[keypoint, axis] += change
-        return self._seen(replace(self.keypoints, pixels=pixels), np.zeros(2))
+        return self._seen_but(keypoint, replace(self.keypoints, pixels=pixels))
 
     def _with_log_sigma(self, keypoint: int, change: float) -> _Place:
         covariances = self.keypoints.covariances.copy()
         covariances[keypoint] *= np.exp(2 * change)
-        return self._seen(replace(self.keypoints, covariances=covariances), np.zeros(2))
+        return self._seen_but(keypoint, replace(self.keypoints, covariances=covariances))
 
     def _with_point(self, point: int, axis: int, change: float) -> _Place:
         shape = self.evidence.shape
@@ -290,8 +300,16 @@ class JointOptimum:
             evidence = self.keypoints.seen_in(evidence, logs)
         return _Place(evidence, row, self.keypoints, np.zeros(2))
 
-    def _seen(self, keypoints: SightedKeypoints, shift: FloatArray) -> _Place:
-        """Other keypoints, with a principal point that is shifted."""
-        logs = log_focals_of(self.evidence, self.state)
-        keypoints = replace(keypoints, pixels=keypoints.pixels - shift)
-        return _Place(keypoints.seen_in(self.evidence, logs), self.row, keypoints, shift)
+    @cached_property
+    def _log_focals(self) -> FloatArray:
+        return log_focals_of(self.evidence, self.state)
+
+    @cached_property
+    def _here(self) -> Evidence:
+        """The evidence with the keypoints as they are."""
+        return self.keypoints.seen_in(self.evidence, self._log_focals)
+
+    def _seen_but(self, keypoint: int, keypoints: SightedKeypoints) -> _Place:
+        """The keypoints with another one in the place of one of them."""
+        evidence = keypoints.seen_in(self._here, self._log_focals, only=keypoint)
+        return _Place(evidence, self.row, keypoints, np.zeros(2))

@@ -76,7 +76,7 @@ class TestExactMasks:
         found = []
         for category in ("bottle", "mug", "chair"):
             models = [each for each in dataset[category] if each.mesh_path is not None]
-            for number, model in enumerate(models):
+            for number, model in enumerate(models[:2]):
                 case = case_of(model, number)
                 alone = align(case.model, case.view()).alignment
                 result = align(case.model, case.view(mask=case.mask))
@@ -226,17 +226,16 @@ class TestStarts:
         assert rotation_error(est=result.alignment, gt=case.truth) < 0.3
         assert stretch_error(case, result.alignment) < 0.01
 
-    @pytest.mark.parametrize("share", [0.0, 0.25])
-    def test_a_mask_alone_without_a_start(self, sample_root: Path, share: float) -> None:
+    def test_a_mask_alone_without_a_start(self, sample_root: Path) -> None:
         case = chair(sample_root)
         columns = np.cumsum(case.mask.sum(axis=0)) / case.mask.sum()
-        mask = case.mask & (columns >= share)  # all that is left of a line is hidden
+        mask = case.mask & (columns >= 0.25)  # all that is left of a line is hidden
         result = align(Model(mesh=case.model.mesh), View(CAMERA, mask=mask))
         poses = [result.alignment, *(each.alignment for each in result.alternatives)]
         errors = [rotation_error(est=pose, gt=case.truth) for pose in poses]
         assert min(errors) < 3.0
         assert stretch_error(case, poses[int(np.argmin(errors))]) < 0.05
-        assert any("partly hidden" in text for text in result.warnings) == (share > 0)
+        assert any("partly hidden" in text for text in result.warnings)
 
     def test_a_mask_and_three_keypoints_with_a_start(self, sample_root: Path) -> None:
         case = chair(sample_root)

@@ -16,7 +16,6 @@ import pytest
 from matplotlib.figure import Figure
 from support.combinations import (
     EVIDENCE,
-    MODELS,
     NOISES,
     OUTLIERS,
     Cell,

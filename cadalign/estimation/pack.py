@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.evidence_kinds import is_told, known_of
 from cadalign.estimation.options import LOSSES, FitOptions
@@ -39,6 +39,8 @@ _LEAST_PIXELS = 3  # of a surface in a window
 _LEAST_OF_PLANE = 6  # pixels of one whose slope is told
 _LOSS_SCALE = 3.0  # a keypoint that something hides has the depth of what hides it
 _PLAIN = FitOptions()
+TABLES = ("sightings", "directions", "offsets", "planes")
+"""Evidence by rows, each with the ``image`` of its view, -1 for what is of none."""
 
 
 def evidence_of(
@@ -86,6 +88,17 @@ def evidence_of(
         offsets,
         _sampled_planes(prior.components[0], rows, views),
         scale_priors(prior, _is_metric(offsets, views, frames)),
+    )
+
+
+def told_by(evidence: Evidence, views: BoolArray) -> Evidence:
+    """The evidence of some views (V,), and what is of none."""
+    tables = {name: getattr(evidence, name) for name in TABLES}
+    return evidence._replace(
+        **{
+            name: kept_rows(rows, (rows.image < 0) | views[rows.image])
+            for name, rows in tables.items()
+        }
     )
 
 

@@ -18,10 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.estimation.pack import told_by
 from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.geometry.rotations import spread_rotations
-from cadalign.solvers.joint.evidence import Evidence, distances_of, kept_rows
+from cadalign.solvers.joint.evidence import Evidence, distances_of
 from cadalign.solvers.joint.search import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
 from cadalign.solvers.marginal.search import after_motion, half_turns
@@ -121,7 +122,8 @@ def _with_rig(evidence: Evidence, per_pose: list[list[_Start]]) -> list[_Start]:
     """Starts whose scales are those of the rig with the most views; the other poses follow."""
     main = int(np.argmax(np.bincount(evidence.rig.pose)))
     starts = []
-    for k, (own, logs) in enumerate(_metric_starts(_of_pose(evidence, main), per_pose[main])):
+    seen = told_by(evidence, evidence.rig.pose == main)
+    for k, (own, logs) in enumerate(_metric_starts(seen, per_pose[main])):
         for rank in range(MOST_PER_VIEW if k == 0 else 1):
             start = []
             for p, found in enumerate(per_pose):
@@ -132,15 +134,6 @@ def _with_rig(evidence: Evidence, per_pose: list[list[_Start]]) -> list[_Start]:
                 start.append(own[0] if p == main else np.concatenate([pose[:9], enlarged]))
             starts.append((np.array(start), logs))
     return starts[:_MOST_STARTS]
-
-
-def _of_pose(evidence: Evidence, pose: int) -> Evidence:
-    chosen = evidence.rig.pose == pose
-    kept = {}
-    for name in ("sightings", "directions", "offsets", "planes"):
-        rows = getattr(evidence, name)
-        kept[name] = kept_rows(rows, (rows.image < 0) | chosen[rows.image])
-    return evidence._replace(**kept)
 
 
 def _sized(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _Start:

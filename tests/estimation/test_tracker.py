@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from cadalign import Camera, Motion, RansacOptions, ShapeModel, Tracker, View, align
+from cadalign import (
+    Alignment,
+    Camera,
+    Model,
+    Motion,
+    RansacOptions,
+    ShapeModel,
+    Tracker,
+    View,
+    align,
+)
 from cadalign.errors import InputError
 from cadalign.estimation.tracks.tracker import TrackUpdate
 from cadalign.evaluation.simulation.tracks import SimulatedTrack, simulate_track, with_mistakes
-from cadalign.geometry.rotations import angle_between
+from cadalign.geometry.rotations import angle_between, rotation_from_vector
 
 pytestmark = pytest.mark.slow
 
@@ -153,7 +164,92 @@ def test_too_few_frames_have_no_pose() -> None:
     assert tracker.points_3d is None
 
 
+POINTS_3D = np.random.default_rng(0).uniform(-0.5, 0.5, (POINTS, 3))
+BOX = Model(points_3d=POINTS_3D, stretch="none")
+CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
+
+
+def moving(k: int) -> Alignment:
+    turn = rotation_from_vector(np.array([0.1, 0.02 * k, 0.05])) @ np.diag([-1.0, -1.0, 1.0])
+    return Alignment(turn, [0.3 + 0.01 * k, 0.2, 6.0], np.ones(3))
+
+
+def seen(k: int, rng: np.random.Generator, noise_px: float = 1.0, **more: Any) -> View:
+    pixels = CAMERA.project(moving(k).apply(POINTS_3D))
+    return View(CAMERA, pixels + noise_px * rng.normal(size=pixels.shape), time=k / 30, **more)
+
+
+@pytest.mark.parametrize("kind", ["up", "camera_height", "depth", "depth image"])
+def test_further_evidence_counts_as_for_the_whole_track(kind: str) -> None:
+    def more(k: int) -> dict[str, Any]:
+        pose = moving(k)
+        up = pose.rotation[:, 1]
+        if kind == "up":
+            return {"up": up, "up_sigma_deg": 0.3}
+        if kind == "camera_height":
+            lowest = pose.apply([[0.0, POINTS_3D[:, 1].min(), 0.0]])[0]
+            return {"up": up, "camera_height": float(-up @ lowest)}
+        depth = pose.apply(POINTS_3D)[:, 2]
+        if kind == "depth":
+            return {"depth": depth, "depth_sigma": 0.005}
+        image = np.zeros((480, 640))
+        for (u, v), z in zip(CAMERA.project(pose.apply(POINTS_3D)), depth, strict=True):
+            image[round(v) - 3 : round(v) + 4, round(u) - 3 : round(u) + 4] = z
+        return {"depth": image}
+
+    rng = np.random.default_rng(1)
+    tracker = Tracker(BOX)
+    for k in range(35):
+        newest = tracker.update(seen(k, rng, **more(k)))
+    whole = tracker.smooth().views[-1]
+    assert newest.pose is not None
+    assert whole.std is not None
+    assert newest.inliers.all()
+    assert angle_between(newest.pose.alignment.rotation, whole.alignment.rotation) < 0.3
+    assert newest.pose.rotation_std_deg == pytest.approx(whole.std.rotation_deg, rel=0.2)
+    off = newest.pose.alignment.translation - whole.alignment.translation
+    assert (np.abs(off) < whole.std.translation).all()
+
+
+def test_noise_that_is_not_given_is_estimated() -> None:
+    rng = np.random.default_rng(1)
+    tracker, told = Tracker(BOX), Tracker(BOX)
+    for k in range(20):
+        view = seen(k, rng, noise_px=6.0, sigma=6.0)
+        known = told.update(view)
+        newest = tracker.update(replace(view, sigma=None))
+    assert known.pose is not None
+    assert newest.pose is not None
+    assert newest.inliers.all()
+    assert newest.pose.rotation_std_deg == pytest.approx(known.pose.rotation_std_deg, rel=0.3)
+
+
+def test_a_view_that_is_refused_leaves_the_track_as_it_was() -> None:
+    rng = np.random.default_rng(1)
+    views = [seen(k, rng) for k in range(12)]
+    whole, tracker = Tracker(BOX), Tracker(BOX)
+    for k, view in enumerate(views):
+        expected = whole.update(view)
+        for change, message in {
+            "ids": r"view.ids: the model has no keypoint 99; the model has 0, 1, 2",
+            "camera": "camera: the focal length is unknown",
+            "cam_from_rig": r"view.cam_from_rig: only some views have a known pose",
+        }.items():
+            wrong = {"ids": [*range(9), 99], "camera": Camera.without_focal(640, 480)}
+            given = wrong | {"cam_from_rig": np.eye(4)}
+            if change != "cam_from_rig" or k > 0:
+                with pytest.raises(InputError, match=message):
+                    tracker.update(replace(view, **{change: given[change]}))
+        newest = tracker.update(view)
+    assert len(tracker.views) == 12
+    assert newest.pose is not None
+    assert expected.pose is not None
+    assert (newest.pose.alignment.rotation == expected.pose.alignment.rotation).all()
+
+
 def test_bad_arguments_are_refused() -> None:
+    with pytest.raises(InputError, match="ransac: expected a cadalign.RansacOptions, got bool"):
+        Tracker(CATEGORY, ransac=True)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="lag: 1 is not a whole number from 3 on"):
         Tracker(CATEGORY, lag=1)
     camera = Camera(640, 480, 600, 600, 319.5, 239.5)

@@ -109,6 +109,8 @@ class Tracker:
     ) -> None:
         if not is_whole(lag) or lag < 3:
             raise InputError(f"{lag!r} is not a whole number from 3 on", where="lag")
+        if ransac is not None:
+            require_kind(ransac, RansacOptions, "ransac")
         self._model, self._motion, self._lag, self._ransac = model, Motion.of(motion), lag, ransac
         self._prior = prior_of(model)
         self._views: list[View] = []
@@ -119,6 +121,7 @@ class Tracker:
         self._contradicting = 0
         self._is_lost = False
         self._errors = SuccessiveErrors()
+        self._noise = 1.0  # of keypoints without a sigma [px], from where the track begins
 
     @property
     def is_lost(self) -> bool:
@@ -148,7 +151,8 @@ class Tracker:
         Raises
         ------
         InputError
-            If it is no `View`, of a wide lens, has no time, or one that is not later than the last.
+            If it is no `View`, of a wide lens, has no time, or one that is not later than the last,
+            or its evidence is none of the model's; the track is then as it was.
         """
         require_kind(view, View, "view")
         if view.time is None:
@@ -162,6 +166,7 @@ class Tracker:
                 what = "a tracker follows keypoints, not outlines"
                 fix = "leave it away, or align the frame from the last pose: align(..., init=)"
                 raise InputError(what, where=f"view.{name}", fix=fix)
+        self._refuse_foreign(view)
         self._views.append(view)
         self._recent.append(view)
         if self._window is None:
@@ -193,6 +198,18 @@ class Tracker:
         self._window = self._shortened(window)
         return self._told(view, inliers, again is not None)
 
+    def _refuse_foreign(self, view: View) -> None:
+        """Refuse a view that does not go with the model or with the views before."""
+        if self._views and (view.cam_from_rig is None) != (self._views[0].cam_from_rig is None):
+            fix = "give it for all views, or for none"
+            raise InputError("only some views have a known pose", where="view.cam_from_rig", fix=fix)
+        try:
+            problem = self._problem([view], [0])
+            problem.evidence(self._prior.components[0], problem.lenses)
+        except InputError as error:
+            where = (error.where or "view").replace("views[0]", "view")
+            raise InputError(error.what, where=where, fix=error.fix) from None
+
     def _begun(self, view: View) -> TrackUpdate:
         """Begin the track where the views so far determine poses."""
         mean = self._prior.components[0].mean
@@ -214,6 +231,7 @@ class Tracker:
             return nothing
         if found.inliers.mean() < _LEAST_SHARE:
             return nothing
+        self._noise = found.problem.noise
         evidence, path = self._with_all_modes(found)
         times = np.array([each.time for each in self._recent], dtype=float)
         window = Window(evidence, times, path, found.motion)
@@ -238,7 +256,9 @@ class Tracker:
 
     def _problem(self, views: Sequence[View], frames: Sequence[int]) -> JointProblem:
         lenses = Lenses.of(views, "known", None)
-        return JointProblem(self._prior, views, None, FitOptions(), lenses, frames=tuple(frames))
+        return JointProblem(
+            self._prior, views, None, FitOptions(), lenses, self._noise, frames=tuple(frames)
+        )
 
     def _with_all_modes(self, found: EstimatedTrack) -> tuple[Evidence, Path]:
         """Evidence and path in modes that suffice for all keypoints."""

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
+from cadalign.estimation.pack import TABLES, told_by
 from cadalign.estimation.tracks.motion import Motion
 from cadalign.solvers.joint.arrow import Arrow, dense_matrix, factorize_arrow, invert_arrow
-from cadalign.solvers.joint.evidence import Evidence, Rig, kept_rows
+from cadalign.solvers.joint.evidence import Evidence, Rig
 from cadalign.solvers.joint.motion import STATE, MotionPrior, moments
 from cadalign.solvers.joint.tracks import (
     NOTHING_KNOWN,
@@ -88,12 +89,8 @@ class Window:
         state = self.path.state
         later = Path(state._replace(poses=state.poses[1:]), self.path.velocities[1:])
         kept = self.evidence.rig.pose > 0
-        some = _of_views(self.evidence, kept[self.evidence.sightings.image], kept)
-        number = np.cumsum(kept) - 1
-        evidence = some._replace(
-            sightings=some.sightings._replace(image=number[some.sightings.image]),
-            rig=some.rig._replace(pose=some.rig.pose - 1),
-        )
+        some = _of_views(self.evidence, kept, kept)
+        evidence = some._replace(rig=some.rig._replace(pose=some.rig.pose - 1))
         return replace(self, evidence=evidence, times=self.times[1:], path=later, anchor=anchor)
 
 
@@ -148,7 +145,7 @@ def begun_again(window: Window, pose: FloatArray, evidence: Evidence) -> Window:
 def _told_by_first(window: Window) -> Anchor:
     """Information of the first frame, and what is known of it, on the second one and the border."""
     evidence, path = window.evidence, window.path
-    first, two = evidence.rig.pose[evidence.sightings.image] == 0, evidence.rig.pose < 2
+    first, two = evidence.rig.pose == 0, evidence.rig.pose < 2
     own = _of_views(evidence, first, two)
     state = path.state._replace(poses=path.state.poses[:2])
     pair = Path(state, path.velocities[:2])
@@ -173,11 +170,16 @@ def _told_by_first(window: Window) -> Anchor:
     )
 
 
-def _of_views(evidence: Evidence, sighted: BoolArray, views: BoolArray) -> Evidence:
-    """The evidence of some sightings (N,) in some of the views (V,), which keep their numbers."""
-    rig, focals = evidence.rig, evidence.focals
-    return evidence._replace(
-        sightings=kept_rows(evidence.sightings, sighted),
+def _of_views(evidence: Evidence, told: BoolArray, views: BoolArray) -> Evidence:
+    """The evidence that some views (V,) have, and what is none's, in a rig of some ``views`` (V,).
+
+    The first are among the second, which are numbered anew.
+    """
+    rig, focals, number = evidence.rig, evidence.focals, np.append(np.cumsum(views) - 1, -1)
+    some = told_by(evidence, told)
+    tables = {name: getattr(some, name) for name in TABLES}
+    return some._replace(
+        **{name: rows._replace(image=number[rows.image]) for name, rows in tables.items()},
         rig=Rig(rig.cam_from_rig[views], rig.pose[views]),
         focals=focals._replace(group=focals.group[views]),
     )

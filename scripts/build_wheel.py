@@ -32,10 +32,7 @@ def main() -> None:
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         source, kernels = Path(folder) / "source", Path(folder) / "kernels"
-        ignored = shutil.ignore_patterns(
-            ".*", "__pycache__", "node_modules", "demo", "dist", "build"
-        )
-        shutil.copytree(ROOT, source, ignore=ignored)
+        copy_source(source)
         compile_kernels(source, kernels)
         pack(kernels, source / "cadalign" / "compile" / "kernels")
         wheel = build(source, Path(folder) / "dist")
@@ -43,6 +40,16 @@ def main() -> None:
     size = (out / wheel.name).stat().st_size / 1e6
     count = sum(name.endswith(".nbi") for name in zipfile.ZipFile(out / wheel.name).namelist())
     sys.stdout.write(f"{out / wheel.name}: {size:.0f} MB, {count} compiled functions\n")
+
+
+def copy_source(folder: Path) -> None:
+    """Copy what a wheel is built from, so that nothing old in `build/` gets into it."""
+    folder.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, folder)
+    ignored = shutil.ignore_patterns("__pycache__", "node_modules")
+    for name in ("cadalign", "datasets", "render"):
+        shutil.copytree(ROOT / name, folder / name, symlinks=True, ignore=ignored)
 
 
 def processor() -> tuple[str, list[str]]:

@@ -87,6 +87,13 @@ def test_wheel_holds_every_module_and_nothing_twice(wheel: zipfile.ZipFile) -> N
 
 
 @pytest.mark.long
+def test_wheel_holds_the_scripts_and_styles_of_the_pages(wheel: zipfile.ZipFile) -> None:
+    bundled = {path.name for path in (ROOT / "cadalign" / "web" / "dist").iterdir()}
+    assert {"annotate.html", "report.js"} <= bundled
+    assert {f"cadalign/web/dist/{name}" for name in bundled} <= set(wheel.namelist())
+
+
+@pytest.mark.long
 def test_wheel_is_typed_and_brings_the_command(wheel: zipfile.ZipFile) -> None:
     names = wheel.namelist()
     assert "cadalign/py.typed" in names

@@ -121,7 +121,7 @@ class ManyEstimates:
                 fix = "give --camera, or the folder of the photos (--images)"
                 raise InputError("neither camera nor photo is known", where="camera", fix=fix)
         joined = join_keypoints(
-            found,
+            replace(found, size=size),
             self.model,
             camera or Camera.without_focal(*size),  # type: ignore[misc]
             image=photo,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -74,13 +74,13 @@ def tracks_of(
 ) -> list[VideoTrack]:
     """The objects of videos by their track, each with a view of all frames from first to last.
 
-    A frame's number is the last one in its image's name, or its place among the images; ``rate``
-    is that of the frames [1/s]. Images of several folders are several videos, whose tracks are
+    Frames are numbered by `frame_numbers`; ``rate`` is that of the frames [1/s]. Images of several folders are several videos, whose tracks are
     named after them. Without a ``camera`` each file's own is taken. Keypoints are those of the
     model's ``ids``, by name, by semantic id, or in the model's order.
 
     Raises DataError if two objects of one frame have the same track, the keypoints are none of the
-    model's, or frames are too far apart to have numbers; InputError if no camera is known.
+    model's, images are not of the camera's size, or frames are too far apart to have numbers;
+    InputError if no camera is known.
     """
     numbers = frame_numbers([each.image or "" for each in objects])
     by_track: dict[tuple[str, str], dict[int, ImageKeypoints]] = defaultdict(dict)
@@ -120,10 +120,12 @@ def with_pictures(tracks: Sequence[VideoTrack], video: Video, *, first: int) -> 
     """Tracks whose views have the video's pictures as evidence, where it has their frame.
 
     ``first`` is the number of the video's first frame. Raises DataError if a picture cannot be
-    read.
+    read; InputError if the video has none of the frames.
     """
     wanted = {number for track in tracks for number in track.frames}
     shown = {number: pixels for number, pixels in video.pictures(first=first) if number in wanted}
+    if not shown:
+        raise _apart(video, wanted)
     return [
         track._replace(
             views=tuple(
@@ -152,6 +154,7 @@ def _view(
     """A frame as a view, without keypoints where the object was not detected."""
     if seen is None:
         return View(camera, time=time)
+    seen.check_camera(camera)
     given: Sequence[object] | None = seen.ids
     if seen.names is not None:
         own_names = {plain_name(str(each)): each for each in ids}
@@ -214,7 +217,7 @@ def draw_video(video: Video, found: Sequence[FoundTrack], *, first: int = 0) -> 
 
     Frames that no track has are as they were; objects that are nearer are drawn later. ``first`` is
     the number of the video's first frame among the tracks' ones. Raises InputError if the pictures
-    are not of the camera's size; DataError if one cannot be read.
+    are not of the camera's size, or none is of a track's frame; DataError if one cannot be read.
     """
     shown: dict[int, list[tuple[FoundTrack, int]]] = defaultdict(list)
     for each in found:
@@ -226,11 +229,22 @@ def draw_video(video: Video, found: Sequence[FoundTrack], *, first: int = 0) -> 
         each, place = shown
         return -float(each.result.views[place].alignment.translation[2])
 
+    is_apart = True
     for number, picture in video.pictures(first=first):
+        is_apart &= number not in shown
         drawn = picture
-        for each, place in sorted(shown[number], key=nearness):
+        for each, place in sorted(shown.get(number, ()), key=nearness):
             drawn = _draw(drawn, each, place, scenes[each.track.name])
         yield drawn
+    if is_apart:
+        raise _apart(video, shown)
+
+
+def _apart(video: Video, frames: Collection[int]) -> InputError:
+    """Error about a video that has none of some frames."""
+    what = f"it has none of the frames {min(frames)} to {max(frames)} of the detections"
+    fix = "give their video, or the number of its first frame"
+    return InputError(what, where=str(video.path), fix=fix)
 
 
 def require_size(video: Video, camera: Camera) -> None:

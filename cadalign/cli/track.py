@@ -11,7 +11,7 @@ import tyro
 
 from cadalign.cli.common import answer, beside, exit_code, file_stems, make_folder, say, waiting
 from cadalign.cli.options import CameraOptions, named_as_flags
-from cadalign.errors import CadalignError, InputError
+from cadalign.errors import CadalignError, InputError, refuse_unused
 from cadalign.estimation.options import RansacOptions
 from cadalign.geometry.camera import Camera
 from cadalign.io.observation import with_lens
@@ -49,14 +49,14 @@ class TrackCommand(CameraOptions):
     """The video, a file or a folder of its pictures, to draw into."""
     image: bool = False
     """Use the video's pictures as evidence, too: the outline of the object is sought in each. It
-    takes a second a frame, and the shape needs models with meshes."""
+    takes a tenth of a second a frame, and the shape needs models with meshes."""
     first_frame: int = 0
     """Number of the first frame of a video file among the frames of the detections."""
     out: Path | None = None
     """Folder to write to; by default <detections>_tracks beside the detections."""
     rate: float | None = None
-    """Frames in a second; an image's frame is the last number in its name. By default the video's,
-    or 30, or the 10 of KITTI's cars."""
+    """Frames in a second; an image's frame is the last number in its name that differs from image to
+    image. By default the video's, or 30, or the 10 of KITTI's cars."""
     sigma: float = 2.0
     """Standard deviation of the keypoints [px], where the file has none."""
     min_score: float = 0.1
@@ -83,6 +83,8 @@ class TrackCommand(CameraOptions):
             for name, value in (("rate", self.rate), ("sigma", self.sigma)):
                 if value is not None and not value > 0:
                     raise InputError(f"{value:g} is not positive", where=name)
+            if video is None or video.path.is_dir():
+                refuse_unused(self, ["first_frame"], "without the file of a video")
             rate = self._rate(video)
             tracks = tracks_of(
                 objects,
@@ -112,7 +114,7 @@ class TrackCommand(CameraOptions):
         found, failures = self._estimate(tracks, shape, motion)
         if found:
             self._write(folder, found, failures, video)
-        say(f"Trajectories: {folder}")
+            say(f"Trajectories: {folder}")
         return exit_code(len(failures), len(tracks))
 
     def _rate(self, video: Video | None) -> float:

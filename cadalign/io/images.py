@@ -234,23 +234,25 @@ class Video:
 
 
 def frame_numbers(images: Iterable[str]) -> dict[str, int]:
-    """Number of each image: the last one in its name, or its place where some have none.
+    """Number of each image: the last one in its name that differs from image to image.
 
-    Numbers are those of one video, whose images have a folder of their own.
+    Its place where some have none. Numbers are those of one video, whose images have a folder of
+    their own.
 
     Examples
     --------
     >>> frame_numbers(["left/cam2_0007.png", "left/cam2_0009.png", "right/cam2_0007.png"])
     {'left/cam2_0007.png': 7, 'left/cam2_0009.png': 9, 'right/cam2_0007.png': 7}
+    >>> frame_numbers(["0007_640x480.png", "0009_640x480.png"])
+    {'0007_640x480.png': 7, '0009_640x480.png': 9}
     """
     distinct = list(dict.fromkeys(images))
-    found = [re.findall(r"\d+", Path(image).stem) for image in distinct]
-    numbers = [int(each[-1]) if each else -1 for each in found]
+    found = [re.findall(r"\d+", Path(image).stem)[::-1] for image in distinct]
     folders = [Path(image).parent for image in distinct]
-    pairs = set(zip(folders, numbers, strict=True))
-    if min(numbers, default=0) < 0 or len(pairs) < len(numbers):
-        numbers = list(range(len(distinct)))
-    return dict(zip(distinct, numbers, strict=True))
+    for numbers in zip(*found, strict=False):
+        if len(set(zip(folders, map(int, numbers), strict=True))) == len(distinct):
+            return dict(zip(distinct, map(int, numbers), strict=True))
+    return dict(zip(distinct, range(len(distinct)), strict=True))
 
 
 def _photos(folder: Path) -> list[Path]:

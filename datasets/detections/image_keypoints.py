@@ -80,6 +80,14 @@ class ImageKeypoints:
     def __len__(self) -> int:
         return len(self.points_2d)
 
+    def check_camera(self, camera: Camera) -> None:
+        """Refuse a camera of images of another size, or in whose image no such pixels are."""
+        if self.size not in (None, (camera.width, camera.height)):
+            what = "the image has {} x {} pixels".format(*self.size)
+            what += f", that of the camera {camera.width} x {camera.height}"
+            raise DataError(what, where=self.source, fix="give the camera of these images")
+        check_pixels(self.points_2d, camera.width, camera.height, where=self.source)
+
     def is_of(self, photo: str) -> bool:
         """True if the image's name, or its id, is that of the photo's file."""
         path = Path(photo)
@@ -195,11 +203,11 @@ def join_keypoints(
     Raises
     ------
     DataError
-        If a keypoint is unknown, two are the same, or none is left.
+        If a keypoint is unknown, two are the same, none is left, or the camera is of another size.
     InputError
         If ``sigma_from_scores`` is not positive.
     """
-    check_pixels(found.points_2d, camera.width, camera.height, where=found.source)
+    found.check_camera(camera)
     kept = list(range(len(found)))
     if found.scores is not None:
         kept = np.flatnonzero((found.scores > 0) & (found.scores >= min_score)).tolist()

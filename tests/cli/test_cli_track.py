@@ -152,6 +152,54 @@ def test_a_video_of_another_size_is_refused(
     assert "its pictures are 64 x 48 px, those of the camera 640 x 480" in line
 
 
+def test_a_video_that_has_none_of_the_frames_is_refused(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = video
+    blank = np.zeros((TRACK_CAMERA.height, TRACK_CAMERA.width, 3), np.uint8)
+    path = tmp_path / "clip.mp4"
+    write_movie(path, iter([blank] * 3), fps=10)
+    more = ["--out", str(tmp_path / "out"), "--video", str(path), "--first-frame", "50"]
+    for options in (more, [*more, "--image"]):
+        assert main(command(folder, *options)) == 1
+        assert (
+            "clip.mp4: it has none of the frames 0 to 19 of the detections; give their video, or the "
+            "number of its first frame"
+        ) in capsys.readouterr().err
+    assert not (tmp_path / "out" / "overlay.mp4").exists()
+
+
+def test_a_number_of_the_first_frame_without_a_video_file_is_refused(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = video
+    write_image(tmp_path / "frame_0.png", np.zeros((480, 640, 3), np.uint8))
+    for more in ([], ["--video", str(tmp_path)]):
+        line = refusal_line(capsys, *command(folder, "--first-frame", "3", *more))
+        assert "--first-frame: has no effect without the file of a video; leave it out" in line
+
+
+def test_images_of_another_size_than_the_cameras_are_refused(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = video
+    found = json.loads((folder / "found.json").read_text())
+    for each in found["images"]:
+        each |= {"width": 320, "height": 240}
+    (tmp_path / "found.json").write_text(json.dumps(found))
+    files = ["--shape", str(folder / "thing.shape"), "--camera", str(folder / "camera.json")]
+    assert main(["track", str(tmp_path / "found.json"), *files]) == 1
+    assert "the image has 320 x 240 pixels, that of the camera 640 x 480" in capsys.readouterr().err
+
+
+def test_a_run_that_estimates_no_track_names_no_trajectories(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, _ = video
+    assert main(command(folder, "--min-score", "5", "--out", str(tmp_path / "out"))) == 1
+    assert "Trajectories" not in capsys.readouterr().err
+
+
 @pytest.mark.long
 def test_pictures_are_evidence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A car that turns before a grey wall, with rough keypoints."""

@@ -70,6 +70,12 @@ def test_images_without_numbers_are_counted() -> None:
     assert frame_numbers([]) == {}
 
 
+def test_numbers_that_all_images_share_are_none_of_frames() -> None:
+    names = ["0007_640x480_v2.png", "0009_640x480_v2.png"]
+    assert list(frame_numbers(names).values()) == [7, 9]
+    assert list(frame_numbers(["a1.png", "b1.png"]).values()) == [0, 1]
+
+
 def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with pytest.raises(DataError, match="there is no photo in it"):

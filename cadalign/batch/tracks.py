@@ -74,9 +74,10 @@ def tracks_of(
 ) -> list[VideoTrack]:
     """The objects of videos by their track, each with a view of all frames from first to last.
 
-    Frames are numbered by `frame_numbers`; ``rate`` is that of the frames [1/s]. Images of several folders are several videos, whose tracks are
-    named after them. Without a ``camera`` each file's own is taken. Keypoints are those of the
-    model's ``ids``, by name, by semantic id, or in the model's order.
+    Frames are numbered by `frame_numbers`; ``rate`` is that of the frames [1/s]. Images of several
+    folders are several videos, whose tracks are named after them. Without a ``camera`` each file's
+    own is taken. Keypoints are those of the model's ``ids``, by name, by semantic id, or in the
+    model's order.
 
     Raises DataError if two objects of one frame have the same track, the keypoints are none of the
     model's, images are not of the camera's size, or frames are too far apart to have numbers;

@@ -240,7 +240,8 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
     from cadalign.estimation.scene import align_scene
     from cadalign.estimation.scene_messages import SceneObject
 
-    with named_as_flags(command, command.fitting, command.ransac):
+    fields_of_file = {"share": f"{path}: share"}
+    with named_as_flags(command, command.fitting, command.ransac, others=fields_of_file):
         if command.overlay is not None:
             fix = "give it with an object's observation.json, which is written without it"
             raise InputError("draws one object, the file has several", where="overlay", fix=fix)
@@ -266,9 +267,9 @@ def _fit_scene(command: Fit, path: Path, data: dict[str, Any]) -> int:
             )
     folder = command.out or beside(path, "_fit")
     with keeping([path, *(file for each in seen.values() for file in each.files)]):
-        texts = _write_scene(command, folder, scene, objects, list(seen.values()))
+        texts, found = _write_scene(command, folder, scene, objects, list(seen.values()))
     if command.json:
-        print_json(scene.to_dict())
+        print_json(scene.to_dict() | {"objects": found})
     else:
         answer("\n".join([str(scene), *texts]))
     say(f"Objects: {folder}")
@@ -319,21 +320,24 @@ def _write_scene(
     scene: AlignedScene,
     objects: list[SceneObject],
     observations: list[Observation],
-) -> list[str]:
-    """Write the files of the scene; returns the texts of its objects."""
+) -> tuple[list[str], list[dict[str, Any]]]:
+    """Write the files of the scene; returns the texts and documents of its objects."""
     make_folder(folder)
-    texts, entries = [], []
+    texts, documents = [], list[dict[str, Any]]()
     stems = file_stems(["scene.json", *(each.name for each in objects)], "object")[1:]
     for each, seen, result, stem in zip(objects, observations, scene.results, stems, strict=True):
         if isinstance(result, CadalignError):
             texts.append(f"{each.name}: {result}")
-            entries.append({"name": each.name, "error": str(result)})
+            documents.append({"name": each.name, "error": str(result)})
             continue
         own = folder / stem
         make_folder(own)
         seen.save(own / "observation.json")
-        command.fitted(own / "observation.json", seen, result, (each.view,)).write(own)
+        fitted = command.fitted(own / "observation.json", seen, result, (each.view,))
+        fitted.write(own)
         texts.append(f"{each.name}: {result}")
-        entries.append({"name": each.name, "folder": own.name})
+        documents.append({"name": each.name, "folder": own.name, "fit": fitted.document(own)})
+    # Their folders have the fits.
+    entries = [{key: each[key] for key in each if key != "fit"} for each in documents]
     write_json(folder / "scene.json", scene.to_dict() | {"objects": entries})
-    return texts
+    return texts, documents

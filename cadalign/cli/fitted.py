@@ -49,13 +49,17 @@ class FittedFile:
         return tabulate_contributions(self.result) if self.is_tabulated else ""
 
     def text(self, out: Path) -> str:
-        """The result as JSON text for a file in a folder, which its sources are relative to."""
+        """The `document` as JSON text."""
+        return json.dumps(self.document(out), indent=2) + "\n"
+
+    def document(self, out: Path) -> dict[str, Any]:
+        """The result in the form of JSON for a folder, which its sources are relative to."""
         sources = {
             name: written_path(path.absolute(), folder=out.absolute())
             for name, path in self.sources.items()
         }
         added = list_contributions(self.result) if self.is_tabulated else {}
-        return json.dumps(self.result.to_dict() | added | sources, indent=2) + "\n"
+        return self.result.to_dict() | added | sources
 
     def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
         """Write fit.json and the pictures to a folder; returns the pictures' paths.

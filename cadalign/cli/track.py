@@ -55,8 +55,8 @@ class TrackCommand(CameraOptions):
     out: Path | None = None
     """Folder to write to; by default <detections>_tracks beside the detections."""
     rate: float | None = None
-    """Frames in a second; an image's frame is the last number in its name that differs from image to
-    image. By default the video's, or 30, or the 10 of KITTI's cars."""
+    """Frames in a second; an image's frame is the last number in its name that differs from image
+    to image. By default the video's, or 30, or the 10 of KITTI's cars."""
     sigma: float = 2.0
     """Standard deviation of the keypoints [px], where the file has none."""
     min_score: float = 0.1

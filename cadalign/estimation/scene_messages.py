@@ -104,13 +104,15 @@ NOTHING = SceneMessage(np.zeros((4, 4)), np.zeros(4))
 class SharedUnknowns:
     """Values of the shared unknowns: the reference of messages, and the prior of an object.
 
-    ``covariance`` (4, 4) is that of their deviations; infinite where nothing is known.
+    ``covariance`` (4, 4) is that of their deviations; infinite where nothing is known. ``source``
+    is that of the focal length.
     """
 
     focal: float
     up: FloatArray
     height: float
     covariance: FloatArray
+    source: str = _OTHERS
 
     @property
     def across(self) -> FloatArray:
@@ -142,7 +144,8 @@ class SharedUnknowns:
     def focal_prior(self) -> FocalPrior | None:
         """The prior on the focal length, where one is known."""
         variance = self.covariance[0, 0]
-        return FocalPrior(self.focal, math.sqrt(variance), _OTHERS) if variance < np.inf else None
+        sigma = math.sqrt(variance)
+        return FocalPrior(self.focal, sigma, self.source) if variance < np.inf else None
 
     def without(self, part: str) -> SharedUnknowns:
         """The values with nothing known of a part."""
@@ -184,7 +187,9 @@ def known_by(views: Sequence[View], focal: FocalPrior | None = None) -> SharedUn
         covariance[3, 3] = cast(float, heights[0].camera_height_sigma) ** 2
     if focal is not None:
         covariance[0, 0] = focal.relative_sigma**2
-    return SharedUnknowns(1.0 if focal is None else focal.focal, up, height, covariance)
+    if focal is None:
+        return SharedUnknowns(1.0, up, height, covariance)
+    return SharedUnknowns(focal.focal, up, height, covariance, focal.source)
 
 
 def as_prior(

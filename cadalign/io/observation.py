@@ -153,6 +153,9 @@ class Observation(ObservedImage):
         if isinstance(data, Mapping) and "alignment" in data:
             fix = "give the observation that was fitted"
             raise DataError("the result of a fit, not an observation", fix=fix)
+        if isinstance(data, Mapping) and "objects" in data:
+            fix = "give it alone to `cadalign fit`, which writes an observation of each"
+            raise DataError("several objects of one photo, not one observation", fix=fix)
         read, fields = read_fields(data)
         images = []
         for number, each in enumerate(fields):

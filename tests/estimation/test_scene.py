@@ -91,6 +91,13 @@ def test_one_object_is_aligned_as_alone() -> None:
     assert scene.focal_std == pytest.approx(alone.std.focal, rel=1e-3)
 
 
+def test_a_prior_is_that_of_the_other_objects_only_where_there_are_others() -> None:
+    first, second = Simulated(0, 2).objects(UNKNOWN)
+    alone, together = align_scene([first]), align_scene([first, second])
+    sources = [scene.results[0].focal_prior.source for scene in (alone, together)]
+    assert sources == ["usual lenses", "the other objects"]
+
+
 def test_gravity_and_ground_are_shared_where_asked() -> None:
     simulated = Simulated(3, 3)
     scene = align_scene(simulated.objects(CAMERA, sized=1), share=("gravity", "ground"))
@@ -355,7 +362,31 @@ def test_file_of_several_objects_names_what_is_wrong(
     data["objects"][1]["object"] = "other"
     path.write_text(json.dumps(data | {"share": ["colour"]}))
     assert main(["fit", str(path)]) == 1
-    assert "share: ['colour'] is not what objects share" in capsys.readouterr().err
+    message = f"{path}: share: ['colour'] is not what objects share"
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_json_of_several_objects_has_their_fits_and_errors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_scene(tmp_path)
+    data = json.loads(path.read_text())
+    data["objects"][1]["keypoints"] = data["objects"][1]["keypoints"][:2]
+    path.write_text(json.dumps(data))
+    assert main(["fit", str(path), "--json"]) == 3
+    left, right = json.loads(capsys.readouterr().out)["objects"]
+    written = json.loads((tmp_path / "scene_fit" / "left" / "fit.json").read_text())
+    assert left == {"name": "left", "folder": "left", "fit": written}
+    assert right["error"].startswith("points_3d: 2 keypoints are too few")
+
+
+def test_several_objects_are_no_observation_of_a_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_scene(tmp_path)
+    assert main(["fit", str(path), str(path), "--out", str(tmp_path / "run")]) == 1
+    message = "several objects of one photo, not one observation; give it alone to `cadalign fit`"
+    assert message in " ".join(capsys.readouterr().err.split())
 
 
 def test_every_object_has_a_folder_of_its_own(tmp_path: Path) -> None:
@@ -398,7 +429,7 @@ def test_options_that_hold_for_no_scene_are_refused(
     assert refusal_line(capsys, "fit", path) == f"left: fit.principal_sigma: {principal}; {fix}"
     path.write_text(json.dumps(data | {"share": 5}))
     assert refusal_line(capsys, "fit", path) == (
-        "share: 5 is not what objects share; give some of focal, gravity, ground"
+        f"{path}: share: 5 is not what objects share; give some of focal, gravity, ground"
     )
 
 

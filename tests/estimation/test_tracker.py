@@ -248,7 +248,7 @@ def test_a_view_that_is_refused_leaves_the_track_as_it_was() -> None:
 
 
 def test_bad_arguments_are_refused() -> None:
-    with pytest.raises(InputError, match="ransac: expected a cadalign.RansacOptions, got bool"):
+    with pytest.raises(InputError, match=r"ransac: expected a cadalign.RansacOptions, got bool"):
         Tracker(CATEGORY, ransac=True)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="lag: 1 is not a whole number from 3 on"):
         Tracker(CATEGORY, lag=1)

@@ -201,8 +201,8 @@ class Tracker:
     def _refuse_foreign(self, view: View) -> None:
         """Refuse a view that does not go with the model or with the views before."""
         if self._views and (view.cam_from_rig is None) != (self._views[0].cam_from_rig is None):
-            fix = "give it for all views, or for none"
-            raise InputError("only some views have a known pose", where="view.cam_from_rig", fix=fix)
+            what, fix = "only some views have a known pose", "give it for all views, or for none"
+            raise InputError(what, where="view.cam_from_rig", fix=fix)
         try:
             problem = self._problem([view], [0])
             problem.evidence(self._prior.components[0], problem.lenses)

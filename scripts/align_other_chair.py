@@ -38,7 +38,7 @@ LINE = (35, 208, 255)
 
 def main(
     *,
-    out: Path = Path("docs/other_chair.png"),
+    out: Path | None = None,
     photo_of: str = "006",
     model: str = "000",
     files: Path | None = None,
@@ -48,8 +48,8 @@ def main(
 
     Parameters
     ----------
-    out : Path
-        Where to write the picture.
+    out : Path, optional
+        Where to write the picture; by default beside the files, or docs/other_chair.png.
     photo_of : str
         The sample chair in the photo.
     model : str
@@ -80,6 +80,7 @@ def main(
             reprojected=CAMERA.project(result.alignment.apply(observation.points_3d)),
             legend=False,
         )
+        out = out or (Path("docs") if files is None else files) / "other_chair.png"
         write_row(out, [image, still(scene), aligned], width=width)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -40,6 +41,11 @@ REQUIRED = os.environ.get("CADALIGN_REQUIRED", "").split()
 
 
 COMPILED = pytest.StashKey[Future[None]]()
+
+
+def pytest_unconfigure() -> None:
+    """Remove the undo histories; not at exit, which processes that are forked have, too."""
+    shutil.rmtree(os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

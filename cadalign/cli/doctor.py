@@ -49,8 +49,9 @@ class Doctor(JsonOption):
 
     def _compile(self) -> int:
         from cadalign.cli.compile_ahead import compile_ahead
-        from cadalign.cli.health import compiled_cache
+        from cadalign.cli.health import compiled_cache, require_cache
 
+        require_cache()
         began = time.perf_counter()
         with waiting("compiling ...") as show:
             compile_ahead(progress=lambda text: show(f"compiled: {text} ..."))

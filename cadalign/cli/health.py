@@ -11,6 +11,7 @@ from pathlib import Path
 
 from cadalign.compile.files import SHIPPED, can_write, kernel_folder, usable_target
 from cadalign.datasets import PhotoSummary, open_photos
+from cadalign.errors import InputError
 from cadalign.render.probe import RENDERERS, Probe, best_renderer, probe_renderer, remedy
 
 
@@ -79,6 +80,14 @@ def compiled_cache() -> str:
         return f"{came}none yet; they will be kept in {folder}"
     fix = "set NUMBA_CACHE_DIR, or every process compiles anew"
     return f"{came}{folder} cannot be written to; {fix}"
+
+
+def require_cache() -> None:
+    """Refuse to compile ahead where nothing of it could be kept."""
+    folder = kernel_folder()
+    if not can_write(folder):
+        fix = "set NUMBA_CACHE_DIR to a folder that can be"
+        raise InputError(f"{folder} cannot be written to", where="--compile", fix=fix)
 
 
 def _usable_cores() -> int:

@@ -12,6 +12,7 @@ import pytest
 import trimesh
 import tyro
 from PIL import Image
+from support.refusals import refusal_line
 
 from cadalign import Camera
 from cadalign.cli.doctor import Doctor
@@ -304,6 +305,14 @@ def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
         (tmp_path / "shut").mkdir(mode=0o500)
         monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "shut" / "cache"))
         assert "set NUMBA_CACHE_DIR" in compiled_cache()
+
+
+def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("cadalign.cli.health.can_write", lambda folder: False)
+    assert refusal_line(capsys, "doctor", "--compile") == (
+        f"--compile: {tmp_path} cannot be written to; set NUMBA_CACHE_DIR to a folder that can be"
+    )
 
 
 @pytest.mark.long

@@ -69,7 +69,7 @@ class AlignedScene:
     camera_height_std : float
         Its relative standard deviation.
     warnings : tuple of str
-        Objects that contradict the others, and were left alone.
+        Objects that contradict the others and were left alone, and what tells nothing.
     """
 
     results: Results
@@ -230,9 +230,12 @@ def align_scene(
     if "gravity" in wanted:
         up_std = float(np.degrees(shared.std("gravity")))
         scene = replace(scene, up=shared.up, up_std_deg=up_std)
-    if "ground" in wanted and np.isfinite(shared.covariance[3, 3]):
+    if "ground" in wanted:
         height_std = shared.std("ground")
-        scene = replace(scene, camera_height=shared.height, camera_height_std=height_std)
+        if np.isfinite(height_std):
+            return replace(scene, camera_height=shared.height, camera_height_std=height_std)
+        nothing = "the ground tells nothing: give the size of an object, or the camera's height"
+        return replace(scene, warnings=(*scene.warnings, nothing))
     return scene
 
 

@@ -119,6 +119,14 @@ def test_gravity_and_ground_are_shared_where_asked() -> None:
     assert without.camera_height is None
 
 
+def test_ground_that_tells_nothing_is_warned_of() -> None:
+    scene = align_scene(Simulated(0, 2).objects(CAMERA), share=("ground",))
+    assert scene.camera_height is None
+    assert scene.warnings == (
+        "the ground tells nothing: give the size of an object, or the camera's height",
+    )
+
+
 def test_known_camera_height_tells_the_size_of_all() -> None:
     simulated = Simulated(4, 2)
     known = simulated.objects(CAMERA, up=simulated.up, camera_height=HEIGHT)

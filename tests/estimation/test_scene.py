@@ -392,9 +392,14 @@ def test_several_objects_are_no_observation_of_a_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_scene(tmp_path)
-    assert main(["fit", str(path), str(path), "--out", str(tmp_path / "run")]) == 1
     message = "several objects of one photo, not one observation; give it alone to `cadalign fit`"
-    assert message in " ".join(capsys.readouterr().err.split())
+    for number, inputs in enumerate(([path, path], [tmp_path])):
+        out = str(tmp_path / f"run_{number}")
+        assert main(["fit", *map(str, inputs), "--out", out]) == 1
+        assert message in " ".join(capsys.readouterr().err.split())
+    assert main(["fit", str(path), "--out", str(tmp_path / "done")]) == 0
+    assert main(["fit", str(tmp_path / "done")]) == 1
+    assert "the folder holds no observation" in capsys.readouterr().err
 
 
 def test_every_object_has_a_folder_of_its_own(tmp_path: Path) -> None:

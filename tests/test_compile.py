@@ -83,6 +83,7 @@ def one(x):
 """
 CALL = """
 import sys
+sys.dont_write_bytecode = True  # of sources that change more than once in a second
 sys.path.insert(0, {folder!r})
 import importlib
 one = importlib.import_module({module!r}).one

@@ -101,10 +101,7 @@ class ManyEstimates:
         if isinstance(task.content, ImageKeypoints):
             seen = self._detected(task.content, folder)
         else:
-            if task.content is None:
-                data = parse_json(read_text(folder / Path(task.name).name), task.name)
-            else:
-                data = _parsed(task.content, task.name)
+            data = _read(task) if task.content is None else _parsed(task.content, task.name)
             seen = self.options.read(data, task.name, folder=folder)
         return seen if shape is None else replace(seen, shape=shape.absolute())
 
@@ -176,6 +173,15 @@ def _model_keypoints(options: ManyOptions) -> ModelKeypoints:
 
 
 _photo_in = lru_cache(maxsize=1024)(photo_in)
+
+
+def _read(task: ObservationTask) -> Any:
+    """The JSON of a task's file, which errors name as the user did."""
+    try:
+        text = read_text(Path(task.folder) / Path(task.name).name)
+    except DataError as error:
+        raise DataError(error.what, where=task.name, fix=error.fix) from None
+    return parse_json(text, task.name)
 
 
 def _parsed(content: bytes, name: str) -> Any:

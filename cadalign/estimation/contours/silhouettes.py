@@ -132,19 +132,20 @@ def _atlas(
         across *= far / (far + (corners - middle) @ direction)[:, None]
         low, high = across.min(axis=0), across.max(axis=0)
         cell = float((high - low).max()) / cells or 1.0
-        places = low[:, None] + cell * np.arange(cells + 1)
-        grid = np.stack(np.meshgrid(places[0], places[1]), axis=-1).reshape(-1, 2)
+        columns, rows = np.minimum((high - low) // cell + 2, cells + 1).astype(int)
+        x, y = low[:, None] + cell * np.arange(cells + 1)
+        grid = np.stack(np.meshgrid(x[:columns], y[:rows]), axis=-1).reshape(-1, 2)
         rays = (grid / far) @ base + direction
         covered = caster.covered(middle - far * direction, rays)
-        image = covered.reshape(cells + 1, cells + 1).astype(np.float32)
+        image = covered.reshape(rows, columns).astype(np.float32)
         points = _cells(image)
         if len(points) < _LEAST_CELLS:
             continue
         moments, lines = parts_of(points)
         views.append(_sampled(image, moments, lines, low + base @ middle, cell))
         bases.append(np.broadcast_to(base, (len(moments), 2, 3)))
-    rows = [np.concatenate(column) for column in zip(*views, strict=True)]
-    return Atlas(caster, corners, np.concatenate(bases), Whitened(*rows))
+    every = [np.concatenate(column) for column in zip(*views, strict=True)]
+    return Atlas(caster, corners, np.concatenate(bases), Whitened(*every))
 
 
 def eye_of(mesh: Mesh, query: Whitened) -> float:
@@ -194,16 +195,12 @@ def _cuts(points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     root = np.linalg.cholesky(np.cov(points.T) + _CELL_VARIANCE * np.eye(2))
     normals = around(_CUT_ANGLES) @ np.linalg.inv(root)
-    terms = _terms(points)
     last = [max(int((1 - share) * len(points)) - 1, 2) for share in _CUT_SHARES]
-    moments: list[FloatArray] = []
-    lines: list[list[float]] = []
-    for normal in normals:
-        along = points @ normal
-        order = np.argsort(along)
-        moments.append(np.cumsum(terms[:, order], axis=1)[:, last].T)
-        lines.extend([*normal, along[order[k]]] for k in last)
-    return np.concatenate(moments), np.array(lines)
+    along = normals @ points.T
+    limits = np.partition(along, last, axis=1)[:, last]
+    kept = (along[:, None] <= limits[:, :, None]).reshape(-1, len(points))
+    lines = np.column_stack([np.repeat(normals, len(last), axis=0), limits.ravel()])
+    return kept @ _terms(points).T, lines
 
 
 def _sampled(

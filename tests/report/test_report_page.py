@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect
-from support.pages import Opened, cut_off, scroll_through
+from playwright.sync_api import Browser, Page, expect
+from support.pages import Opened, cut_off, scroll_through, watched
 from support.reports import HOSTILE, PAPER, REASON, Recipe, payload_of, write_page
 
 from cadalign.evaluation.api import run as do_run
@@ -25,8 +26,18 @@ pytestmark = pytest.mark.long
 _TEXT, _DRAWN = 4.5, 3.0
 
 
-def test_everything_of_a_run_is_there(opened: Opened, plain: str) -> None:
-    page = opened(plain)
+@pytest.fixture(scope="module")
+def drawn(browser: Browser, plain: str) -> Iterator[Page]:
+    """The page of an ordinary run with all of it drawn; to be looked at, not changed."""
+    with watched(browser) as open_page:
+        page = open_page(plain)
+        assert page.locator("#plot-stretch-z").get_attribute("data-drawn") is None  # not in view
+        scroll_through(page)
+        yield page
+
+
+def test_everything_of_a_run_is_there(drawn: Page) -> None:
+    page = drawn
     expect(page).to_have_title("A report of chairs")
     expect(page.locator(".lead")).to_contain_text("24 views of chairs")
     table = page.locator("table.headline")
@@ -46,7 +57,6 @@ def test_everything_of_a_run_is_there(opened: Opened, plain: str) -> None:
         "plot-stretch-z",
     ]
     expect(page.locator(".found")).to_have_text("24 instances")
-    scroll_through(page)
     page.locator("#gallery").scroll_into_view_if_needed()
     expect(page.locator(".card")).to_have_count(24)
 
@@ -60,7 +70,6 @@ def test_everything_of_a_run_is_there(opened: Opened, plain: str) -> None:
         pytest.param(Recipe(pictures=0), "24 instances", id="no-pictures"),
         pytest.param(Recipe(exhibits=False, pictures=0), "24 instances", id="numbers-only"),
         pytest.param(Recipe(done=9), "24 instances", id="unfinished"),
-        pytest.param(Recipe(runs=2), "48 instances", id="two-runs"),
     ],
 )
 def test_unlucky_runs_are_shown_too(
@@ -130,11 +139,8 @@ def test_texts_from_data_stay_texts(opened: Opened, tmp_path: Path) -> None:
     assert "</script" not in asset("report.js")
 
 
-def test_plots_hold_what_the_tables_hold(opened: Opened, plain: str) -> None:
-    page = opened(plain)
-    drawn = "(id) => document.getElementById(id).data.map(({ name, x, y }) => ({ name, x, y }))"
-    assert page.locator("#plot-stretch-z").get_attribute("data-drawn") is None  # not in view yet
-    scroll_through(page)
+def test_plots_hold_what_the_tables_hold(drawn: Page) -> None:
+    held = "(id) => document.getElementById(id).data.map(({ name, x, y }) => ({ name, x, y }))"
     payload = payload_of(Recipe())
     rows = payload["tables"]["rows"]
     errors = {
@@ -145,7 +151,7 @@ def test_plots_hold_what_the_tables_hold(opened: Opened, plain: str) -> None:
         ]
         for index, method in enumerate(payload["methods"])
     }
-    curves = page.evaluate(drawn, "plot-cumulative")
+    curves = drawn.evaluate(held, "plot-cumulative")
     assert [curve["name"] for curve in curves] == list(errors)
     for curve in curves:
         values = errors[curve["name"]]
@@ -153,7 +159,7 @@ def test_plots_hold_what_the_tables_hold(opened: Opened, plain: str) -> None:
             reached = sum(value is not None and value <= at for value in values)
             assert share == pytest.approx(100 * reached / len(values))
     keypoints = np.array(payload["tables"]["instances"]["keypoints"])[rows["instance"]]
-    lines = page.evaluate(drawn, "plot-keypoints")
+    lines = drawn.evaluate(held, "plot-keypoints")
     line = next(line for line in lines if line["name"] == "optimal (ours)")
     for at, middle in zip(line["x"], line["y"], strict=True):
         chosen = (keypoints == at) & (np.array(rows["method"]) == 0)
@@ -180,17 +186,29 @@ def test_switches_change_all_plots_and_the_gallery(opened: Opened, plain: str) -
     expect(page.locator("#plots .numbers[open] tbody tr").first).to_contain_text("optimal")
 
 
-def test_noise_is_a_plot_once_runs_differ_in_it(opened: Opened, tmp_path: Path) -> None:
-    page = opened(write_page(tmp_path / "report.html", Recipe(runs=2)))
-    scroll_through(page)
+@pytest.fixture(scope="module")
+def two_runs(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """The page of two runs with all of it drawn, and the dialog of a pair open."""
+    with watched(browser) as open_page:
+        page = open_page(write_page(tmp_path_factory.mktemp("two") / "report.html", Recipe(runs=2)))
+        scroll_through(page)
+        page.locator(".pair").first.click()
+        yield page
+
+
+def test_two_runs_are_shown_and_compared(two_runs: Page) -> None:
+    page = two_runs
+    expect(page.locator("#gallery .found")).to_have_text("48 instances")
+    expect(page.locator("dialog[open] table").first).to_contain_text("optimal")
+    # Noise is a plot once runs differ in it.
     data = page.evaluate("document.getElementById('plot-noise').data.map(({ x }) => x)")
     assert data
     assert all(x == [1, 2] for x in data)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_colours_have_contrast(opened: Opened, plain: str, scheme: str) -> None:
-    page = opened(plain, color_scheme=scheme)
+def test_colours_have_contrast(opened: Opened, plain: str, drawn: Page, scheme: str) -> None:
+    page = drawn if scheme == "light" else opened(plain, color_scheme=scheme)
     colors = page.evaluate(
         """() => Object.fromEntries(
             ["page", "card", "ink", "soft", "accent", "gt", "est", "warn"].map((name) => {
@@ -226,10 +244,8 @@ def contrast(one: list[float], other: list[float]) -> float:
     return (light + 0.05) / (dark + 0.05)
 
 
-def test_whatever_can_be_used_has_a_name(opened: Opened, tmp_path: Path) -> None:
-    page = opened(write_page(tmp_path / "report.html", Recipe(runs=2)))
-    scroll_through(page)
-    page.locator(".pair").first.click()
+def test_whatever_can_be_used_has_a_name(two_runs: Page) -> None:
+    page = two_runs
     expect(page.locator("dialog canvas")).to_be_visible()
     nameless = page.evaluate(
         """() => [...document.querySelectorAll(
@@ -259,8 +275,7 @@ def test_tables_begin_with_all_and_are_whole_at_1440_pixels(opened: Opened, tmp_
         assert scroller.evaluate("(e) => e.scrollWidth - e.clientWidth") <= 0
 
 
-@pytest.mark.parametrize("width", [1000, 1280])
-def test_no_column_is_cut_off(opened: Opened, tmp_path: Path, width: int) -> None:
+def test_no_column_is_cut_off(opened: Opened, tmp_path: Path) -> None:
     recipe = Recipe(runs=2, categories=("bottle", "chair"))
     payload = payload_of(recipe)
     columns = payload["headline"]["columns"]
@@ -269,7 +284,11 @@ def test_no_column_is_cut_off(opened: Opened, tmp_path: Path, width: int) -> Non
     rows[0]["cells"] = {f"{k}": 1.0 for k in range(24)}
     headline = {**payload["headline"], "columns": columns + many, "rows": rows}
     address = write_page(tmp_path / "report.html", recipe, headline=headline)
-    page = opened(address, viewport={"width": width, "height": 900})
+    page = opened(address, viewport={"width": 1000, "height": 900})
+    expect(page.locator("table.headline").nth(1)).to_be_visible()
+    assert cut_off(page) == []
+    page.set_viewport_size({"width": 1280, "height": 900})
+    page.reload()
     expect(page.locator("table.headline").nth(1)).to_be_visible()
     assert cut_off(page) == []
     heads = page.locator("table.headline thead th").all_inner_texts()
@@ -323,7 +342,11 @@ def test_paper_gets_tables_plots_and_a_few_cards(
 def test_a_real_run_makes_a_page(opened: Opened, sample_root: Path, tmp_path: Path) -> None:
     folder = RunFolder(tmp_path / "run")
     options = KeypointNetOptions(
-        sample_root, render="overlay", max_models=1, methods=("optimal", "limit")
+        sample_root,
+        categories=("chair",),
+        render="overlay",
+        max_models=1,
+        methods=("optimal", "limit"),
     )
     do_run(options, folder, workers=0, dask=None)
     for assets in (False, True):

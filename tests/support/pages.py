@@ -89,11 +89,18 @@ def page_yardstick(context: BrowserContext) -> Yardstick:
     return Yardstick(lambda: float(page.evaluate(_USUAL_WORK)), 0.2)
 
 
+_SHOW_PLOT = """(number) => {
+    const plot = document.querySelectorAll(".plot")[number];
+    plot.scrollIntoView({ block: "nearest" });
+    return /\\d/.test(plot.dataset.drawn);
+}"""
+
+
 def scroll_through(page: Page) -> None:
     """Bring every plot into view until it is drawn."""
-    for plot in page.locator(".plot").all():
-        plot.scroll_into_view_if_needed()
-        expect(plot).to_have_attribute("data-drawn", re.compile(r"\d"))
+    for plot in range(page.locator(".plot").count()):
+        # Looks at every frame; an assertion waits longer and longer between its looks.
+        page.wait_for_function(_SHOW_PLOT, arg=plot)
 
 
 def card_names(page: Page) -> list[str]:

@@ -17,6 +17,8 @@ from cadalign.datasets import write_sample_dataset
 DESKTOP, PHONE = (1440, 900), (390, 844)
 SERIOUS = ("serious", "critical")
 COLOURS = ["color-contrast", "link-in-text-block"]
+ONLY_COLOURS: dict[str, Any] = {"runOnly": COLOURS}
+NO_COLOURS: dict[str, Any] = {"rules": {name: {"enabled": False} for name in COLOURS}}
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +62,9 @@ def used(
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.evaluate(axe_script(folder))
 
-        # What has not to do with colours is the same in both schemes, and dark colours at any size.
-        schemes = [("dark", COLOURS), ("light", None)][request.param == PHONE :]
+        # What has not to do with colours is the same in both schemes, and colours at any size.
+        desktop = [("dark", ONLY_COLOURS), ("light", {})]
+        schemes = desktop if request.param == DESKTOP else [("light", NO_COLOURS)]
 
         def check(panel: str) -> None:
             for scheme, rules in schemes:

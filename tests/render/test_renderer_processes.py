@@ -90,8 +90,8 @@ def resident():
 renderer = load_renderer(sys.argv[1], None)
 camera = Camera.from_fov(160, 120, fov_x=50)
 scenes = [Scene(ball(3)), Scene(ball(4))]
-for number in range(50):
-    if number == 20:
+for number in range(80):
+    if number == 25:
         before = resident()
     view = look_at(azimuth=3.6 * number, elevation=20, distance=6)
     frame = renderer.render(scenes[number // 10 % 2], camera, view)
@@ -114,5 +114,5 @@ def test_memory_stays_flat_over_many_frames(name):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     # 50 kB a frame: less than one frame's colours and depths, which would be kept by a leak.
-    assert int(done.stdout.splitlines()[-1]) < 1_500, "kB more than after 20 frames"
+    assert int(done.stdout.splitlines()[-1]) < 2_750, "kB more than after 25 frames"
     assert "GLError" not in done.stderr

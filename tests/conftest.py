@@ -113,6 +113,13 @@ def font_type() -> Iterator[int]:
         yield usual
 
 
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make figures, but draw no pixel of their files, which takes most of a small run."""
+    # By its name: most tests need no matplotlib.
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda _, path, **rest: path.touch())
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """The folder of the real data; tests that need it are skipped where it is not named."""

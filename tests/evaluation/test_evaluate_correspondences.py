@@ -134,12 +134,6 @@ def finished(colmap: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolde
     return folder
 
 
-@pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the writing of figures, which takes seconds and has a test of its own."""
-    monkeypatch.setattr(plots, "save_figure", lambda figure, path: [])
-
-
 class TestFormats:
     @pytest.mark.parametrize("below", ["", "sparse/0", "sparse", "0"])
     def test_colmap_is_recognised_wherever_its_loader_looks(self, tmp_path, below):

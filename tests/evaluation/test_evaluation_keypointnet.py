@@ -191,6 +191,7 @@ def test_an_estimate_behind_the_camera_is_drawn(sample_root: Path, tmp_path: Pat
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("no_figures")
 def test_the_command_prints_json_and_says_by_its_exit_code_that_rows_failed(
     annotated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -205,6 +206,7 @@ def test_the_command_prints_json_and_says_by_its_exit_code_that_rows_failed(
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("no_figures")
 def test_a_run_of_nothing_but_failures_exits_with_1(annotated: Path, tmp_path: Path) -> None:
     options = ["--min-visible", "13", "--methods", "aepnp", "--out", str(tmp_path / "run")]
     assert main(["evaluate", "keypointnet", str(annotated), "--workers", "0", *options]) == 1
@@ -228,6 +230,7 @@ def test_translation_up_to_scale_is_no_more_than_the_absolute_one(annotated: Pat
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("no_figures")
 def test_runs_without_translation_up_to_scale_still_open(annotated: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     evaluate(annotated, methods=["optimal"], out=run)

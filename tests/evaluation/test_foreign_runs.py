@@ -260,6 +260,7 @@ def _correspondences(root: Path, out: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("make", [_keypointnet, _retrieval, _correspondences])
+@pytest.mark.usefixtures("no_figures")
 def test_a_finished_run_without_timings_is_shown(
     sample_root: Path, tmp_path: Path, make: Callable[[Path, Path], None]
 ) -> None:

@@ -110,6 +110,7 @@ def test_records_hold_the_estimated_box(root: Path, shapes: Path, tmp_path: Path
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("no_figures")
 def test_the_page_shows_the_method_and_errors_up_to_scale(
     root: Path, shapes: Path, tmp_path: Path
 ) -> None:

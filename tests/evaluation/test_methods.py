@@ -176,6 +176,7 @@ def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("no_figures")
 def test_on_views_of_models_with_tables_and_page(sample_root: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
     table = cadalign.evaluate(sample_root, methods=[linear, joint, "optimal"], workers=0, out=out)
@@ -275,6 +276,7 @@ def test_a_function_that_cannot_be_sent_is_named() -> None:
         simulate([locked], workers=1)
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_run_does_not_go_on_with_another_function(tmp_path: Path) -> None:
     module = tmp_path / "changing.py"
     code = "import cadalign\ndef solve(a, b, c):\n    return cadalign.fit(a, b, c)\n"
@@ -325,6 +327,7 @@ def command(*options: str) -> list[str]:
         ("my_plugin.py:solve", "solve"),
     ],
 )
+@pytest.mark.usefixtures("no_figures")
 def test_a_plugin_runs_beside_the_methods(
     plugin: Path, capsys: pytest.CaptureFixture[str], text: str, name: str
 ) -> None:

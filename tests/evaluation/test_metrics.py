@@ -59,6 +59,7 @@ def test_a_registered_metric_is_a_column() -> None:
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("no_figures")
 def test_it_is_shown_wherever_metrics_are(
     sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,6 +173,7 @@ def test_names_of_the_summary_are_refused(sample_root: Path, name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("workers", ["0", "2"])
+@pytest.mark.usefixtures("no_figures")
 def test_what_a_plugin_prints_is_not_the_output(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -197,6 +199,7 @@ def test_what_a_plugin_prints_is_not_the_output(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_figures")
 def test_a_plugin_registers_metrics(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

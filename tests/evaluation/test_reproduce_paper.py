@@ -18,6 +18,7 @@ SCRIPT = Path(__file__).parents[2] / "scripts" / "reproduce_paper.py"
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("no_figures")
 def test_everything_is_in_one_folder_beside_the_papers_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,6 @@ import pytest
 from cadalign import Box, Library
 from cadalign.cli import main
 from cadalign.errors import DataError, DegenerateError, InputError
-from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.retrieval import SPEC, RetrievalRunOptions, summarize
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -61,12 +60,6 @@ def finished(library: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFold
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "run")
     run(replace(QUICK, root=library), folder, workers=0, dask=None)
     return folder
-
-
-@pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the writing of figures, which takes seconds and has a test of its own."""
-    monkeypatch.setattr(plots, "save_figure", lambda figure, path: [])
 
 
 def rows_of(folder: RunFolder, **wanted: Any) -> list[dict[str, Any]]:

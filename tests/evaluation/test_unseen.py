@@ -16,7 +16,6 @@ from cadalign import Alignment, Box
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation import plots
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
@@ -72,11 +71,6 @@ def finished(root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     folder = RunFolder(tmp_path_factory.mktemp("runs") / "run")
     run(UnseenOptions(root), folder, workers=0, dask=None)
     return folder
-
-
-@pytest.fixture
-def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plots, "draw_plot", lambda path, plots: [])
 
 
 def column(folder: RunFolder, name: str, method: str) -> np.ndarray:

@@ -27,6 +27,8 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.geometry.rotations import rotation_from_vector
 
+pytestmark = pytest.mark.usefixtures("no_figures")
+
 CAMERA = {"fx": 500.0, "fy": 500.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}
 TURN = rotation_from_vector(np.array([0.3, -0.4, 0.2]))
 

@@ -37,7 +37,7 @@ from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("no_figures")]
 
 PERFECT = {
     "rotation_error_deg": 0.0, "translation_cm": 0.0, "box_iou": 1.0, "box_iou_up_to_scale": 1.0,

@@ -25,7 +25,7 @@ def with_exif(case: Case) -> None:
     image = Image.open(case.photo)
     image.load()
     exif = Image.Exif()
-    exif.get_ifd(0x8769)[0xA405] = 35
+    exif[0x8769] = {0xA405: 35}
     image.save(case.photo, exif=exif)
 
 

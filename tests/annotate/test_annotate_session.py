@@ -426,7 +426,7 @@ def exif_photo(path: Path, *, orientation: int = 1, focal_35mm: int | None = Non
     exif = Image.Exif()
     exif[0x0112] = orientation
     if focal_35mm is not None:
-        exif.get_ifd(0x8769)[0xA405] = focal_35mm
+        exif[0x8769] = {0xA405: focal_35mm}
     image.save(path, exif=exif, quality=95)
 
 

@@ -209,7 +209,7 @@ def test_prior_of_the_photos_is_used_where_they_agree(
     for row, focal in enumerate((28, second)):
         photo = tmp_path / f"{row}.jpg"
         exif = Image.Exif()
-        exif.get_ifd(0x8769)[0xA405] = focal  # focal length in 35 mm film
+        exif[0x8769] = {0xA405: focal}  # focal length in 35 mm film
         Image.new("RGB", (640, 480)).save(photo, exif=exif)
         images.append(replace(observed(25.0 * row), image=photo))
     path = without_focal(write(tmp_path, *images))

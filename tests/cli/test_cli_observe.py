@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
     photo = Image.new("RGB", (480, 640), (90, 120, 150))
     exif = photo.getexif()
     exif[0x0112] = 6  # held upright, stored on its side: 640 x 480 when turned
-    exif.get_ifd(0x8769)[0xA405] = 34
+    exif[0x8769] = {0xA405: 34}
     photo.save(tmp_path / "photo.jpg", exif=exif)
     scores = np.random.default_rng(0).uniform(0.3, 1, 24)
     flat = np.column_stack([POINTS_2D, scores]).ravel().tolist()
@@ -124,7 +124,7 @@ def test_exif_that_lies_is_ignored_with_a_warning(
 ) -> None:
     photo = Image.new("RGB", (640, 480))
     exif = photo.getexif()
-    exif.get_ifd(0x8769)[0x920A] = 0.0
+    exif[0x8769] = {0x920A: 0.0}
     photo.save(folder / "photo.jpg", exif=exif)
     observe(folder, "--image", str(folder / "photo.jpg"))
     with caplog.at_level(logging.WARNING, logger="cadalign"):

@@ -46,8 +46,7 @@ def write_photo(
         exif[0x0112] = turn
     if model is not None:
         exif[0x0110] = model
-    for name, value in tags.items():
-        exif.get_ifd(0x8769)[TAGS[name]] = value
+    exif[0x8769] = {TAGS[name]: value for name, value in tags.items()}
     image.save(path, exif=exif, quality=95)
     return path
 

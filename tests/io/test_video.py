@@ -37,14 +37,15 @@ def test_the_frames_of_a_file_are_read_in_order(tmp_path: Path) -> None:
 
 def test_a_video_that_was_held_sideways_is_turned(tmp_path: Path) -> None:
     import av
+    from av.video.stream import VideoStream
 
+    if not hasattr(VideoStream, "set_display_rotation"):
+        pytest.skip("this PyAV writes no rotation")
     path, turned = tmp_path / "clip.mp4", tmp_path / "turned.mp4"
     write_movie(path, map(picture, range(COUNT)), fps=10)
     with av.open(str(path)) as source, av.open(str(turned), "w") as target:
         own = source.streams.video[0]
         stream = target.add_stream_from_template(own)
-        if not hasattr(stream, "set_display_rotation"):
-            pytest.skip("this PyAV writes no rotation")
         stream.set_display_rotation(90)
         for packet in source.demux(own):
             if packet.dts is not None:

@@ -93,6 +93,9 @@ class _Rate(ProgressColumn):
 @contextmanager
 def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
     """Show a progress bar with rate and time left; yields what takes a run's progress."""
+    if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
+        yield lambda state: None
+        return
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -103,7 +106,6 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
         TimeRemainingColumn(),
         console=new_console(),
         transient=True,
-        disable=not sys.stderr.isatty(),  # else it ends in an empty line
     ) as progress:
         bar = progress.add_task(label, total=None)
         yield lambda state: progress.update(bar, total=state.total, completed=state.done)

@@ -282,5 +282,5 @@ def _opened(path: Path) -> Iterator[InputContainer]:
 def _upright(container: InputContainer) -> Iterator[ByteImage]:
     """The pictures, turned as the file says that they are to be seen."""
     for frame in container.decode(video=0):
-        turns = round(getattr(frame, "rotation", 0) / 90)
+        turns = round(frame.rotation / 90)
         yield np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), turns))

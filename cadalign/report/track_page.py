@@ -164,7 +164,7 @@ def _angles(each: FoundTrack) -> tuple[FloatArray, FloatArray]:
     for k in range(3):
         moved = _euler(rotation_from_vector(_STEP * np.eye(3)[k]) @ turns)
         slopes[:, :, k] = (moved - angles + np.pi) % (2 * np.pi) - np.pi
-    covariances = (slopes / _STEP) @ each.path.frames[:, :3, :3] @ (slopes / _STEP).mT
+    covariances = (slopes / _STEP) @ each.path.frames[:, :3, :3] @ (slopes / _STEP).swapaxes(1, 2)
     stds = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     return np.degrees(np.unwrap(angles, axis=0)), np.degrees(stds)
 

@@ -167,6 +167,7 @@ def test_missing_materials_are_warned_of_and_become_plain(write, caplog, library
         (f"{SQUARE}f 1 2 3/1/1/1\n", "line 5"),
         ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3\n", "line 2: cannot read 'v 1 0'"),
         ("v 0 0 0\nv 1 0 0.1.2\nv 0 1 0\nf 1 2 3\n", "line 2"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0.1.2\nf 1 2 3\n", "line 3"),
         ("v 0 0 0\nv 1 0 zero\nv 0 1 0\nf 1 2 3\n", "line 2"),
         ("f 1 2 3\n", "1 faces, but no vertices"),
         (f"{SQUARE}f 1 2 5\n", "face 0 (counted from 0) names vertex 5, but there are 4"),

@@ -310,7 +310,7 @@ def _possible(problem: JointProblem, surface: Surface) -> Possible | None:
     known = np.log(lengths / np.ptp(surface.mesh.bounds, axis=0))
     if not len(directions.model) and np.isfinite(known).sum() < 2:
         return None
-    roots, axes = np.linalg.eigh(directions.whitening.mT @ directions.whitening)
+    roots, axes = np.linalg.eigh(directions.whitening.swapaxes(1, 2) @ directions.whitening)
     weights = roots / (1 + _ROUGHLY**2 * roots)  # of directions that are as rough as a start
 
     def possible(rotations: FloatArray, scales: FloatArray) -> BoolArray:

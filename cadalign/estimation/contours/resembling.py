@@ -174,8 +174,9 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
         inverse = np.exp(-2 * logs)
         relative = terms * (inverse / (squares * inverse).sum(axis=1, keepdims=True))[:, None]
         slopes = -2 * relative[:, :, free]
-        normal = slopes.mT @ slopes + _PRIOR**2 * np.eye(count)
-        gradient = (slopes.mT @ relative.sum(axis=2)[:, :, None])[:, :, 0]
+        transposed = slopes.swapaxes(1, 2)
+        normal = transposed @ slopes + _PRIOR**2 * np.eye(count)
+        gradient = (transposed @ relative.sum(axis=2)[:, :, None])[:, :, 0]
         gradient += _PRIOR**2 * logs[:, free]
         step = np.linalg.solve(normal, -gradient[:, :, None])[:, :, 0]
         moved = logs[:, free] + np.clip(step, -0.5, 0.5)

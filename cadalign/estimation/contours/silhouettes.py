@@ -213,7 +213,7 @@ def _sampled(
     square = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
     square -= mean[:, :, None] * mean[:, None, :]
     variances, axes = np.linalg.eigh(square + _CELL_VARIANCE * np.eye(2))
-    spread = (axes * np.sqrt(np.maximum(variances, _CELL_VARIANCE))[:, None]) @ axes.mT
+    spread = (axes * np.sqrt(np.maximum(variances, _CELL_VARIANCE))[:, None]) @ axes.swapaxes(1, 2)
     rays = (_radii(_RINGS)[:, None, None] * around(TURNS)).reshape(-1, 2)
     places = mean[:, None] + rays @ spread
     padded = np.asarray(np.pad(image, 1), dtype=np.float32)

@@ -12,6 +12,7 @@ from codecs import BOM_UTF8
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -198,10 +199,10 @@ def _joined(bodies: list[bytes]) -> tuple[list[bytes], bytes]:
 def _parse_rows(bodies: list[bytes], *, least: int = 1, padding: float = 0.0) -> FloatArray:
     """The numbers of statements that may differ in length, padded; (n, width) float."""
     bodies, text = _joined(bodies)
-    values = np.fromstring(text, sep=" ", dtype=np.float64)
     lengths = _lengths(bodies, text)
-    if lengths.sum() != len(values) or (lengths < least).any():
-        raise ValueError("not all of it is numbers, or they are too few")
+    if (lengths < least).any():
+        raise ValueError("too few numbers in a line")
+    values = _numbers(text, int(lengths.sum()), np.float64)
     width = int(lengths.max(initial=0))
     if width > _MAX_VALUES:
         raise ValueError("too many numbers in a line")
@@ -252,10 +253,16 @@ def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
 
 
 def _integers(text: bytes, count: int) -> IntArray:
-    values = np.fromstring(text, sep=" ", dtype=np.int64)
-    if len(values) != count:
-        raise ValueError("not all of it is whole numbers")
-    return np.asarray(values)
+    return _numbers(text, count, np.int64)
+
+
+def _numbers(text: bytes, count: int, dtype: type[np.generic]) -> npt.NDArray[Any]:
+    # At "0.1.2" older NumPy stops with a mere warning, after 0.1: the number that follows the
+    # text tells whether all of it was read.
+    values = np.fromstring(text + b" 0", sep=" ", dtype=dtype)
+    if len(values) != count + 1:
+        raise ValueError("not all of it is numbers")
+    return values[:-1]
 
 
 def _parse_corner(corner: bytes) -> tuple[int, int]:

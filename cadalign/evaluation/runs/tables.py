@@ -71,7 +71,8 @@ def read_table(path: Path, *, fix: str = DONE_ANEW) -> pa.Table:
     with _reading(path, fix):
         # Threads would gain nothing here and cost memory for each.
         table = pq.read_table(path, use_threads=False)
-        str(table.schema)  # names that are no text are noticed when they are looked at
+        # Names that are no text are noticed when looked at, by older pyarrow not in the schema.
+        str((table.column_names, table.schema))
         table.validate(full=True)
         return table
 

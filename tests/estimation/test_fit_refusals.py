@@ -307,7 +307,7 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
         ),
         (
             {"stretch_sigma": np.timedelta64(2, "s")},
-            "stretch_sigma: np.timedelta64(2,'s') is not positive",
+            f"stretch_sigma: {np.timedelta64(2, 's')!r} is not positive",
         ),
         ({"known_axis": "w"}, "known_axis: unknown known_axis 'w'; known are x, y, z"),
         (

@@ -21,11 +21,11 @@ pytestmark = pytest.mark.long
 
 
 def with_exif(case: Case) -> None:
-    """Give the photo a focal length of 35 mm in its EXIF data."""
+    """Give the photo a focal length near the camera's own in its EXIF data [mm]."""
     image = Image.open(case.photo)
     image.load()
     exif = Image.Exif()
-    exif[0x8769] = {0xA405: 35}
+    exif[0x8769] = {0xA405: 51}
     image.save(case.photo, exif=exif)
 
 

@@ -103,6 +103,11 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
     return np.asarray((axes * [y * z, x * z, x * y]) @ axes.T / 2)
 
 
+def has_linear_box(model: ShapePrior | ShapeModel) -> bool:
+    """Whether the box is always that of the shape's own last two points."""
+    return model.has_box and model.box_margins is None
+
+
 def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evidence, State]:
     """Evidence and state whose box has those faces that outermost keypoints determine at these.
 
@@ -112,7 +117,8 @@ def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evide
     shape, keypoints = evidence.shape, len(prior.ids)
     seen = np.unique(evidence.sightings.point)
     seen = seen[seen < keypoints]
-    if len(evidence.offsets.value) or not len(shape.modes) or not len(seen):
+    is_kept = has_linear_box(prior) or len(evidence.offsets.value)
+    if is_kept or not len(shape.modes) or not len(seen):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
     bounds, own = placed_box(points, keypoints, seen, prior)
@@ -157,7 +163,7 @@ def with_boxes(
     mixture: Mixture, seen: Seen, minima: Minima, count: int, model: ShapeModel
 ) -> tuple[Mixture, Minima]:
     """A component for each of the first minima, with the box that `with_box` gives."""
-    if not mixture.covariances.any():
+    if has_linear_box(model) or not mixture.covariances.any():
         return mixture, minima
     component, axes = minima.label[:count], np.arange(3)
     means, covariances = mixture.means[component], mixture.covariances[component]

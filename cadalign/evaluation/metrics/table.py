@@ -52,8 +52,7 @@ class Metric:
 
     def text(self, value: Any) -> str:
         """Format a value in the unit, rounded; a dash for what is missing or not finite."""
-        shown = self.shown(value)
-        return self.rounded(shown)
+        return self.rounded(self.shown(value))
 
     def rounded(self, shown: float | None) -> str:
         """Format a value that is in the unit, or None; a huge one by its power of ten."""

@@ -240,23 +240,19 @@ def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
     doubled = text.count(b"//")
     corners = np.zeros((total, 2), dtype=np.int64)
     if not forms:
-        corners[:, 0] = _integers(text, total)
+        corners[:, 0] = _numbers(text, total)
     elif forms == {b"/"} and text.count(b"/") == total:
-        corners[:] = _integers(text.replace(b"/", b" "), 2 * total).reshape(total, 2)
+        corners[:] = _numbers(text.replace(b"/", b" "), 2 * total).reshape(total, 2)
     elif forms == {b"//"} and doubled == total:
-        corners[:, 0] = _integers(text.replace(b"//", b" "), 2 * total)[::2]
+        corners[:, 0] = _numbers(text.replace(b"//", b" "), 2 * total)[::2]
     elif forms == {b"//"} and not doubled and text.count(b"/") == 2 * total:
-        corners[:] = _integers(text.replace(b"/", b" "), 3 * total).reshape(total, 3)[:, :2]
+        corners[:] = _numbers(text.replace(b"/", b" "), 3 * total).reshape(total, 3)[:, :2]
     else:
         corners[:] = [_parse_corner(corner) for corner in text.split()]
     return corners, sizes
 
 
-def _integers(text: bytes, count: int) -> IntArray:
-    return _numbers(text, count, np.int64)
-
-
-def _numbers(text: bytes, count: int, dtype: type[np.generic]) -> npt.NDArray[Any]:
+def _numbers(text: bytes, count: int, dtype: type[np.generic] = np.int64) -> npt.NDArray[Any]:
     # At "0.1.2" older NumPy stops with a mere warning, after 0.1: the number that follows the
     # text tells whether all of it was read.
     values = np.fromstring(text + b" 0", sep=" ", dtype=dtype)

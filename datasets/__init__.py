@@ -11,17 +11,21 @@ if TYPE_CHECKING:
         join_keypoints,
     )
     from cadalign.datasets.detections.keypoint_files import read_image_keypoints
-    from cadalign.datasets.models.categories import SYNSETS
+
+    # `open` is not in __all__: a star import must not hide the built-in function.
+    from cadalign.datasets.formats import (
+        CORRESPONDENCE_FORMATS,
+        open_correspondences,
+        open_photos,
+        write_photos,
+    )
+    from cadalign.datasets.formats import open_photos as open  # noqa: F401
     from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
     from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
     from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
-    from cadalign.datasets.models.shapenet import ShapeNet, ShapeNetModel
+    from cadalign.datasets.models.shapenet import SYNSETS, ShapeNet, ShapeNetModel
     from cadalign.datasets.photos.bop import Bop
     from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, PhotoSummary
-
-    # `open` is not in __all__: a star import must not hide the built-in function.
-    from cadalign.datasets.photos.formats import open_photos, write_photos
-    from cadalign.datasets.photos.formats import open_photos as open  # noqa: F401
     from cadalign.datasets.photos.kitti import KittiCars
     from cadalign.datasets.photos.objectron import Objectron
     from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
@@ -34,7 +38,6 @@ if TYPE_CHECKING:
     from cadalign.datasets.sfm.bundler import Bundler
     from cadalign.datasets.sfm.colmap import Colmap
     from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
-    from cadalign.datasets.sfm.formats import CORRESPONDENCE_FORMATS, open_correspondences
     from cadalign.io.meshes.files import check_solid, flat_axes, load_mesh
 
 __all__ = [

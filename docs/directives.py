@@ -94,9 +94,7 @@ def named(path: str) -> Any:
 
 def shown_by_itself() -> list[str]:
     """Paths of what the pages show by themselves."""
-    return [
-        path for page in sorted(PAGES.glob("*.md")) for path in _SHOWN.findall(page.read_text())
-    ]
+    return _found(_SHOWN)
 
 
 def rooms() -> list[str]:

@@ -9,14 +9,17 @@ if TYPE_CHECKING:
     from cadalign.render.drawing.movie import contact_sheet, write_movie
     from cadalign.render.drawing.overlay import draw_overlay
     from cadalign.render.drawing.pictures import (
+        Angles,
         depth_picture,
+        draw_still,
         face_picture,
         feature_lines,
         keypoint_picture,
         line_picture,
         normal_picture,
+        pose_in_view,
+        turntable,
     )
-    from cadalign.render.drawing.stills import Angles, draw_still, pose_in_view, turntable
     from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
     from cadalign.render.raycast.surface import Studio

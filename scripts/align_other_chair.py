@@ -7,12 +7,12 @@ picture and, if asked to, the files for `cadalign fit` and `cadalign annotate`.
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import tyro
-from common import write_row
 
 from cadalign import Alignment, Box, Camera, Observation, fit
 from cadalign.annotate.lines import Wireframe
@@ -119,6 +119,14 @@ def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment
         ends = [tuple(np.round(16 * point).astype(int).tolist()) for point in (start, end)]
         cv2.line(drawn, *ends, LINE, 1, cv2.LINE_AA, shift=4)
     return drawn
+
+
+def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:
+    """Write pictures of one height side by side, shrunk to a width [px] in all."""
+    row = np.hstack(pictures)
+    height = round(row.shape[0] * width / row.shape[1])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, cv2.resize(row, (width, height), interpolation=cv2.INTER_AREA))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
-from common import write_row
+from align_other_chair import write_row
 from matplotlib.axes import Axes
 
 from cadalign import Box, Observation, fit

@@ -13,12 +13,12 @@ from PIL import Image
 from cadalign.annotate.names import named_model, observation_file
 from cadalign.annotate.options import FileOptions
 from cadalign.annotate.photos import find_photos
-from cadalign.datasets.models.categories import require_category
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import InputError
 from cadalign.geometry.camera import Camera
 from cadalign.render import RaycastRenderer, Scene
-from cadalign.render.drawing.stills import Angles, pose_in_view
+from cadalign.render.drawing.pictures import Angles, pose_in_view
 from cadalign.retrieval import Library, LibraryModel
 from cadalign.retrieval.models import ModelKey
 

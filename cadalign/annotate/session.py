@@ -26,7 +26,7 @@ from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
 from cadalign.errors import CadalignError, DegenerateError, InputError
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import read_photo
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from cadalign.batch.exported import exported_object
 from cadalign.batch.table import RECORD_COLUMNS
 from cadalign.datasets.detections.coco import write_coco_keypoints
+from cadalign.datasets.formats import write_photos
 from cadalign.datasets.photos import bop_files
 from cadalign.datasets.photos.dataset import PoseEstimate
-from cadalign.datasets.photos.formats import write_photos
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.sfm.colmap import write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView

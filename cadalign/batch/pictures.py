@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cadalign.datasets.models.categories import name_of_synset
+from cadalign.datasets.models.shapenet import name_of_synset
 from cadalign.errors import CadalignError, DataError, RenderError
 from cadalign.estimation.result import Result
 from cadalign.evaluation.instances.pictures import cut_out, shown_photo, write_preview, write_webp

@@ -20,8 +20,14 @@ from cadalign.io.images import JPEG_ENDING
 from cadalign.io.meshes.files import load_mesh
 from cadalign.render.drawing.canvas import ByteImage, composite
 from cadalign.render.drawing.movie import MOVIES, contact_sheet
-from cadalign.render.drawing.pictures import keypoint_picture
-from cadalign.render.drawing.stills import VIEWS, Angles, draw_still, pose_in_view, turntable
+from cadalign.render.drawing.pictures import (
+    VIEWS,
+    Angles,
+    draw_still,
+    keypoint_picture,
+    pose_in_view,
+    turntable,
+)
 from cadalign.render.probe import make_renderer
 from cadalign.render.scene import LIGHT_GREY, Renderer, Scene, check_image_size
 from cadalign.render.viewpoints import visible_keypoints

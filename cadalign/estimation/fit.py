@@ -123,7 +123,7 @@ def fit(
     Examples
     --------
     >>> import numpy as np
-    >>> from cadalign.evaluation.simulation.problems import simulate_problem
+    >>> from cadalign.evaluation.simulation import simulate_problem
     >>> problem = simulate_problem(np.random.default_rng(1), points=10, noise_px=0.0)
     >>> result = fit(problem.points_3d, problem.points_2d, problem.camera)
     >>> bool(np.allclose(result.alignment.scale, problem.alignment.scale))
@@ -210,7 +210,7 @@ def fit_batch(
     Examples
     --------
     >>> import numpy as np
-    >>> from cadalign.evaluation.simulation.problems import simulate_problem
+    >>> from cadalign.evaluation.simulation import simulate_problem
     >>> rng = np.random.default_rng(1)
     >>> problems = [simulate_problem(rng, points=n, noise_px=1.0) for n in (8, 20)]
     >>> batch = fit_batch(

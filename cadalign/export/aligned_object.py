@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats, as_points, as_positive
-from cadalign.datasets.photos.formats import PHOTO_FORMATS, write_photos
+from cadalign.datasets.formats import PHOTO_FORMATS, write_photos
 from cadalign.datasets.photos.photo import (
     CadModel,
     NamedPoints,

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
-from cadalign.datasets.models.categories import require_category
+from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, require_kind
 from cadalign.estimation.align import align
 from cadalign.estimation.facing import turned_alignment

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_floats, as_points, worker_count
-from cadalign.datasets.models.categories import require_category
+from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.facing import faced, turned_alignment
 from cadalign.estimation.fit import fit_batch

@@ -17,16 +17,20 @@ from typing import overload
 
 import numpy as np
 
-from cadalign.datasets.models.annotated_symmetry import annotated_symmetry
-from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
 from cadalign.datasets.models.keypoints import (
     Keypoints,
     Symmetries,
+    annotated_symmetry,
     entry_id,
     parse_entry,
     read_entries,
 )
-from cadalign.datasets.models.shapenet import MeshLocator
+from cadalign.datasets.models.shapenet import (
+    MeshLocator,
+    name_of_synset,
+    require_category,
+    synset_of_name,
+)
 from cadalign.errors import DataError, InputError, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry

@@ -1,19 +1,40 @@
-"""ShapeNetCore as it is distributed, a folder per category and per model, or with KeypointNet."""
+"""ShapeNetCore: its categories and their WordNet synset ids, and its models.
+
+The models lie as they are distributed, a folder per category and per model, or with KeypointNet.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import overload
 
-from cadalign.datasets.models.categories import name_of_synset, require_category, synset_of_name
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError, InputError, unknown
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import as_path
 from cadalign.io.meshes.files import load_mesh
+
+SYNSETS: dict[str, str] = {
+    "airplane": "02691156", "bag": "02773838", "basket": "02801938", "bathtub": "02808440",
+    "bed": "02818832", "bench": "02828884", "birdhouse": "02843684", "bookshelf": "02871439",
+    "bottle": "02876657", "bowl": "02880940", "bus": "02924116", "cabinet": "02933112",
+    "camera": "02942699", "can": "02946921", "cap": "02954340", "car": "02958343",
+    "cellphone": "02992529", "chair": "03001627", "clock": "03046257", "dishwasher": "03207941",
+    "display": "03211117", "earphone": "03261776", "faucet": "03325088",
+    "file cabinet": "03337140", "flowerpot": "03991062", "guitar": "03467517",
+    "helmet": "03513137", "jar": "03593526", "keyboard": "03085013", "knife": "03624134",
+    "lamp": "03636649", "laptop": "03642806", "loudspeaker": "03691459", "mailbox": "03710193",
+    "microphone": "03759954", "microwave": "03761084", "motorcycle": "03790512",
+    "mug": "03797390", "piano": "03928116", "pillow": "03938244", "pistol": "03948459",
+    "printer": "04004475", "remote": "04074963", "rifle": "04090263", "rocket": "04099429",
+    "skateboard": "04225987", "sofa": "04256520", "stove": "04330267", "table": "04379243",
+    "telephone": "04401088", "tower": "04460130", "train": "04468005", "trash bin": "02747177",
+    "vessel": "04530566", "washer": "04554684",
+}  # fmt: skip
+"""The synset id of each category of ShapeNetCore, named as KeypointNet does where it has it."""
 
 # Where a model's mesh lies in its folder: version 2, then version 1.
 MESH_FILES = (Path("models", "model_normalized.obj"), Path("model.obj"))
@@ -22,6 +43,26 @@ _SYNSET_DIGITS = 8
 _PLY_FOLDER = "ShapeNetCore.v2.ply"
 # Folders in ShapeNet's layout that may lie below KeypointNet's root.
 _SHAPENET_FOLDERS = ("models", "ShapeNetCore.v2")
+_NAMES = {synset: name for name, synset in SYNSETS.items()}
+
+
+def name_of_synset(synset: str) -> str:
+    """The category's name, or the synset id itself where it is not one of ShapeNetCore's."""
+    return _NAMES.get(synset, synset)
+
+
+def synset_of_name(name: str) -> str:
+    """The category's synset id; what is not a known name is returned as it is."""
+    return SYNSETS.get(name, name)
+
+
+def require_category(name: str, known: Iterable[str], *, where: str) -> str:
+    """Return the category's name if it, or the category with this synset id, is in ``known``."""
+    names = sorted(known)
+    for candidate in (name, name_of_synset(name)):
+        if candidate in names:
+            return candidate
+    raise unknown("category", name, names, where=where)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import FloatArray, is_whole
-from cadalign.datasets.models.categories import name_of_synset
-from cadalign.datasets.models.shapenet import MESH_FILES
+from cadalign.datasets.models.shapenet import MESH_FILES, name_of_synset
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     PhotoFormat,

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import is_whole
-from cadalign.datasets.models.categories import SYNSETS
+from cadalign.datasets.models.shapenet import SYNSETS
 from cadalign.datasets.sample.household import bottle, chair
 from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
 from cadalign.datasets.sample.vehicles import car, vessel

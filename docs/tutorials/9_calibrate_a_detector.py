@@ -20,7 +20,7 @@ import numpy as np
 
 import cadalign
 from cadalign.datasets import ImageKeypoints
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 
 rng = np.random.default_rng(0)
 

@@ -22,7 +22,7 @@ from cadalign.estimation.problems import whitening_of
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.simulation.problems import (
+from cadalign.evaluation.simulation import (
     SIMULATION_CAMERA,
     Problem,
     random_rotation,

@@ -16,7 +16,7 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.unseen import UnseenObject
-from cadalign.evaluation.simulation.problems import UNIT_BOUNDS, Problem, simulate_standing_boxes
+from cadalign.evaluation.simulation import UNIT_BOUNDS, Problem, simulate_standing_boxes
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
 from cadalign.render import look_at

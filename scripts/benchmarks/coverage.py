@@ -17,7 +17,7 @@ from cadalign import Alignment, Camera, Model, RansacOptions, Result, View
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.metrics.cramer_rao import probability_level
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.metrics import rotation_error
 
 _LARGE_ROTATION_DEG, _LARGE_SCALE = 15.0, 0.25

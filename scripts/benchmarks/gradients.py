@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Camera, ShapeModel
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 
 _WELL_KNOWN_DEG = 10.0
 

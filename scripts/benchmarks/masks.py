@@ -21,7 +21,7 @@ from cadalign.estimation.contours.measured import shift_to
 from cadalign.estimation.contours.view_contour import contour_bound
 from cadalign.evaluation.instances.evidence import DAMAGES, damaged_mask
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
-from cadalign.evaluation.simulation.problems import Problem
+from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import alignment_box_iou, nearest_truth, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view

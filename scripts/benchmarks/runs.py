@@ -17,11 +17,10 @@ import cv2
 import msgspec
 import numpy as np
 import poselib
-from common import COMMAND
 from scipy.spatial.transform import Rotation
 
 from benchmarks import section
-from benchmarks.section import BenchmarkData, Row, Tables, Used
+from benchmarks.section import COMMAND, BenchmarkData, Row, Tables, Used
 from cadalign import Camera, RansacOptions
 from cadalign.batch.experiment import LARGEST_CHUNK
 from cadalign.datasets import Bundler, Colmap, Correspondences, KeypointNet, write_sample_dataset

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,6 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import tyro
-from common import COMMAND
 
 import cadalign
 from cadalign import CadalignError
@@ -22,9 +22,11 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.experiments.unseen import UnseenOptions
 from cadalign.evaluation.instances.unseen import UnseenObject, UnseenTasks, observe_object
-from cadalign.evaluation.simulation.problems import Problem
+from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.rotations import vector_from_rotation
 
+COMMAND = (sys.executable, "-c", "import sys; from cadalign.cli import main; sys.exit(main())")
+"""What runs `cadalign`, wherever it is installed."""
 LIMIT_DRAWS = 20
 """Draws of an ideal estimator's errors for each problem."""
 WITHIN_95 = 1.96

@@ -16,7 +16,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
-from cadalign.evaluation.simulation.problems import Problem
+from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import box_iou, rotation_error
 from cadalign.render import look_at

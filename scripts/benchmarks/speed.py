@@ -11,15 +11,14 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from common import COMMAND
 
 import cadalign
 from benchmarks import section
-from benchmarks.section import BenchmarkData, Row, Tables
+from benchmarks.section import COMMAND, BenchmarkData, Row, Tables
 from cadalign import Camera, Observation
 from cadalign.datasets import sample_models
 from cadalign.errors import RenderError
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
 from cadalign.render import (
     RaycastRenderer,

@@ -28,7 +28,7 @@ from cadalign.annotate.suggestion import (
 )
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
-from cadalign.evaluation.simulation.problems import Problem
+from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.observation import Observation

@@ -25,7 +25,7 @@ from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
 
 CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)

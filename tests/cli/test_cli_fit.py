@@ -19,7 +19,7 @@ from support.refusals import refusal_line
 
 from cadalign import RansacOptions, Result, fit
 from cadalign.cli import main
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.io.observation import Observation
 from cadalign.render.drawing.layers import REPROJECTED_COLOR
 

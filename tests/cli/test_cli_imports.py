@@ -13,7 +13,7 @@ import pytest
 from support.timing import Measure, ratio, timed_process
 
 from cadalign.cli import COMMANDS, class_of
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 

@@ -12,7 +12,7 @@ from support.refusals import refusal_line
 
 import cadalign
 from cadalign.cli import main
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 

@@ -18,7 +18,7 @@ from cadalign import Alignment, Camera, FocalPrior, Result, fit
 from cadalign.cli import main
 from cadalign.cli.observe import _slugs
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
-from cadalign.evaluation.simulation.problems import Problem, random_rotation
+from cadalign.evaluation.simulation import Problem, random_rotation
 from cadalign.io.observation import Observation
 
 TRUE = Camera(640, 480, 620.0, 620.0, 319.5, 239.5)

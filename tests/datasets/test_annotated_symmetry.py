@@ -5,8 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cadalign.datasets.models.annotated_symmetry import annotated_symmetry
-from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
+from cadalign.datasets.models.keypoints import (
+    Circle,
+    RotationalSymmetry,
+    Symmetries,
+    annotated_symmetry,
+)
 from cadalign.geometry.symmetry_group import SymmetryGroup
 
 Y = np.array([0.0, 1.0, 0.0])

@@ -15,7 +15,7 @@ import cadalign
 import cadalign.datasets
 from cadalign.cli import main
 from cadalign.datasets import Bop, CadModel, PhotoKeypoints, PhotoObject
-from cadalign.datasets.photos.formats import PHOTO_FORMATS
+from cadalign.datasets.formats import PHOTO_FORMATS
 from cadalign.datasets.photos.photo import DepthImage
 from cadalign.errors import DataError
 

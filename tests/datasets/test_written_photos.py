@@ -16,8 +16,8 @@ from support.photo_sets import WRITERS, write_bop, write_kitti, write_pix3d, wri
 import cadalign.datasets
 from cadalign import Alignment, Camera
 from cadalign.datasets import CadModel, Photo, PhotoDataset, PhotoFormat, PhotoObject, Truth
+from cadalign.datasets.formats import PHOTO_FORMATS, open_photos, write_photos
 from cadalign.datasets.photos.dataset import has, parse, read_list
-from cadalign.datasets.photos.formats import PHOTO_FORMATS, open_photos, write_photos
 from cadalign.datasets.photos.photo import existing
 from cadalign.datasets.photos.placed import PlacedObject, converted
 from cadalign.errors import DataError, InputError

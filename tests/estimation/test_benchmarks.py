@@ -15,7 +15,7 @@ from support.problems import problem_of
 from support.timing import ratio, timed
 
 from cadalign import Box, RansacOptions, fit, fit_batch
-from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.evaluation.simulation import random_rotation
 from cadalign.geometry.metrics import box_iou
 from cadalign.solvers import aepnp, aepnp_paper, ap4p
 

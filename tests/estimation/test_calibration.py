@@ -18,7 +18,7 @@ from support.covariances import of_unknowns
 
 from cadalign import Camera, RansacOptions, Result, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.io.observation import Observation
 
 ROUNDS = 120

@@ -14,7 +14,7 @@ from support.problems import LENS, assert_same, fit_problem, moved, problem_of, 
 from cadalign import Alignment, Camera, fit
 from cadalign.errors import DegenerateError
 from cadalign.estimation.options import BOUNDING_PRIOR
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem
 from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 
 # --- what it finds ----------------------------------------------------------------------------

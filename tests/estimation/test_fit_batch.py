@@ -11,7 +11,7 @@ import pytest
 
 from cadalign import Camera, RansacOptions, Result, Results, View, fit, fit_batch
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 
 LENS = Camera(640, 480, 500.0, 520.0, 310.0, 250.0, (-0.2, 0.05, 0.002, -0.001))
 

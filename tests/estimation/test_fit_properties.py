@@ -12,7 +12,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation.problems import Problem, random_rotation
+from cadalign.evaluation.simulation import Problem, random_rotation
 from cadalign.geometry.metrics import rotation_error
 
 SEEDS = st.integers(0, 2**32 - 1)

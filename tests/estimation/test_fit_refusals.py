@@ -11,7 +11,7 @@ from support.refusals import refusal
 
 from cadalign import Camera, RansacOptions, fit
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 
 GOOD = problem_of(3, points=8, noise_px=0.0)
 METHODS = ["optimal", "aepnp", "aepnp-paper", "epnp"]

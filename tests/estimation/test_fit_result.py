@@ -20,7 +20,7 @@ from cadalign.estimation.result_parts import (
     Stated,
     ViewResult,
 )
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA
+from cadalign.evaluation.simulation import SIMULATION_CAMERA
 
 COVARIANCE = np.diag([1e-4, 1e-4, 1e-4, 0.0004, 0.0009, 0.01, 0, 0.0001, 0.0225])
 WARNING = "s_z is known only to +-15 %: there are few keypoints for their noise"

@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from cadalign import Alignment, Camera, Model, Result, View, align, align_batch, fit, fit_batch
 from cadalign.estimation.options import USUAL_STRETCH
-from cadalign.evaluation.simulation.problems import Problem, random_rotation
+from cadalign.evaluation.simulation import Problem, random_rotation
 from cadalign.geometry.metrics import rotation_error
 
 CAMERA = Camera(640, 480, 935.0, 935.0, 319.5, 239.5)

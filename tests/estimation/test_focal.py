@@ -31,7 +31,7 @@ from cadalign.datasets import Bundler, Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation import focal_search
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
-from cadalign.evaluation.simulation.problems import SIMULATION_CAMERA, Problem, simulate_problem
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 from cadalign.solvers.focal import linear_focal
 

@@ -22,7 +22,7 @@ from cadalign import (
 )
 from cadalign.cli import main
 from cadalign.errors import InputError
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation

@@ -15,7 +15,7 @@ from support.problems import with_outliers
 import cadalign
 from cadalign import Alignment, Camera, RansacOptions, fit, fit_batch
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.geometry.metrics import rotation_error, scale_error
 
 CAMERA = Camera(width=640, height=480, fx=935.0, fy=935.0, cx=319.5, cy=239.5)

@@ -26,7 +26,7 @@ from cadalign import (
 from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.estimation.result_parts import Stated
-from cadalign.evaluation.simulation.problems import UNIT_BOUNDS, simulate_standing_boxes
+from cadalign.evaluation.simulation import UNIT_BOUNDS, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation

@@ -24,7 +24,7 @@ from cadalign import (
     fit,
 )
 from cadalign.errors import CadalignError, InputError
-from cadalign.evaluation.simulation.problems import Problem
+from cadalign.evaluation.simulation import Problem
 from cadalign.render import Scene, cast_geometry
 from cadalign.shapes.examples import Example
 

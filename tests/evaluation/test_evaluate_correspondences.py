@@ -33,7 +33,7 @@ from cadalign.evaluation.instances.correspondences import (
 from cadalign.evaluation.methods.method import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.evaluation.summary import Quartiles
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera

@@ -27,7 +27,7 @@ from cadalign.evaluation.methods.registry import choose_methods, registered_meth
 from cadalign.evaluation.photos.objects import photos_benchmark
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 
 
 @pytest.fixture(autouse=True)

@@ -20,7 +20,7 @@ from cadalign.evaluation.experiments.simulation import (
     sweep_benchmark,
     sweep_tasks,
 )
-from cadalign.evaluation.simulation.problems import simulate_problem
+from cadalign.evaluation.simulation import simulate_problem
 
 
 def simulate(sweep: str, **options: Any) -> Any:

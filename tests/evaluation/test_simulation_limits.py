@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Camera, fit, fit_batch
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation.problems import Problem, random_rotation, simulate_problem
+from cadalign.evaluation.simulation import Problem, random_rotation, simulate_problem
 from cadalign.geometry.metrics import rotation_error, scale_error, translation_error
 
 pytestmark = pytest.mark.slow

@@ -10,9 +10,13 @@ import pytest
 from cadalign import Alignment
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
-from cadalign.datasets.models.annotated_symmetry import symmetry_group
-from cadalign.datasets.models.keypoints import Circle, RotationalSymmetry, Symmetries
-from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.datasets.models.keypoints import (
+    Circle,
+    RotationalSymmetry,
+    Symmetries,
+    symmetry_group,
+)
+from cadalign.evaluation.simulation import random_rotation
 from cadalign.geometry.metrics import rotation_error, translation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.geometry.symmetry_group import SymmetryGroup

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from cadalign import Alignment, Box
 from cadalign.errors import InputError
-from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.evaluation.simulation import random_rotation
 from cadalign.geometry.box import BOX_EDGES
 
 SEEDS = st.integers(0, 2**32 - 1)

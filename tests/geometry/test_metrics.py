@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Alignment, Box, Camera
 from cadalign.errors import InputError
-from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.evaluation.simulation import random_rotation
 from cadalign.geometry.metrics import (
     alignment_box_iou,
     box_iou,

@@ -20,7 +20,7 @@ from cadalign.estimation.options import LOSSES
 from cadalign.estimation.uncertainty.residuals import bent
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import RetrievalTask, observe_model
-from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.evaluation.simulation import random_rotation
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.absence import SAME_SHAPE, shape_distance
 from cadalign.retrieval.kernels import error_bound, search_all

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.problems import problem_of
 
 from cadalign import Alignment
-from cadalign.evaluation.simulation.problems import Problem
+from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.metrics import rotation_error
 from cadalign.solvers.minimal import ap4p
 

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.evaluation.simulation import random_rotation
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 from cadalign.solvers.alignment import Objective
 from cadalign.solvers.constants import LINEAR, ScalePrior

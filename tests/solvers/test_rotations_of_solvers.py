@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Camera, RansacOptions, Result, fit
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.simulation.problems import random_rotation
+from cadalign.evaluation.simulation import random_rotation
 from cadalign.solvers import aepnp, aepnp_paper
 from cadalign.solvers.linalg import rotation_from_quaternion
 

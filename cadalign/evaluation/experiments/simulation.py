@@ -1,7 +1,7 @@
 """The AEPnP paper's simulation: errors of methods while one quantity is varied.
 
 640 x 480 px, f = 150 px, points in [-1, 1)^3, true scales in [0.5, 2]; see
-`cadalign.evaluation.simulation.problems.simulate_problem`. A summary is of one metric, over the
+`cadalign.evaluation.simulation.simulate_problem`. A summary is of one metric, over the
 problems that a method solved at one value.
 """
 
@@ -25,7 +25,7 @@ from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import OK, Columns, Plan, Row
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import convert, in_file

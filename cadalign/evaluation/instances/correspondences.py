@@ -24,7 +24,7 @@ from cadalign.evaluation.experiments.correspondences import COLUMNS, NAMES, Corr
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.runs.work import Row, fingerprint
-from cadalign.evaluation.simulation.problems import Problem, simulate_problem
+from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.seeding import instance_rng

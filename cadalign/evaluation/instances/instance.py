@@ -1,7 +1,7 @@
 """Test instances of an annotated model: a view, a stretch, noisy visible keypoints, symmetry.
 
 An estimate that is off by a rotation that maps the object onto itself shows the same object in the
-same place: that is no error. `cadalign.datasets.models.annotated_symmetry` finds these rotations.
+same place: that is no error. `cadalign.datasets.models.keypoints` finds these rotations.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
-from cadalign.datasets.models.annotated_symmetry import symmetry_group
+from cadalign.datasets.models.keypoints import symmetry_group
 from cadalign.errors import CadalignError, TooFewVisibleError
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_views
 from cadalign.evaluation.runs.work import Row

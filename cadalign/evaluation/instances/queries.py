@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets.models.categories import require_category
+from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.experiments.retrieval import (

@@ -11,8 +11,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
 from cadalign.arrays import FloatArray
+from cadalign.datasets.formats import open_photos
 from cadalign.datasets.photos.dataset import PhotoDataset
-from cadalign.datasets.photos.formats import open_photos
 from cadalign.datasets.photos.photo import CadModel, NamedPoints, Photo, PhotoObject
 from cadalign.errors import DataError
 from cadalign.evaluation.benchmark import Case, Tasks

@@ -1,4 +1,7 @@
-"""Simulated videos with a known answer: an object that moves smoothly, with missed keypoints."""
+"""Simulated problems with a known answer: the AEPnP paper's, boxes on the ground, and videos.
+
+In a video an object moves smoothly, and some of its keypoints are missed.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.estimation.tracks.motion import Motion, moved_by
 from cadalign.estimation.view import View
-from cadalign.evaluation.simulation.problems import random_rotation
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
+from cadalign.geometry.rotations import rotation_from_quat_wxyz, rotation_from_vector
 
+SIMULATION_CAMERA = Camera(width=640, height=480, fx=150.0, fy=150.0, cx=319.5, cy=239.5)
+"""The paper's virtual camera."""
 TRACK_CAMERA = Camera(width=640, height=480, fx=600.0, fy=600.0, cx=319.5, cy=239.5)
 USUAL_MOTION = Motion(angular_sigma=20.0, linear_sigma=0.15)
 """Strengths of the simulated accelerations, of an object of about unit size."""
@@ -22,6 +27,112 @@ _STEPS = 4  # of the motion, between frames
 _MARGIN = 0.5  # of the model's origin from the image's borders, over half its size
 _NEAREST, _FARTHEST = 1.5, 5.0  # depths of the origin
 _TRIES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Keypoints on a model (n, 3) and in an image (n, 2) [px], and the alignment that joins them.
+
+    ``outliers`` (n,) are the observations that have nothing to do with their points; None where
+    there are none.
+    """
+
+    points_3d: FloatArray
+    points_2d: FloatArray
+    camera: Camera
+    alignment: Alignment
+    outliers: BoolArray | None
+
+
+def simulate_problem(
+    rng: np.random.Generator,
+    *,
+    points: int,
+    noise_px: float,
+    outlier_share: float = 0.0,
+    camera: Camera = SIMULATION_CAMERA,
+    depth: tuple[float, float] = (4.0, 8.0),
+    stretch: tuple[float, float] = (0.5, 2.0),
+) -> Problem:
+    """Draw one problem of the paper's simulation.
+
+    The object's points are uniform in the cube [-1, 1)^3 and the rotation is uniform. The model is
+    the object with y and z divided by stretches drawn from ``stretch``, so the true scale is (1,
+    s_y, s_z). The object's centre lies at a depth drawn from ``depth``, up to one unit off the
+    optical axis. ``noise_px`` is the standard deviation of the Gaussian noise on each image
+    coordinate; ``outlier_share`` of the observations, rounded to a whole number of them, are moved
+    to anywhere in the image instead. All randomness comes from ``rng``.
+
+    Examples
+    --------
+    >>> problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=0.0)
+    >>> reprojected = problem.camera.project(problem.alignment.apply(problem.points_3d))
+    >>> bool(np.allclose(reprojected, problem.points_2d))
+    True
+    """
+    scale = np.array([1.0, *rng.uniform(*stretch, 2)])
+    translation = np.array([*rng.uniform(-1, 1, 2), rng.uniform(*depth)])
+    alignment = Alignment(random_rotation(rng), translation, scale)
+    points_3d = rng.uniform(-1, 1, (points, 3)) / scale
+    points_2d = camera.project(alignment.apply(points_3d))
+    points_2d = points_2d + noise_px * rng.standard_normal(points_2d.shape)
+    count = round(outlier_share * points)
+    if not count:
+        return Problem(points_3d, points_2d, camera, alignment, None)
+    outliers = np.zeros(points, dtype=bool)
+    outliers[rng.choice(points, size=count, replace=False)] = True
+    points_2d[outliers] = rng.uniform(-0.5, [camera.width - 0.5, camera.height - 0.5], (count, 2))
+    return Problem(points_3d, points_2d, camera, alignment, outliers)
+
+
+UNIT_BOUNDS: FloatArray = np.array([[-0.5] * 3, [0.5] * 3])
+"""Lowest and highest coordinates of a unit cube."""
+
+
+def simulate_standing_boxes(
+    rng: np.random.Generator,
+    *,
+    objects: int,
+    camera: Camera,
+    camera_height: float = 1.6,
+    points: int = 10,
+    noise_px: float = 1.0,
+) -> tuple[list[Problem], FloatArray]:
+    """Draw objects that stand on the ground, 3 to 5 ahead of a camera that looks down at them.
+
+    They have a unit cube's bounds, stretched. Returns the problem of each, and the direction (3,)
+    against gravity in the camera.
+
+    Examples
+    --------
+    >>> camera = Camera(640, 480, 700, 700, 319.5, 239.5)
+    >>> boxes, up = simulate_standing_boxes(np.random.default_rng(0), objects=2, camera=camera)
+    >>> lowest = [each.alignment.apply(UNIT_BOUNDS)[0] for each in boxes]
+    >>> np.round([-up @ corner for corner in lowest], 6).tolist()
+    [1.6, 1.6]
+    """
+    tilt = rotation_from_vector(np.array([rng.uniform(0.17, 0.5), 0.0, 0.0]))
+    up: FloatArray = tilt @ [0.0, -1.0, 0.0]
+    ahead = np.array([0.0, 0.0, 1.0]) - up * up[2]
+    problems: list[Problem] = []
+    while len(problems) < objects:
+        model = rng.uniform(-0.5, 0.5, (points, 3))
+        scale = np.array([1.0, *np.exp(rng.normal(0.0, 0.2, 2))])
+        turn = rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
+        upright = tilt @ rotation_from_vector(np.array([np.pi, 0.0, 0.0]))
+        place = rng.uniform(3, 5) * ahead / np.linalg.norm(ahead)
+        place = place + [rng.uniform(-1, 1), 0.0, 0.0] - up * (camera_height - scale[1] / 2)
+        pose = Alignment(upright @ turn, place, scale)
+        pixels = camera.project(pose.apply(model))
+        if camera.contains(pixels).all():
+            pixels = pixels + noise_px * rng.normal(size=pixels.shape)
+            problems.append(Problem(model, pixels, camera, pose, None))
+    return problems, up
+
+
+def random_rotation(rng: np.random.Generator) -> FloatArray:
+    """A rotation matrix (3, 3), uniform over all rotations."""
+    return rotation_from_quat_wxyz(rng.standard_normal(4))
 
 
 @dataclass(frozen=True, eq=False)

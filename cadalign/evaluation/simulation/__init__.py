@@ -1,1 +1,0 @@
-"""Simulated problems: those of the AEPnP paper, and videos."""

@@ -1,10 +1,10 @@
-"""Make the documentation's pictures: overview, annotator, conventions, architecture.
+"""Make the documentation's pictures: overview, chairs, annotator, conventions, architecture.
 
     python scripts/make_pictures.py overview
 
-The annotator's photo and model are those of `align_other_chair.py`, whose files are needed:
+The annotator's photo and model are those of `chairs`, whose files are needed:
 
-    python scripts/align_other_chair.py --files chairs
+    python scripts/make_pictures.py chairs --files chairs
     python scripts/make_pictures.py annotator --files chairs
 """
 
@@ -13,28 +13,45 @@ from __future__ import annotations
 import re
 import sys
 import tempfile
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
+import cv2
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
-from align_other_chair import write_row
 from matplotlib.axes import Axes
 
-from cadalign import Box, Observation, fit
+from cadalign import Alignment, Box, Camera, Observation, fit
+from cadalign.annotate.lines import Wireframe
+from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
-from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.datasets import AnnotatedModel, KeypointNet, ModelKeypoints, write_sample_dataset
 from cadalign.evaluation.instances.instance import load_scene, make_instance
-from cadalign.render import RaycastRenderer, draw_overlay
+from cadalign.io.images import read_image, write_image
+from cadalign.render import (
+    Angles,
+    RaycastRenderer,
+    Scene,
+    draw_overlay,
+    draw_still,
+    pose_in_view,
+    visible_keypoints,
+)
+from cadalign.render.drawing.canvas import ByteImage, composite
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 MODELS = (("chair", "000"), ("car", "002"), ("bottle", "002"), ("vessel", "003"))
 COLORS = {"x": "#c62828", "y": "#2e7d32", "z": "#1565c0"}
 WIDTH, ROW, TOP = 1080, 34, 56
+CHAIR_CAMERA = Camera.from_fov(640, 720, fov_x=33.0)
+CHAIR_VIEW = Angles(azimuth=143.0, elevation=24.0)
+PHOTO_GROUND = (206, 208, 212)
+LINE = (35, 208, 255)
 # Layers by kind, and the kind's colour.
 KINDS = {
     "#e8e8ec": "errors names arrays notebook seeding compile",
@@ -84,6 +101,101 @@ def _overlay(dataset: KeypointNet, category: str, number: str) -> np.ndarray:
     )
 
 
+def chairs(
+    *,
+    out: Path | None = None,
+    photo_of: str = "006",
+    model: str = "000",
+    files: Path | None = None,
+    width: int = 1500,
+) -> None:
+    """Align one sample chair to a photo of another: the README's worked example.
+
+    The photo is a rendering of the one chair; keypoints are joined by their semantic ids.
+
+    Parameters
+    ----------
+    out : Path, optional
+        Where to write the picture; by default beside the files, or docs/other_chair.png.
+    photo_of : str
+        The sample chair in the photo.
+    model : str
+        The sample chair that is aligned to it.
+    files : Path, optional
+        Folder for the photo, the observation and the model's keypoints.
+    width : int
+        Width of the picture in pixels.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        root = files or Path(folder)
+        dataset = KeypointNet(write_sample_dataset(root / "sample"))
+        seen, own = (dataset["chair", f"sample_chair_{name}"] for name in (photo_of, model))
+        photo = root / "photo.png"
+        observation = observe(seen, own, photo)
+        observation.save(root / "photo.json")
+        ModelKeypoints.of_model(own).save(root / f"{own.model_id}.keypoints.json")
+        result = fit(observation.points_3d, observation.points_2d, observation.camera, sigma=None)
+        print(result)
+
+        scene = Scene(own.load_mesh())
+        image = read_image(photo, CHAIR_CAMERA)
+        aligned = draw_overlay(
+            with_wireframe(image, ClickableModel(scene.mesh), result.alignment),
+            CHAIR_CAMERA,
+            est_box=Box.from_model(scene.bounds, result.alignment),
+            observed=observation.points_2d,
+            reprojected=CHAIR_CAMERA.project(result.alignment.apply(observation.points_3d)),
+            legend=False,
+        )
+        out = out or (Path("docs") if files is None else files) / "other_chair.png"
+        write_row(out, [image, still(scene), aligned], width=width)
+
+
+def observe(seen: AnnotatedModel, model: AnnotatedModel, photo: Path) -> Observation:
+    """Render the photo; its visible keypoints, with the other model's points of the same ids."""
+    scene = Scene(seen.load_mesh())
+    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
+    write_image(photo, still(scene))
+    visible = visible_keypoints(scene, seen.keypoints.xyz, CHAIR_CAMERA, pose)
+    in_photo = seen.keypoints.xyz[visible]
+    shared, rows, model_rows = np.intersect1d(
+        seen.keypoints.ids[visible], model.keypoints.ids, return_indices=True
+    )
+    return Observation(
+        points_3d=model.keypoints.xyz[model_rows],
+        points_2d=CHAIR_CAMERA.project(pose.apply(in_photo[rows])),
+        camera=CHAIR_CAMERA,
+        ids=shared,
+        image=photo,
+        model=model.mesh_path,
+        fit_options={"sigma": None},  # two chairs agree less well than pixels do
+    )
+
+
+def still(scene: Scene) -> ByteImage:
+    """A picture of a chair, (h, w, 3) uint8."""
+    pose = pose_in_view(scene, CHAIR_CAMERA, CHAIR_VIEW)
+    color = draw_still(RaycastRenderer(), scene, CHAIR_CAMERA, pose, samples=16)
+    return composite(color, PHOTO_GROUND)
+
+
+def with_wireframe(image: ByteImage, model: ClickableModel, alignment: Alignment) -> ByteImage:
+    """The photo with the lines of the stretched model."""
+    drawn = image.copy()
+    for start, end in Wireframe.of_model(model).seen_in(CHAIR_CAMERA, alignment):
+        ends = [tuple(np.round(16 * point).astype(int).tolist()) for point in (start, end)]
+        cv2.line(drawn, *ends, LINE, 1, cv2.LINE_AA, shift=4)
+    return drawn
+
+
+def write_row(path: Path, pictures: Sequence[np.ndarray], *, width: int) -> None:
+    """Write pictures of one height side by side, shrunk to a width [px] in all."""
+    row = np.hstack(pictures)
+    height = round(row.shape[0] * width / row.shape[1])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_image(path, cv2.resize(row, (width, height), interpolation=cv2.INTER_AREA))
+
+
 def annotator(*, out: Path = DOCS / "annotator.png", files: Path) -> None:
     """The annotator in a headless browser.
 
@@ -92,7 +204,7 @@ def annotator(*, out: Path = DOCS / "annotator.png", files: Path) -> None:
     out : Path
         Where to write the picture.
     files : Path
-        Where `align_other_chair.py` has written its files.
+        Where `chairs` has written its files.
     """
     sys.path.insert(0, str(ROOT / "tests"))
     from support.annotating import IDLE, opened_page, wait
@@ -204,5 +316,5 @@ def architecture() -> None:
 
 if __name__ == "__main__":
     tyro.extras.subcommand_cli_from_dict(
-        {each.__name__: each for each in (overview, annotator, conventions, architecture)}
+        {each.__name__: each for each in (overview, chairs, annotator, conventions, architecture)}
     )

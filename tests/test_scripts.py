@@ -56,8 +56,8 @@ def test_every_script_starts(
 def test_the_worked_photo_aligns_as_its_page_says(
     tmp_path: Path, run: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    files, script = tmp_path / "chairs", ROOT / "scripts" / "align_other_chair.py"
-    assert run(script, "--files", str(files)) == 0
+    files, script = tmp_path / "chairs", ROOT / "scripts" / "make_pictures.py"
+    assert run(script, "chairs", "--files", str(files)) == 0
     assert (files / "other_chair.png").is_file()
     assert main(["fit", str(files / "photo.json"), "--out", str(tmp_path / "fit")]) == 0
     page = (ROOT / "docs" / "photo_to_glb.md").read_text(encoding="utf-8")

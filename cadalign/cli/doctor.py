@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import time
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cadalign.cli.common import JsonOption, answer, new_console, print_json, waiting
+from cadalign.errors import InputError
 
 if TYPE_CHECKING:
-    from cadalign.cli.health import Health
     from cadalign.datasets import PhotoSummary
+    from cadalign.render.probe import Probe
+
 
 # Problems of a data set that are printed; JSON has all.
 _SHOWN = 10
@@ -37,8 +42,6 @@ class Doctor(JsonOption):
             return self._check_data(self.data)
         if self.compile:
             return self._compile()
-        from cadalign.cli.health import examine
-
         with waiting("trying the renderers, each in a process of its own ..."):
             health = examine()
         if self.json:
@@ -49,7 +52,6 @@ class Doctor(JsonOption):
 
     def _compile(self) -> int:
         from cadalign.cli.compile_ahead import compile_ahead
-        from cadalign.cli.health import compiled_cache, require_cache
 
         require_cache()
         began = time.perf_counter()
@@ -63,10 +65,11 @@ class Doctor(JsonOption):
         return 0
 
     def _check_data(self, folder: Path) -> int:
-        from cadalign.cli.health import examine_data
+        from cadalign.datasets import open_photos
 
         with waiting("reading the annotations ...") as show:
-            summary = examine_data(folder, progress=lambda count: show(f"{count} photos read ..."))
+            dataset = open_photos(folder)
+            summary = dataset.summary(progress=lambda count: show(f"{count} photos read ..."))
         if self.json:
             print_json({**asdict(summary), "root": str(summary.root)})
         else:
@@ -120,3 +123,73 @@ def _print_data(summary: PhotoSummary) -> None:
         answer(f"Left out: {problem}")
     if len(summary.problems) > _SHOWN:
         answer(f"... and {len(summary.problems) - _SHOWN} more problems; --json has all")
+
+
+@dataclass(frozen=True)
+class Health:
+    """Findings of `examine`."""
+
+    renderers: tuple[Probe, ...]
+    """All of them, ray casting last."""
+    best: str
+    """The renderer that "auto" selects."""
+    remedies: dict[str, str]
+    """For each renderer that does not work, the command that would enable it."""
+    cores: int
+    usable_cores: int
+    """Those that this process may use."""
+    cache: str
+    """Location and state of the cache of compiled solvers."""
+    python: str
+    numpy: str
+    numba: str
+
+
+def examine() -> Health:
+    """Try every renderer in a process of its own and collect the rest; takes some seconds."""
+    from cadalign.render.probe import RENDERERS, best_renderer, probe_renderer, remedy
+
+    renderers = tuple(probe_renderer(name, timed=True) for name in RENDERERS)
+    return Health(
+        renderers=renderers,
+        best=best_renderer(),
+        remedies={found.name: command for found in renderers if (command := remedy(found))},
+        cores=os.cpu_count() or 1,
+        usable_cores=_usable_cores(),
+        cache=compiled_cache(),
+        python=platform.python_version(),
+        numpy=version("numpy"),
+        numba=version("numba"),
+    )
+
+
+def compiled_cache() -> str:
+    """Describe the cache of compiled solvers: its folder, and how many functions it holds."""
+    from cadalign.compile.files import SHIPPED, can_write, kernel_folder, usable_target
+
+    folder = kernel_folder()
+    count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
+    shipped = sum(1 for _ in SHIPPED.glob("*.nbi")) if usable_target(SHIPPED) else 0
+    came = f"{shipped} functions came with the installation; " if shipped else ""
+    if count:
+        return f"{came}{count} functions kept in {folder}"
+    if can_write(folder):
+        return f"{came}none yet; they will be kept in {folder}"
+    fix = "set NUMBA_CACHE_DIR, or every process compiles anew"
+    return f"{came}{folder} cannot be written to; {fix}"
+
+
+def require_cache() -> None:
+    """Refuse to compile ahead where nothing of it could be kept."""
+    from cadalign.compile.files import can_write, kernel_folder
+
+    folder = kernel_folder()
+    if not can_write(folder):
+        fix = "set NUMBA_CACHE_DIR to a folder that can be"
+        raise InputError(f"{folder} cannot be written to", where="--compile", fix=fix)
+
+
+def _usable_cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -15,8 +15,7 @@ from PIL import Image
 from support.refusals import refusal_line
 
 from cadalign import Camera
-from cadalign.cli.doctor import Doctor
-from cadalign.cli.health import Health, compiled_cache
+from cadalign.cli.doctor import Doctor, Health, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
 from cadalign.datasets.sfm.correspondences import CameraView
@@ -277,7 +276,7 @@ def _health(**changes):
 
 
 def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys):
-    monkeypatch.setattr("cadalign.cli.health.examine", _health)
+    monkeypatch.setattr("cadalign.cli.doctor.examine", _health)
     monkeypatch.setenv("COLUMNS", "160")
     assert Doctor().run() == 0
     text = capsys.readouterr().out
@@ -291,7 +290,7 @@ def test_doctor_tells_what_works_and_how_to_enable_the_rest(monkeypatch, capsys)
 
 def test_doctor_fails_where_not_even_ray_casting_works(monkeypatch, capsys):
     broken = Probe("raycast", False, "embreex is gone", "")
-    monkeypatch.setattr("cadalign.cli.health.examine", lambda: _health(renderers=(broken,)))
+    monkeypatch.setattr("cadalign.cli.doctor.examine", lambda: _health(renderers=(broken,)))
     assert Doctor().run() == 1
 
 
@@ -309,7 +308,7 @@ def test_the_state_of_the_cache_is_told(tmp_path, monkeypatch):
 
 def test_nothing_is_compiled_ahead_that_could_not_be_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr("cadalign.cli.health.can_write", lambda folder: False)
+    monkeypatch.setattr("cadalign.compile.files.can_write", lambda folder: False)
     assert refusal_line(capsys, "doctor", "--compile") == (
         f"--compile: {tmp_path} cannot be written to; set NUMBA_CACHE_DIR to a folder that can be"
     )

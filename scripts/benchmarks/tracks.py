@@ -16,7 +16,7 @@ from cadalign import Motion, RansacOptions, Result, ShapeModel, Tracker, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.evaluation.metrics.errors import rotation_jitter_deg
-from cadalign.evaluation.simulation import SimulatedTrack, simulate_track, with_mistakes
+from cadalign.evaluation.simulated_tracks import SimulatedTrack, simulate_track, with_mistakes
 from cadalign.metrics import rotation_error
 
 _RADIUS_95 = 7.815  # squared, of three degrees of freedom

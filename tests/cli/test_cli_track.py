@@ -15,7 +15,7 @@ from support.refusals import refusal_line
 from cadalign import Camera, ShapeModel
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
-from cadalign.evaluation.simulation import TRACK_CAMERA, SimulatedTrack, simulate_track
+from cadalign.evaluation.simulated_tracks import TRACK_CAMERA, SimulatedTrack, simulate_track
 from cadalign.geometry.rotations import angle_between
 from cadalign.io.images import Video, write_image
 from cadalign.render import RaycastRenderer, Scene, look_at

@@ -8,7 +8,7 @@ import pytest
 from cadalign import ShapeModel, Tracker, align
 from cadalign.estimation.result import Result
 from cadalign.estimation.tracks.frames import SuccessiveErrors
-from cadalign.evaluation.simulation import (
+from cadalign.evaluation.simulated_tracks import (
     SimulatedTrack,
     simulate_track,
     with_correlated_errors,

@@ -21,7 +21,7 @@ from cadalign import (
 )
 from cadalign.errors import InputError
 from cadalign.estimation.tracks.tracker import TrackUpdate
-from cadalign.evaluation.simulation import SimulatedTrack, simulate_track, with_mistakes
+from cadalign.evaluation.simulated_tracks import SimulatedTrack, simulate_track, with_mistakes
 from cadalign.geometry.rotations import angle_between, rotation_from_vector
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 
 from cadalign import Motion, RansacOptions, Result, ShapeModel, View, align
 from cadalign.errors import DegenerateError, InputError
-from cadalign.evaluation.simulation import SimulatedTrack, simulate_track, with_mistakes
+from cadalign.evaluation.simulated_tracks import SimulatedTrack, simulate_track, with_mistakes
 from cadalign.geometry.rotations import angle_between, vector_from_rotation
 
 pytestmark = pytest.mark.slow

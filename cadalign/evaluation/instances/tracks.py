@@ -42,7 +42,7 @@ from cadalign.evaluation.metrics.errors import (
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Row, fingerprint
 from cadalign.evaluation.shape_files import learn
-from cadalign.evaluation.simulation import (
+from cadalign.evaluation.simulated_tracks import (
     simulate_track,
     with_correlated_errors,
     with_mistakes,

@@ -24,7 +24,7 @@ from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoin
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.options import absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.evaluation.runs.work import FAILED, Columns, Plan, Row, Rows
+from cadalign.evaluation.runs.work import FAILED, Columns, Plan, Row, Rows, fingerprint_of_files
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, parse_json
 from cadalign.io.files import read_text
@@ -148,6 +148,8 @@ def plan_run(options: ManyOptions, folder: RunFolder) -> Plan[ObservationTask]:
         "contents": tasks.fingerprint(),
         **options.contents(),
     }
+    if files := tasks.named_files():
+        config["files"] = fingerprint_of_files(files)
     drawn_in = folder.made_for_pictures() if options.pictures else None
     chunk = max(1, min(LARGEST_CHUNK, len(tasks) // _LEAST_CHUNKS))
     estimates = ManyEstimates(absolute_paths(options), model, drawn_in)

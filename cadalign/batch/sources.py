@@ -11,7 +11,8 @@ import hashlib
 from array import array
 from bisect import bisect_right
 from codecs import BOM_UTF8
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from glob import glob
 from itertools import accumulate
 from pathlib import Path
@@ -34,6 +35,7 @@ from cadalign.io.observation import (
     kind_of,
     refuse_photo_or_mesh,
 )
+from cadalign.io.observation_file import named_files
 
 _DAMAGED = "damaged"
 
@@ -64,6 +66,9 @@ class Source(Protocol):
     def fingerprint(self) -> str:
         """A text that changes with the content."""
 
+    def named_files(self) -> Iterable[Path]:
+        """Photos, masks and meshes that the observations name."""
+
 
 class Files(list[Path]):
     """Observation files, one each."""
@@ -74,6 +79,11 @@ class Files(list[Path]):
 
     def fingerprint(self) -> str:
         return fingerprint_of_files(self)
+
+    def named_files(self) -> Iterator[Path]:
+        for path in self:
+            with suppress(DataError):  # whoever reads it says so
+                yield from _named_files(read_bytes(path), path)
 
 
 class Lines:
@@ -115,6 +125,11 @@ class Lines:
     def fingerprint(self) -> str:
         return self._digest
 
+    def named_files(self) -> Iterator[Path]:
+        with open_input(self._path) as file:
+            for line in file:
+                yield from _named_files(line.removeprefix(BOM_UTF8), self._path)
+
 
 class Detections:
     """A detector's file, which memory holds whole; objects that cannot be read come last."""
@@ -137,6 +152,9 @@ class Detections:
 
     def fingerprint(self) -> str:
         return fingerprint(read_bytes(self._path))
+
+    def named_files(self) -> Iterable[Path]:
+        return ()
 
 
 class ObservationTasks(Sequence[ObservationTask]):
@@ -168,6 +186,11 @@ class ObservationTasks(Sequence[ObservationTask]):
     def fingerprint(self) -> str:
         """A text that changes with the content of the inputs."""
         return fingerprint("\n".join(source.fingerprint() for source in self._sources))
+
+    def named_files(self) -> tuple[Path, ...]:
+        """Photos, masks and meshes that the observations name, each once."""
+        found = (path for source in self._sources for path in source.named_files())
+        return tuple(dict.fromkeys(found))
 
 
 def read_sources(inputs: Iterable[Path]) -> ObservationTasks:
@@ -223,6 +246,13 @@ def _of_file(path: Path) -> Source:
     if suffix == TABLE or _kind_of_file(path) == DETECTOR:
         return Detections(path)
     return Files([path])
+
+
+def _named_files(content: bytes, path: Path) -> list[Path]:
+    try:
+        return list(named_files(msgspec.json.decode(content), path.parent))
+    except (msgspec.MsgspecError, UnicodeError, RecursionError):
+        return []
 
 
 def _folder(path: Path) -> str:

@@ -240,6 +240,27 @@ def test_another_input_or_option_is_refused(tmp_path: Path) -> None:
         cadalign.fit_many(source, out=tmp_path / "run", method="aepnp")
 
 
+@pytest.mark.parametrize("name", ["o.json", "o.jsonl"])
+def test_a_run_does_not_go_on_with_another_photo_or_mesh(tmp_path: Path, name: str) -> None:
+    photo, mesh = tmp_path / "photo.jpg", tmp_path / "chair.ply"
+    photo.write_bytes(b"one")
+    mesh.write_bytes(b"one")
+    data = json.loads(lines(tmp_path / "o.jsonl", 1).read_text())
+    (tmp_path / "o.jsonl").unlink()
+    data |= {"image": photo.name, "model": mesh.name}
+    (tmp_path / name).write_text(json.dumps(data), encoding="utf-8")
+    assert not isinstance(cadalign.fit_many(tmp_path, out=tmp_path / "run")[0], CadalignError)
+    cadalign.fit_many(tmp_path, out=tmp_path / "run")
+    for changed in (photo, mesh):
+        before = changed.stat().st_mtime_ns
+        changed.write_bytes(b"another")
+        with pytest.raises(DataError, match="another configuration: files is"):
+            cadalign.fit_many(tmp_path, out=tmp_path / "run")
+        changed.write_bytes(b"one")
+        os.utime(changed, ns=(before, before))
+    cadalign.fit_many(tmp_path, out=tmp_path / "run")
+
+
 @pytest.mark.parametrize(
     ("options", "where"),
     [

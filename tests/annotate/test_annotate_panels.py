@@ -14,7 +14,7 @@ from support.web import axe_script
 
 from cadalign.datasets import write_sample_dataset
 
-DESKTOP, PHONE = (1440, 900), (390, 844)
+DESKTOP, PHONE = (1280, 800), (390, 844)
 SERIOUS = ("serious", "critical")
 COLOURS = ["color-contrast", "link-in-text-block"]
 ONLY_COLOURS: dict[str, Any] = {"runOnly": COLOURS}

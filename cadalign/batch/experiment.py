@@ -22,6 +22,7 @@ from cadalign.datasets.detections.image_keypoints import (
 )
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.estimation.result import Result
 from cadalign.evaluation.options import absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import FAILED, Columns, Plan, Row, Rows, fingerprint_of_files
@@ -82,17 +83,26 @@ class ManyEstimates:
             seen = self._observation(task)
             found = self.options.estimate_of(seen, task.name)
         except CadalignError as error:
+            if seen is not None:
+                self._draw(task, naming_row(task.row, task.name, seen), seen, None)
             return _failed(task, str(error), seen)
         seen, result = found.observation, found.result
         row = naming_row(task.row, task.name, seen) | result_row(result) | found.cells
-        if self.folder is not None and task.row < self.options.pictures:
-            from cadalign.batch.pictures import draw_fit
-
-            troubles = draw_fit(self.folder, row, seen, result)
-            row["warning_count"] += len(troubles)
-            row["warnings"] = "; ".join(filter(None, (row["warnings"], *troubles)))
+        troubles = self._draw(task, row, seen, result)
+        row["warning_count"] += len(troubles)
+        row["warnings"] = "; ".join(filter(None, (row["warnings"], *troubles)))
         timing = {"row": task.row, "seconds": time.perf_counter() - start}
         return Rows([row], [timing], [_record(task.row, seen, found)])
+
+    def _draw(
+        self, task: ObservationTask, row: Row, seen: Observation, result: Result | None
+    ) -> tuple[str, ...]:
+        """Write the pictures of an observation, if it is one of those; says what is not drawn."""
+        if self.folder is None or task.row >= self.options.pictures:
+            return ()
+        from cadalign.batch.pictures import draw_fit
+
+        return draw_fit(self.folder, row, seen, result)
 
     def _observation(self, task: ObservationTask) -> Observation:
         folder, shape = Path(task.folder), self.options.learned

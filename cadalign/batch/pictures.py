@@ -49,30 +49,33 @@ def _names_of(model: Path) -> tuple[str, str]:
     return name, name
 
 
-def draw_fit(folder: RunFolder, row: Row, seen: Observation, result: Result) -> tuple[str, ...]:
-    """Write the pictures of an aligned observation; says what could not be drawn.
+def draw_fit(
+    folder: RunFolder, row: Row, seen: Observation, result: Result | None
+) -> tuple[str, ...]:
+    """Write the pictures of an observation, aligned or not; says what could not be drawn.
 
-    ``pictures`` gets the photo, ``thumbs`` the part around the object with its box, ``sketches`` a
+    ``pictures`` gets the photo, ``thumbs`` the part around the object with its box, ``previews`` a
     preview of the model's mesh, warped to the estimated shape. Raises AbortError if a picture
     cannot be written, as on a full disk.
     """
+    camera = seen.camera if result is None else result.camera
     names = page_names(row)
     stem = record_stem(names["category"], names["model_id"])
     troubles = []
     photo = mesh = None
     try:
-        photo = None if seen.image is None else read_image(seen.image, result.camera)
+        photo = None if seen.image is None else read_image(seen.image, camera)
     except CadalignError as error:
         troubles.append(f"the photo is not shown: {error}")
     try:
-        mesh = _mesh(seen, result)
+        mesh = None if result is None else _mesh(seen, result)
     except CadalignError as error:
         troubles.append(f"the model is shown as a box: {error}")
     try:
         if photo is not None:
-            small, camera = shown_photo(photo, result.camera)
+            small, shrunk = shown_photo(photo, camera)
             write_webp(folder.pictures / f"{stem}.webp", small)
-            write_webp(folder.thumbs / f"{stem}.webp", _thumb(small, camera, result))
+            write_webp(folder.thumbs / f"{stem}.webp", _thumb(small, shrunk, seen, result))
         if mesh is not None:
             write_preview(folder.previews / f"{stem}.json", mesh)
     except (DataError, OSError) as error:
@@ -91,9 +94,13 @@ def _mesh(seen: Observation, result: Result) -> Mesh | None:
     return None if seen.model is None else load_mesh(seen.model)
 
 
-def _thumb(photo: ByteImage, camera: Camera, result: Result) -> ByteImage:
-    box = Box.from_model(result.bounds, result.alignment)
-    observed = rescaled_pixels(result.views[0].points_2d, camera.width / result.camera.width)
+def _thumb(photo: ByteImage, camera: Camera, seen: Observation, result: Result | None) -> ByteImage:
+    box = None if result is None else Box.from_model(result.bounds, result.alignment)
+    observed = rescaled_pixels(seen.points_2d, camera.width / seen.camera.width)
     drawn = draw_overlay(photo, camera, est_box=box, observed=observed, axes=False, legend=False)
-    points = np.concatenate([observed, camera.project_where_ahead(box.corners)])
-    return cut_out(drawn, camera, points[np.isfinite(points).all(axis=1)])[0]
+    ends = np.empty((0, 2)) if box is None else camera.project_where_ahead(box.corners)
+    points = np.concatenate([observed, ends])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        points = np.array([[0, 0], [camera.width, camera.height]], dtype=float)
+    return cut_out(drawn, camera, points)[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
 from cadalign.evaluation.instances.pictures import cut_out
 from cadalign.evaluation.runs.folder import RunFolder
+from cadalign.io.images import read_photo, write_image
 from cadalign.report import headline_text, write_report
 
 CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
@@ -98,6 +100,24 @@ def test_runs_without_instances_are_for_a_page_of_their_own(
     cadalign.simulate(sweep="points", runs=1, values=(10,), out=tmp_path / "sim", workers=0)
     with pytest.raises(InputError, match=r"sim is a run of .*, plain one of fit; write a report"):
         write_report([runs["plain"], tmp_path / "sim"], tmp_path / "r.html")
+
+
+def test_failed_fits_show_their_photos_and_keypoints(tmp_path: Path, opened: Opened) -> None:
+    photo = tmp_path / "photo.png"
+    write_image(photo, np.full((480, 640, 3), (40, 140, 90), dtype=np.uint8))
+    good = replace(next(observations()), image=photo)
+    line = replace(good, points_3d=POINTS[:1] * np.arange(1.0, 9.0)[:, None])
+    cadalign.fit_many([good, line], out=tmp_path / "run", pictures=2)
+    page = opened(write_report([tmp_path / "run"], tmp_path / "run" / "r.html").path.as_uri())
+    failed = page.locator("figure, li, button", has_text="failed").locator("img").first
+    expect(failed).to_be_visible()
+    assert failed.evaluate("image => image.decode().then(() => image.naturalWidth)") > 100
+    for kind in ("pictures", "thumbs"):
+        shown = sorted((tmp_path / "run" / kind).glob("*.webp"))
+        assert len(shown) == 2
+        for each in shown:
+            middle = read_photo(each)[5, 5].astype(int)
+            assert np.abs(middle - (40, 140, 90)).max() < 12
 
 
 def test_thumbnails_show_the_middle_of_the_object() -> None:

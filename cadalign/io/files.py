@@ -50,6 +50,26 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 
 @contextmanager
+def writing_folder(path: Path) -> Iterator[Path]:
+    """Write, within the block, a folder such that it is there whole or as it was.
+
+    What is written to the folder beside it that the block is given takes its place at the end.
+    """
+    import tempfile
+
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Not a plain folder name beside it: two runs at once must not share one.
+        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+            unfinished = Path(folder, "unfinished")
+            unfinished.mkdir()
+            yield unfinished
+            if path.exists():
+                path.rename(Path(folder, "replaced"))
+            unfinished.rename(path)
+
+
+@contextmanager
 def keeping(inputs: Iterable[Path | None]) -> Iterator[None]:
     """Refuse, within the block, to write over the files that something is made from.
 

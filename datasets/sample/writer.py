@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import colorsys
 import hashlib
 import json
 import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -16,19 +14,19 @@ import numpy as np
 
 from cadalign.arrays import is_whole
 from cadalign.datasets.models.shapenet import SYNSETS
-from cadalign.datasets.sample.household import bottle, chair
-from cadalign.datasets.sample.model import Draft, SampleKeypoint, SampleModel, finish
-from cadalign.datasets.sample.vehicles import car, vessel
-from cadalign.errors import DataError, InputError
-from cadalign.io.files import as_path, writing
+from cadalign.datasets.sample.bottles import bottle
+from cadalign.datasets.sample.cars import car
+from cadalign.datasets.sample.chairs import chair
+from cadalign.datasets.sample.model import SampleModel, finish
+from cadalign.datasets.sample.vessels import vessel
+from cadalign.errors import DataError, InputError, unknown
+from cadalign.io.files import as_path, dense_json, writing_folder
 from cadalign.io.meshes.files import write_ply_mesh
 
-_Maker = Callable[[np.random.Generator, int], Draft]
-MAKERS: dict[str, _Maker] = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}
+MAKERS = {"chair": chair, "bottle": bottle, "car": car, "vessel": vessel}
 """By category: draws and builds the model with a number; the styles take turns with the number."""
 _SPLITS = ("train", "train", "train", "train", "val", "test")  # take turns by number
 _MARKER = "sample_dataset.json"
-_LARGEST_OFFSET = 0.08
 
 
 def sample_models(
@@ -64,16 +62,14 @@ def sample_models(
     >>> model.model_id, len(model.keypoints)
     ('sample_bottle_000', 17)
     """
-    names = _check_arguments(per_category, categories, seed)
+    names = _checked(per_category, categories, seed)
 
     def make(category: str, index: int) -> SampleModel:
         rng = np.random.default_rng([seed, int(SYNSETS[category]), index])
-        # Real models are not centred either; x stays, so that x = 0 remains the mirror plane.
-        offset = rng.uniform(-_LARGEST_OFFSET, _LARGEST_OFFSET, size=3) * (0, 1, 1)
-        if category == "bottle":
-            offset[2] = 0.0
-        draft, model_id = MAKERS[category](rng, index), f"sample_{category}_{index:03d}"
-        return finish(draft, category=category, model_id=model_id, offset=offset)
+        # Real models are not centred either; but planes and axes of symmetry stay at 0.
+        offset = rng.uniform(-0.08, 0.08, size=3) * (0, 1, category != "bottle")
+        draft = MAKERS[category](rng, index)
+        return finish(draft, category, f"sample_{category}_{index:03d}", offset)
 
     return (make(category, index) for category in names for index in range(per_category))
 
@@ -116,101 +112,73 @@ def write_sample_dataset(
         If ``root`` is a file or holds anything else, or cannot be written.
     """
     target = as_path(root, "root")
-    names = _check_arguments(per_category, categories, seed)
+    names = _checked(per_category, categories, seed)
     _check_replaceable(target)
     origin = {"categories": names, "per_category": int(per_category), "seed": int(seed)}
     with suppress(OSError):
         if keep and (target / _MARKER).read_text(encoding="utf-8") == _marker(target, origin):
             return target
-    with writing(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # Not a plain folder name beside it: two runs at once must not share one.
-        with tempfile.TemporaryDirectory(
-            prefix=f".{target.name}.", suffix=".partial", dir=target.parent
-        ) as folder:
-            data = Path(folder, "data")
-            data.mkdir()
-            _write(data, names, per_category, seed)
-            (data / _MARKER).write_text(_marker(data, origin), encoding="utf-8")
-            if target.exists():
-                target.rename(Path(folder, "replaced"))
-            data.rename(target)
+    splits: dict[str, list[str]] = {name: [] for name in _SPLITS}
+    annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
+    with writing_folder(target) as data:
+        for model in sample_models(per_category=per_category, categories=names, seed=seed):
+            synset, records = SYNSETS[model.category], annotations[model.category]
+            path = data / "ShapeNetCore.v2.ply" / synset / f"{model.model_id}.ply"
+            write_ply_mesh(path, model.mesh)
+            splits[_SPLITS[len(records) % len(_SPLITS)]].append(f"{synset}-{model.model_id}\n")
+            records.append(_annotation(model))
+        texts = {f"annotations/{name}.json": dense_json(annotations[name]) for name in names}
+        texts |= {f"splits/{split}.txt": "".join(lines) for split, lines in splits.items()}
+        for place, text in texts.items():
+            (data / place).parent.mkdir(exist_ok=True)
+            (data / place).write_text(text, encoding="utf-8", newline="\n")
+        (data / _MARKER).write_text(_marker(data, origin), encoding="utf-8")
     return target
 
 
-def _check_arguments(
-    per_category: int, categories: Sequence[str] | None, seed: int
-) -> tuple[str, ...]:
+def _checked(per_category: int, categories: Sequence[str] | None, seed: int) -> tuple[str, ...]:
     for name, value, least in (("per_category", per_category, 1), ("seed", seed, 0)):
         if not is_whole(value) or value < least:
             what = f"must be an integer >= {least}, not {value!r}"
             raise InputError(what, where=name, fix=f"give {least} or more")
-    if categories is None:
-        return tuple(MAKERS)
-    if isinstance(categories, str):
-        what = "a single text, not a sequence"
-        raise InputError(what, where="categories", fix=f"give [{categories!r}]")
-    unknown = [name for name in categories if name not in MAKERS]
-    if unknown or not categories or len(set(categories)) < len(categories):
-        what = f"unknown category {unknown[0]!r}" if unknown else f"{list(categories)!r}"
-        fix = f"give some of {', '.join(MAKERS)}, each once"
-        raise InputError(what, where="categories", fix=fix)
-    return tuple(categories)
-
-
-def _write(root: Path, names: Sequence[str], per_category: int, seed: int) -> None:
-    splits: dict[str, list[str]] = {name: [] for name in _SPLITS}
-    annotations: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
-    for model in sample_models(per_category=per_category, categories=names, seed=seed):
-        synset, records = SYNSETS[model.category], annotations[model.category]
-        write_ply_mesh(root / "ShapeNetCore.v2.ply" / synset / f"{model.model_id}.ply", model.mesh)
-        splits[_SPLITS[len(records) % len(_SPLITS)]].append(f"{synset}-{model.model_id}\n")
-        records.append(_annotation(model))
-    (root / "annotations").mkdir()
-    for name, records in annotations.items():
-        text = json.dumps(records, separators=(",", ":"))
-        (root / "annotations" / f"{name}.json").write_text(text, encoding="utf-8")
-    (root / "splits").mkdir()
-    for split, lines in splits.items():
-        path = root / "splits" / f"{split}.txt"
-        path.write_text("".join(lines), encoding="utf-8", newline="\n")
+    names = tuple(MAKERS if categories is None else categories)
+    if isinstance(categories, str) or not names or len(set(names)) < len(names):
+        fix = f"give a list of some of {', '.join(MAKERS)}, each once"
+        raise InputError(f"cannot be {categories!r}", where="categories", fix=fix)
+    for name in names:
+        if name not in MAKERS:
+            raise unknown("category", name, MAKERS, where="categories")
+    return names
 
 
 def _annotation(model: SampleModel) -> dict[str, Any]:
+    """A model's entry; symmetries name keypoints by their rows."""
     row = {keypoint.semantic_id: i for i, keypoint in enumerate(model.keypoints)}
-    mirrored = [{"kp_indexes": [row[number] for number in pair]} for pair in model.mirrored]
-    turned = []
+    reflection = [{"kp_indexes": [row[number] for number in pair]} for pair in model.mirrored]
+    rotation: list[dict[str, Any]] = []
     for group in model.turned:
-        rows = [row[semantic_id] for semantic_id in group]
-        circle = _circle(model, rows) if model.round else {}
-        turned.append({"kp_indexes": rows, "is_circle": model.round, "circle": circle})
-    return {
-        "class_id": SYNSETS[model.category],
-        "model_id": model.model_id,
-        "keypoints": [_keypoint_entry(keypoint) for keypoint in model.keypoints],
-        "symmetries": {"reflection": mirrored, "rotation": turned},
-    }
-
-
-def _keypoint_entry(keypoint: SampleKeypoint) -> dict[str, Any]:
-    # Steps of the golden ratio around the colour circle never come back to a colour.
-    rgb = colorsys.hsv_to_rgb(keypoint.semantic_id * 0.6180339887498949 % 1.0, 0.85, 0.95)
-    return {
-        "xyz": keypoint.xyz.tolist(),
-        "rgb": [round(255 * value) for value in rgb],
-        "semantic_id": keypoint.semantic_id,
-        "pcd_info": {"point_index": keypoint.vertex_index},
-        "mesh_info": {"face_index": keypoint.face_index, "face_uv": keypoint.barycentric.tolist()},
-    }
-
-
-def _circle(model: SampleModel, rows: Sequence[int]) -> dict[str, Any]:
-    points = np.array([model.keypoints[row].xyz for row in rows])
-    # The axis is that of the model, not the mean of a few points on a polygon.
-    center = model.mesh.bounds.mean(axis=0)
-    center[1] = points[:, 1].mean()
-    radius = float(np.linalg.norm(points - center, axis=1).mean())
-    return {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
+        rows, circle = [row[number] for number in group], {}
+        if model.round:
+            # The axis is that of the model, not the mean of points on a polygon.
+            xyz = np.array([model.keypoints[i].xyz for i in rows])
+            center = np.where([1, 0, 1], model.mesh.bounds.mean(axis=0), xyz.mean(axis=0))
+            radius = float(np.linalg.norm(xyz - center, axis=1).mean())
+            circle = {"center": center.tolist(), "radius": radius, "normal": [0.0, 1.0, 0.0]}
+        rotation.append({"kp_indexes": rows, "is_circle": model.round, "circle": circle})
+    colors = np.round(255 * np.asarray(model.mesh.vertex_colors)[:, :3]).astype(int).tolist()
+    keypoints = [
+        {
+            "xyz": each.xyz.tolist(),
+            "rgb": colors[each.vertex_index],
+            "semantic_id": each.semantic_id,
+            "pcd_info": {"point_index": each.vertex_index},
+            "mesh_info": {"face_index": each.face_index, "face_uv": each.barycentric.tolist()},
+        }
+        for each in model.keypoints
+    ]
+    symmetries = {"reflection": reflection, "rotation": rotation}
+    names = {"class_id": SYNSETS[model.category], "model_id": model.model_id}
+    return names | {"keypoints": keypoints, "symmetries": symmetries}
 
 
 def _marker(root: Path, origin: dict[str, Any]) -> str:
@@ -228,10 +196,9 @@ def _check_replaceable(target: Path) -> None:
         raise DataError("is a file", where=str(target), fix="give a folder")
     ours = {_MARKER, *(f"splits/{split}.txt" for split in _SPLITS)}
     ours |= {f"annotations/{category}.json" for category in MAKERS}
-    is_sample = (target / _MARKER).is_file()
     for path in sorted(path for path in target.rglob("*") if not path.is_dir()):
         place = path.relative_to(target)
         known = place.as_posix() in ours or place.match("ShapeNetCore.v2.ply/*/sample_*.ply")
-        if not (is_sample and known):
+        if not known or not (target / _MARKER).is_file():
             what = f"holds files that are not of a sample data set, such as {path.name}"
             raise DataError(what, where=str(target), fix="give a new or an empty folder")

@@ -15,9 +15,10 @@ from scipy.spatial import cKDTree
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample import SampleModel, sample_models, write_sample_dataset
-from cadalign.datasets.sample.model import box, closest_barycentric, ellipsoid, split_creases
+from cadalign.datasets.sample.parts import box, lathe
 from cadalign.datasets.sample.writer import MAKERS
 from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.geometry.mesh import join
 
 CATEGORIES = {"bottle": "02876657", "car": "02958343", "chair": "03001627", "vessel": "04530566"}
 MOMENTS = Path(__file__).parents[1] / "fixtures" / "sample_models.json"
@@ -306,12 +307,10 @@ def test_parts_are_closed_and_face_outward(category: str) -> None:
 def test_keypoints_are_placed_on_the_surface_or_close_to_it(category: str) -> None:
     for index in range(12):
         draft = MAKERS[category](np.random.default_rng(index), index)
-        triangles = np.concatenate([part.triangles for part in draft.parts])
-        size = np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0))
-        places = [np.array(place) for place in draft.places.values()]
-        found = closest_barycentric(triangles, places)
-        for place, (face, weights) in zip(places, found, strict=True):
-            assert np.linalg.norm(weights @ triangles[face] - place) < 0.02 * size
+        whole, places = join(draft.parts, category), np.array([*draft.places.values()])
+        found = whole.surface_points(*whole.closest(places))
+        size = np.linalg.norm(np.ptp(whole.bounds, axis=0))
+        assert np.linalg.norm(found - places, axis=1).max() < 0.02 * size
 
 
 def test_models_of_a_category_differ(models: tuple[SampleModel, ...]) -> None:
@@ -445,31 +444,9 @@ def test_parts_have_the_size_and_volume_they_should() -> None:
     soft = box((0, 0, 0), (2, 4, 6), (1, 2, 3), radius=0.2, steps=6)
     np.testing.assert_allclose(np.ptp(soft.vertices, axis=0), (2, 4, 6))
     assert 0.95 * 48 < soft.to_trimesh().volume < 48
-    ball = ellipsoid((0, 0, 0), (2, 4, 6), (1, 2, 3), count=64)
-    assert ball.to_trimesh().volume == pytest.approx(np.pi * 48 / 6, rel=0.01)
-
-
-def test_creases_double_vertices_only_where_the_surface_is_sharp() -> None:
-    block = box((0, 0, 0), (1, 1, 1), (0, 0, 0))
-    split = split_creases(block)
-    assert len(split.vertices) == 24
-    np.testing.assert_allclose(split.triangles, block.triangles)
-    ball = ellipsoid((0, 0, 0), (1, 1, 1), (0, 0, 0), count=32)
-    assert len(split_creases(ball).vertices) == len(ball.vertices)
-
-
-def test_closest_point_of_a_triangle_beats_all_others() -> None:
-    rng = np.random.default_rng(0)
-    samples = rng.dirichlet((1, 1, 1), size=2000)
-    for _ in range(40):
-        triangle, point = rng.normal(size=(1, 3, 3)), rng.normal(size=3) * 2
-        ((_, weights),) = closest_barycentric(triangle, [point])
-        assert weights.min() >= 0
-        assert weights.sum() == pytest.approx(1.0)
-        found = np.linalg.norm(weights @ triangle[0] - point)
-        others = np.linalg.norm(samples @ triangle[0] - point, axis=1)
-        assert found <= others.min() + 1e-12
-        assert found >= others.min() - 0.2
+    angle = np.linspace(0, np.pi, 33)
+    ball = lathe(np.stack([np.sin(angle), -2 * np.cos(angle)], axis=1), (1, 2, 3), count=64)
+    assert ball.to_trimesh().volume == pytest.approx(4 * np.pi * 2 / 3, rel=0.01)
 
 
 def moments(model: SampleModel) -> list[float]:

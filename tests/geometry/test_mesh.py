@@ -71,6 +71,22 @@ def test_surface_points_refuse_faces_that_are_not_there(number: int) -> None:
     )
 
 
+def test_the_closest_point_beats_all_others() -> None:
+    rng = np.random.default_rng(0)
+    samples = rng.dirichlet((1, 1, 1), size=(3, 700))
+    for _ in range(40):
+        mesh = Mesh(rng.normal(size=(9, 3)), np.arange(9).reshape(3, 3))
+        points = 2 * rng.normal(size=(2, 3))
+        face, weights = mesh.closest(points)
+        assert weights.min() >= 0
+        np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+        found = np.linalg.norm(mesh.surface_points(face, weights) - points, axis=1)
+        others = (samples @ mesh.triangles).reshape(-1, 1, 3) - points
+        best = np.linalg.norm(others, axis=2).min(axis=0)
+        assert (found <= best + 1e-12).all()
+        assert (found >= best - 0.3).all()
+
+
 def test_trimesh_gets_the_faces_in_the_same_order() -> None:
     made = MESH.to_trimesh()
     assert made.faces.tolist() == FACES.tolist()

@@ -7,14 +7,12 @@ from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass,
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-import numpy as np
-
 from cadalign.errors import DataError
 from cadalign.estimation.detector_noise import opened_noise
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.options import ExperimentOptions, plain_value
 from cadalign.evaluation.runs.work import Columns, Row, fingerprint
 from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import read_bytes
@@ -78,7 +76,7 @@ class ManyOptions(ExperimentOptions):
 
     def as_config(self) -> dict[str, Any]:
         """The options in a run's configuration, without those that are at their defaults."""
-        return {name: _plain(value) for name, value in self._given().items()}
+        return {name: plain_value(value) for name, value in self._given().items()}
 
     def _given(self) -> dict[str, Any]:
         given: dict[str, Any] = {}
@@ -157,13 +155,3 @@ def _paths(value: Any) -> Iterator[Path]:
     elif isinstance(value, dict | list | tuple):
         for each in value.values() if isinstance(value, dict) else value:
             yield from _paths(each)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(each) for name, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return str(value.absolute()) if isinstance(value, Path) else value

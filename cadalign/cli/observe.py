@@ -19,7 +19,6 @@ from cadalign.cli.common import (
     file_stems,
     make_folder,
     make_folder_of,
-    new_console,
     say,
 )
 from cadalign.cli.options import CameraOptions, EvidenceOptions, named_as_flags
@@ -193,7 +192,7 @@ class Observe(CameraOptions, EvidenceOptions):
 
 def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: ModelKeypoints) -> int:
     """Write an observation of each object; returns the exit code, 3 where some are left out."""
-    from rich.progress import track
+    from cadalign.cli.runs import tracked
 
     for name, given in {"object": command.object, **command.given}.items():
         if name in ("object", "mask", "depth") and given is not None:
@@ -203,7 +202,6 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
         raise InputError(what, where="--image", fix="give the photos' folder, or leave out --every")
     folder = command.out or beside(command.keypoints, "_observations")
     make_folder(folder)
-    console = new_console()
     failed = 0
     if command.tracks:
         tracks: dict[str | None, list[ImageKeypoints]] = {}  # those without are one
@@ -213,14 +211,8 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
     else:
         groups = [[each] for each in objects]
         texts = [Path(each.image or "").stem or "photo" for each in objects]
-    shown = track(
-        list(zip(groups, _slugs(texts), strict=True)),
-        "observing",
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
-    for found, name in shown:
+    named = zip(groups, _slugs(texts), strict=True)
+    for found, name in tracked(named, "observing", total=len(groups)):
         out = folder / f"{name}.json"
         try:
             if command.tracks:
@@ -229,7 +221,7 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
                 command.observe(found[0], model, _photo(found[0], command.image), out)
         except CadalignError as error:
             failed += 1
-            console.print(f"left out: {name}: {error}", markup=False)
+            say(f"left out: {name}: {error}")
     kind = "tracks" if command.tracks else "objects"
     answer(f"{len(groups) - failed} of {len(groups)} {kind}: {folder}")
     return exit_code(failed, len(groups))

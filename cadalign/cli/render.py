@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from cadalign.cli.common import make_folder_of, new_console, say
+from cadalign.cli.common import make_folder_of, say
 from cadalign.cli.options import named_as_flags
 
 if TYPE_CHECKING:
@@ -61,8 +61,7 @@ class Render:
             return self._draw(RenderJob.of(self))
 
     def _draw(self, job: RenderJob) -> int:
-        from rich.progress import track
-
+        from cadalign.cli.runs import tracked
         from cadalign.io.images import write_image
         from cadalign.render import write_movie
         from cadalign.render.drawing.movie import MOVIES
@@ -70,8 +69,7 @@ class Render:
         make_folder_of(self.out)
         if self.out.suffix.lower() in MOVIES:
             frames, count = job.movie()
-            shown = track(frames, "drawing", total=count, console=new_console(), transient=True)
-            write_movie(self.out, shown, fps=self.fps)
+            write_movie(self.out, tracked(frames, "drawing", total=count), fps=self.fps)
         else:
             write_image(self.out, job.picture())
         drawn_by = job.renderer.drawn_by(job.scene, samples=self.samples)

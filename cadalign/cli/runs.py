@@ -6,7 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.progress import (
     BarColumn,
@@ -26,7 +26,7 @@ from cadalign.errors import DataError
 from cadalign.io.observation import DetectorOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from cadalign.batch.options import ManyOptions
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from cadalign.io.observation import ObservationChanges
     from cadalign.render import OverlayStyle
 
+T = TypeVar("T")
 _MOST_REASONS, _MOST_OF_EVALUATIONS = 10, 3
 _ON_PAGE = 5000
 """Observations beyond which the page is left to `cadalign report`."""
@@ -91,10 +92,10 @@ class _Rate(ProgressColumn):
 
 
 @contextmanager
-def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
-    """Show a progress bar with rate and time left; yields what takes a run's progress."""
+def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Show a progress bar with rate and time left; yields what takes how many of all are done."""
     if not sys.stderr.isatty():  # rich would end in an empty line; before 14.3 also if disabled
-        yield lambda state: None
+        yield lambda done, total: None
         return
     with Progress(
         TextColumn("{task.description}"),
@@ -108,7 +109,22 @@ def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
         transient=True,
     ) as progress:
         bar = progress.add_task(label, total=None)
-        yield lambda state: progress.update(bar, total=state.total, completed=state.done)
+        yield lambda done, total: progress.update(bar, total=total, completed=done)
+
+
+@contextmanager
+def run_progress(label: str) -> Iterator[Callable[[RunProgress], None]]:
+    """Show a progress bar; yields what takes a run's progress."""
+    with progress_bar(label) as show:
+        yield lambda state: show(state.done, state.total)
+
+
+def tracked(items: Iterable[T], label: str, *, total: int) -> Iterator[T]:
+    """The items one after the other, while a progress bar is shown."""
+    with progress_bar(label) as show:
+        for done, item in enumerate(items):
+            show(done, total)
+            yield item
 
 
 def inputs_of(command: ManyCommand, changes: ObservationChanges) -> dict[str, Any]:

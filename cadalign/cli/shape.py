@@ -11,7 +11,7 @@ import tyro
 
 from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
 from cadalign.cli.options import named_as_flags
-from cadalign.cli.runs import run_progress
+from cadalign.cli.runs import progress_bar
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
 from cadalign.render.drawing.shape_picture import draw_shape
@@ -49,16 +49,14 @@ class ShapeLearn:
             return self._learn(dataset)
 
     def _learn(self, dataset: KeypointNet) -> int:
-        from cadalign.evaluation.runs.run import Progress
-
-        with run_progress(f"learning {self.category}") as on_progress:
+        with progress_bar(f"learning {self.category}") as on_progress:
             model = ShapeModel.from_dataset(
                 dataset,
                 self.category,
                 split=self.split,
                 components=self.components,
                 modes=self.modes,
-                on_progress=lambda done, total: on_progress(Progress(done, total)),
+                on_progress=on_progress,
             )
         out = Path(f"{model.category}.shape") if self.out is None else self.out
         model.save(out)

@@ -59,7 +59,7 @@ class ExperimentOptions:
         Some stand there only if they are given; others are left to the rest of it.
         """
         options = asdict(self).items()
-        stored = {name: _absolute(each) for name, each in options if name not in self.not_stored}
+        stored = {name: plain_value(each) for name, each in options if name not in self.not_stored}
         config = {k: v for k, v in stored.items() if v is not None or k not in self.if_given}
         return {**config, "experiment": self.experiment}
 
@@ -94,10 +94,15 @@ class ExperimentOptions:
             object.__setattr__(self, name, value)
 
 
-def _absolute(value: Any) -> Any:
-    if isinstance(value, Path):
-        return str(value.absolute())
-    return [_absolute(each) for each in value] if isinstance(value, tuple) else value
+def plain_value(value: Any) -> Any:
+    """The value as JSON has it, the paths in it absolute."""
+    if isinstance(value, dict):
+        return {name: plain_value(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_value(each) for each in value]
+    if hasattr(value, "tolist"):  # an array
+        return value.tolist()
+    return str(value.absolute()) if isinstance(value, Path) else value
 
 
 @dataclass(frozen=True, kw_only=True)

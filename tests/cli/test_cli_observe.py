@@ -390,7 +390,8 @@ def test_the_photos_of_a_track_are_views_of_one_observation(
     command[1] = str(folder / "found.csv")
     assert main(command) == 0
     out = folder / "found_observations"
-    assert "2 of 2 tracks" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert ("2 of 2 tracks" in said.out, said.err) == (True, "")
     assert sorted(path.name for path in out.iterdir()) == ["1.json", "car_b.json"]
     observation = Observation.load(out / "1.json")
     assert [len(view.points_2d) for view in observation.views] == [24, 24]

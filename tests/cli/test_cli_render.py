@@ -102,9 +102,11 @@ def test_an_mp4_is_a_turntable(model, tmp_path):
 
 
 @pytest.mark.parametrize("ending", [".webm", ".gif"])
-def test_other_movies_are_turntables_too(model, tmp_path, ending):
+def test_other_movies_are_turntables_too(model, tmp_path, ending, capsys):
     out = tmp_path / f"t{ending}"
     _run(model, "--out", out, "--size", "80x60", "--seconds", 0.3, "--fps", 10)
+    (line,) = capsys.readouterr().err.splitlines()  # no progress bar where no terminal is
+    assert line.startswith("Written: ")
     assert out.stat().st_size > 100
 
 

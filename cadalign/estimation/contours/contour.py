@@ -7,14 +7,14 @@ difference of the two contours is free of both.
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
+from cadalign.estimation.contours.sampling import Image, sampled
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import RayCaster
@@ -32,8 +32,6 @@ REACH = 2.0
 _STEP = 0.25
 
 
-Image = npt.NDArray[np.float32]
-AnyImage = TypeVar("AnyImage", Image, npt.NDArray[np.uint8])
 _LONGEST_STEP = 1.5  # [px], between rays on a normal: a thinner part may be missed
 _MOST_STEPS = 24  # to either side
 _PRECISION = 0.01  # [px], of a rim
@@ -163,23 +161,6 @@ def crossings(
     with np.errstate(divide="ignore", invalid="ignore"):
         found = places[nearest, every] + _STEP * (before - 0.5) / (before - after)
     return np.where(np.isfinite(distance[nearest, every]), found, np.nan)
-
-
-def sampled(image: Image, points: FloatArray) -> FloatArray:
-    """Values (n,) of an image at points (n, 2), bilinear."""
-    return interpolated(image, points).astype(np.float64)
-
-
-def interpolated(image: AnyImage, points: FloatArray) -> AnyImage:
-    """Values (n,) or colours (n, c) of an image (h, w) or (h, w, c) at points (n, 2), bilinear."""
-    single = points.astype(np.float32)
-    found = np.empty((len(points), *image.shape[2:]), dtype=image.dtype)
-    for start in range(0, len(points), 30_000):  # OpenCV takes 32,767
-        part = slice(start, start + 30_000)
-        x, y = (np.ascontiguousarray(single[part, axis, None]) for axis in (0, 1))
-        border = cv2.BORDER_REPLICATE
-        found[part] = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border)[:, 0]
-    return found
 
 
 def _resampled(points: FloatArray, normals: FloatArray) -> tuple[FloatArray, FloatArray]:

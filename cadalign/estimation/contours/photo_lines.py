@@ -18,7 +18,6 @@ from cadalign.estimation.contours.contour import (
     across_rims,
     contour_of,
     find_rims,
-    interpolated,
     without_steep,
 )
 from cadalign.estimation.contours.line_changes import (
@@ -31,6 +30,7 @@ from cadalign.estimation.contours.line_changes import (
     steps_of,
     with_neighbours,
 )
+from cadalign.estimation.contours.sampling import colors_at
 from cadalign.estimation.contours.surface import PosedSurface
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -83,25 +83,18 @@ class PhotoPyramid(NamedTuple):
     def colors(self, points: FloatArray, step: float) -> ByteImage:
         """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
         level = self._level(step)
-        return interpolated(self.levels[level], rescaled_pixels(points, 0.5**level))
+        return colors_at(self.levels[level], rescaled_pixels(points, 0.5**level))
 
     def cells(
         self, corner: FloatArray, cell: float, shape: tuple[int, ...], step: float
     ) -> tuple[ByteImage, BoolArray]:
         """Colours (h, w, 3) of cells ``cell`` [px] apart from a pixel on, and if they are seen."""
-        level = self._level(step)
-        (x, y), spacing = rescaled_pixels(corner, 0.5**level), cell * 0.5**level
-        colors = cv2.warpAffine(
-            self.levels[level],
-            np.array([[spacing, 0.0, x], [0.0, spacing, y]]),
-            shape[1::-1],
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
         columns, rows = (corner[axis] + cell * np.arange(shape[1 - axis]) for axis in (0, 1))
+        places = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+        colors = self.colors(places, step).reshape(*shape, 3)
         is_column = (columns >= 0) & (columns <= self.camera.width - 1)
         is_row = (rows >= 0) & (rows <= self.camera.height - 1)
-        return np.asarray(colors, dtype=np.uint8), is_row[:, None] & is_column
+        return colors, is_row[:, None] & is_column
 
     def _level(self, step: float) -> int:
         """Number of the copy whose pixels are at most as large as a step [px]."""
@@ -112,7 +105,7 @@ def photo_of(
     image: int, camera: Camera, pixels: ByteImage, depth: MeasuredDepths | None = None
 ) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
-    levels = [np.ascontiguousarray(pixels)]
+    levels = [np.array(pixels, order="C")]  # kernels are compiled anew for read-only arrays
     while min(levels[-1].shape[:2]) > _SMALLEST:
         height, width = levels[-1].shape[:2]
         size = (width // 2, height // 2)

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.estimation.contours.contour import Image, sampled
+from cadalign.estimation.contours.sampling import Image, sampled
 from cadalign.estimation.contours.surface import RigidSurface, rigid_surface
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -266,16 +266,9 @@ class FacedMask(NamedTuple):
         in_camera = rays @ turn.T
         is_ahead = camera.is_wide | (in_camera[:, 2:] > 1e-6)
         pixels = camera.project(np.where(is_ahead, in_camera, [0, 0, 1]))
-        single = np.clip(pixels, -1e6, 1e6).astype(np.float32).reshape(CELLS, CELLS, 2)
         # Averages over a cell, where it holds several pixels.
         blur = max(cell * camera.fx / 3, 0.3)
         soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur)
-        image = cv2.remap(
-            soft,
-            np.ascontiguousarray(single[..., 0]),
-            np.ascontiguousarray(single[..., 1]),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-        )
+        image = sampled(np.pad(soft, 1), pixels + 1).reshape(CELLS, CELLS)
         is_seen = camera.contains(pixels)
-        return cls(np.asarray(image, dtype=np.float32), is_seen, rays, corner, cell, turn)
+        return cls(image.astype(np.float32), is_seen, rays, corner, cell, turn)

@@ -20,6 +20,7 @@ from cadalign.estimation.contours.contour import (
     find_rims,
     mask_contour,
 )
+from cadalign.estimation.contours.sampling import colors_at, sampled
 from cadalign.estimation.contours.view_contour import (
     Noise,
     correlation_length,
@@ -33,6 +34,17 @@ WIDTH, HEIGHT = 160, 120
 def distances(center: tuple[float, float]) -> np.ndarray:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     return np.hypot(columns - center[0], rows - center[1])
+
+
+def test_images_are_read_at_exact_places_and_beyond_them_at_their_border() -> None:
+    rows, columns = np.mgrid[:3, :4000]
+    inside = np.random.default_rng(0).uniform([0, 0], [3999, 2], (1000, 2))
+    ramp = (columns + 7 * rows).astype(np.float32)
+    assert np.abs(sampled(ramp, inside) - inside @ [1, 7]).max() < 1e-9
+    outside = np.array([[-5.0, 1.25], [4100.0, -np.inf], [12.5, np.inf], [np.nan, 9.0]])
+    assert sampled(ramp, outside).tolist() == [8.75, 3999.0, 26.5, 14.0]
+    photo = np.stack([ramp[:, :200], 255 - ramp[:, :200]], axis=-1).astype(np.uint8)
+    assert colors_at(photo, np.array([[17.6, 0.0], [300.0, 1.5]])).tolist() == [[18, 237], [210, 46]]
 
 
 def disc(center: tuple[float, float], radius: float) -> np.ndarray:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -138,7 +139,9 @@ def align_scene(
     -------
     AlignedScene
         An object that contradicts the others in what they share is aligned alone, and what is given
-        but contradicts them all is left out; the warnings name both.
+        but contradicts them all is left out; the warnings name both. An object that cannot be
+        aligned alone, as by a mask where the focal length is unknown, is aligned with what the
+        others tell, and tells them nothing.
 
     Raises
     ------
@@ -223,6 +226,12 @@ def align_scene(
         shared, members = _settled(members, shared, known, tilt, aligned)
     for member in members:
         found[member.number] = member.result
+    for number, each in enumerate(objects):
+        if isinstance(
+            found[number], CadalignError
+        ):  # as of a mask that does not tell the focal length
+            with suppress(CadalignError):
+                found[number] = aligned(each, shared.tilted(tilt))
     scene = AlignedScene(Results.of(found), camera, warnings=(*warnings, *contradictions))
     if "focal" in wanted:
         focal_std = shared.std("focal")

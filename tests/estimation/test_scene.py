@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 from support.refusals import refusal_line, refusal_text
 
 from cadalign import (
+    Alignment,
     Camera,
     FocalPrior,
+    Mesh,
     Model,
     RansacOptions,
     Result,
@@ -30,6 +33,7 @@ from cadalign.evaluation.simulation import UNIT_BOUNDS, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation
+from cadalign.render import Scene, cast_geometry
 
 FOCAL, HEIGHT = 700.0, 1.6
 CAMERA = Camera(640, 480, FOCAL, FOCAL, 319.5, 239.5)
@@ -254,6 +258,25 @@ def test_bad_object_stops_no_other() -> None:
     scene = align_scene([objects[0], replace(objects[1], view=few), objects[2]])
     assert list(scene.results.errors) == [1]
     assert isinstance(scene.results[2], Result)
+
+
+@pytest.mark.long
+def test_mask_alone_takes_the_focal_length_of_the_others() -> None:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
+    corners[corners[:, 1] > 0] *= [0.4, 1.0, 0.6]
+    corners[corners[:, 1] > 0] += [0.1, 0.0, 0.15]
+    mesh = Mesh(corners, ConvexHull(corners).simplices.astype(np.int64))
+    turn = rotation_from_vector([2.6, 0.5, 0.3])
+    truth = Alignment(turn, [0.4, 0.1, 3.0], np.ones(3))
+    seen = View(UNKNOWN, mask=cast_geometry(Scene(mesh), CAMERA, truth).mask)
+    others = Simulated(5, 3).objects(UNKNOWN)
+    masked = SceneObject(Model(mesh=mesh, stretch="none"), seen)
+    scene = align_scene([masked, *others])
+    found = scene.results[0]
+    assert isinstance(found, Result)
+    assert rotation_error(est=found.alignment, gt=truth) < 2
+    assert abs(np.log(found.camera.fx / FOCAL)) < 3 * found.std.focal < 0.3
+    assert scene.camera.fx == pytest.approx(align_scene(others).camera.fx)
 
 
 def test_prior_on_the_focal_length_counts_once() -> None:

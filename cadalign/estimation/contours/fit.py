@@ -11,6 +11,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DegenerateError
+from cadalign.estimation.contours.contour import SPACING, Sight
 from cadalign.estimation.contours.descent import ContourFit, Masked, Settled, settle, settle_with
 from cadalign.estimation.contours.measured import (
     Place,
@@ -50,6 +51,8 @@ _LEAST_PROBABILITY = 1e-5  # of such a rise of the other residuals by chance
 _LARGEST = 24.0  # [px]
 _HULL_GAIN = 0.5  # misfit of hulls, relative, below which these take the place of the outlines
 _INLIER = 3.5  # in standard deviations
+_UNCOVERED = 0.1  # share of a mask, outside of the model's silhouette
+_MOST_PIXELS = 5000  # of a mask, at which rays are cast for it
 _OPEN_BORDER = 3  # [px], within which a mask may go on outside of the image
 _LEAST_PIECE = 0.003  # of a piece of the mask, relative to the largest
 
@@ -153,6 +156,8 @@ def fit_masks(
         warnings.append(f"{where} contradicts the rest and is left out: {reason}{off}")
         left_out.append(contour)
         used = [each for each in used if each is not contour]
+    if used and search.is_proposed:
+        warnings.extend(_uncovered(best[0]))
     fits = best[0].settled.fits if used else ()
     residuals: list[MaskResiduals | None] = [None] * len(views)
     for contour, fit in [*zip(used, fits, strict=True), *((each, None) for each in left_out)]:
@@ -315,6 +320,30 @@ def _outline_cost(settled: Settled) -> float:
 def _distances(settled: Settled) -> FloatArray:
     every = [np.nan_to_num(np.abs(fit.residuals), nan=_LARGEST) for fit in settled.fits]
     return np.asarray(np.minimum(np.concatenate(every), _LARGEST))
+
+
+def _uncovered(best: _Candidate) -> list[str]:
+    """Report masks of which no occluder, but a wrong pose or model leaves a part uncovered.
+
+    The contour alone does not tell where the parts of an object are few pixels wide.
+    """
+    masked, state = best.masked, best.settled.joined.place.state
+    posed, poses = masked.at(state)
+    found = []
+    for contour, fit in zip(masked.views, best.settled.fits, strict=True):
+        camera = masked.camera_at(contour.image, contour.camera, state)
+        rows, columns = np.nonzero(contour.mask[0] >= 0.5)
+        pixels = np.column_stack([columns, rows])[:: 1 + len(rows) // _MOST_PIXELS]
+        covered = Sight(posed.caster, camera, poses[contour.image]).covers(pixels)
+        dilated = SPACING * len(contour.contour.points) * max(fit.offset, 0.0) / len(rows)
+        share = 1 - float(covered.mean()) - dilated
+        if share > _UNCOVERED:
+            found.append(
+                f"views[{contour.image}].mask: the silhouette of the best pose found leaves "
+                f"{100 * share:.0f} % of it uncovered: the pose may be wrong, or the model "
+                "another; a larger image of the object, or keypoints, tell more"
+            )
+    return found
 
 
 def _contradicting(

@@ -25,6 +25,7 @@ from cadalign.estimation.contours.view_contour import (
     cost_of_contour,
 )
 from cadalign.estimation.estimates import poses_of
+from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model, is_exact_model
 from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import evidence_of
@@ -51,6 +52,7 @@ _LEAST_PIXEL = 1.3  # of a smaller copy, in those of the mask
 _ROUGHLY = np.radians(10.0)  # standard deviation of a start's directions
 _ROUGH_STRETCH = 0.3  # of the logarithms of its lengths
 _MOST_SIGMAS = 3.0
+_LARGEST_FOCAL_SIGMA = 0.25  # relative: poses are sought at the focal length of the prior
 _WHERE = "views[0].mask"
 
 
@@ -152,14 +154,17 @@ def minima_of_mask(
     another pose has an outline alike. Their ``outline_score`` is what ranks them: warped to the
     mask, a model follows it in a wrong pose, too.
 
-    Raises InputError if the mask has no contour, the model no mesh, or the focal length is unknown.
+    Raises InputError if the mask has no contour, the model no mesh, or no prior says roughly what
+    the focal length is.
     """
     (view,), camera = problem.views, problem.lenses.cameras[0]
-    if not view.camera.focal_known:
+    known = prior_of_camera(problem.lenses.prior, camera)
+    if problem.lenses.count and (known is None or known.relative_sigma > _LARGEST_FOCAL_SIGMA):
         raise InputError(
             "a mask alone does not tell the focal length",
             where="views[0].camera",
-            fix="give a calibrated camera, or keypoints",
+            fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
+            f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
         )
     is_exact = is_exact_model(model)
     # The likelihoods of a similar model's proposals are calibrated for the mask itself.

@@ -44,7 +44,8 @@ def test_images_are_read_at_exact_places_and_beyond_them_at_their_border() -> No
     outside = np.array([[-5.0, 1.25], [4100.0, -np.inf], [12.5, np.inf], [np.nan, 9.0]])
     assert sampled(ramp, outside).tolist() == [8.75, 3999.0, 26.5, 14.0]
     photo = np.stack([ramp[:, :200], 255 - ramp[:, :200]], axis=-1).astype(np.uint8)
-    assert colors_at(photo, np.array([[17.6, 0.0], [300.0, 1.5]])).tolist() == [[18, 237], [210, 46]]
+    places = np.array([[17.6, 0.0], [300.0, 1.5]])
+    assert colors_at(photo, places).tolist() == [[18, 237], [210, 46]]
 
 
 def disc(center: tuple[float, float], radius: float) -> np.ndarray:

@@ -21,7 +21,8 @@ CAMERA = Camera(640, 480, 900, 900, 319.5, 239.5)
 def wedge() -> Mesh:
     """A box of which one side leans, so that no turn of it looks like another."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.4, 0.4) for z in (-0.3, 0.3)])
-    corners[corners[:, 1] > 0] *= [0.6, 1.0, 0.8]
+    top = corners[:, 1] > 0
+    corners[top] = [0.6, 1.0, 0.8] * corners[top] + [0.2, 0.0, 0.06]
     faces = [
         [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
         [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],

@@ -235,7 +235,7 @@ class Result(ResultData):
             return cls.from_dict(data)
 
     def to_dict(self) -> dict[str, Any]:
-        """Write the result as plain lists and numbers, for JSON, without model and trajectory."""
+        """Write the result as plain lists and numbers, for JSON, without the model."""
         from cadalign.estimation.document import write_result  # takes the validation library along
 
         return write_result(self)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -190,6 +191,21 @@ def test_poses_between_frames_and_beyond_them() -> None:
     assert near.covariance == pytest.approx(at_frame.covariance, rel=1e-3, abs=1e-9)
     with pytest.raises(InputError, match=r"time: nan is not a finite number"):
         path.at(float("nan"))
+
+    document = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+    read = Result.from_dict(document)
+    assert read.to_dict() == result.to_dict()
+    assert read.trajectory is not None
+    assert read.trajectory.at(0.05).covariance == pytest.approx(inside.covariance)
+    given = document["trajectory"]
+    for wrong, message in (
+        ({"times": given["times"][::-1]}, r"result: trajectory.times: expected increasing times"),
+        ({"poses": given["poses"][1:]}, r"result: trajectory.poses: shape"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Result.from_dict(document | {"trajectory": given | wrong})
+    del document["trajectory"]  # as of files before it was one of their fields
+    assert Result.from_dict(document).trajectory is None
 
 
 def test_views_of_one_time_share_a_pose_and_tell_the_size() -> None:

@@ -12,6 +12,7 @@ from cadalign.errors import CadalignError, DegenerateError
 from cadalign.estimation.joint_robust import OUTLIER_COST
 from cadalign.estimation.mistakes import (
     DOWNWARD,
+    INVERTED,
     Explained,
     Mistake,
     find_in_all,
@@ -98,7 +99,9 @@ def _mistake_in_all(problem: JointProblem, best: Minimum) -> str | None:
 
 def _beside_keypoints(problem: JointProblem) -> list[Mistake]:
     """Mistakes in other evidence than keypoints."""
-    return [DOWNWARD] if any(view.up is not None for view in problem.views) else []
+    is_rig = len(problem.views) > 1 and problem.views[0].cam_from_rig is not None
+    has_up = any(view.up is not None for view in problem.views)
+    return [INVERTED] * is_rig + [DOWNWARD] * has_up
 
 
 def mistake_beside(problem: JointProblem, ransac: RansacOptions | None) -> str | None:
@@ -181,6 +184,9 @@ def _without(
         views = [
             each if each.up is None else replace(each, up=np.negative(each.up)) for each in views
         ]
+    if mistake.inverted:
+        motions = [np.linalg.inv(np.asarray(each.cam_from_rig)) for each in views]
+        views = [replace(v, cam_from_rig=m) for v, m in zip(views, motions, strict=True)]
     prior = replace(problem.prior, components=components)
     unknown = [None] * len(views)  # starts are of the data as given
     try:

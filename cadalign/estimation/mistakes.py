@@ -47,7 +47,7 @@ class Mistake(NamedTuple):
 
     The model mirrored across x, u or v counted from the photo's other side, u and v swapped, pixels
     of an image ``factor`` times as large as the camera's, or, beside the keypoints, an ``up`` that
-    points down.
+    points down and poses of cameras that are ``inverted``.
     """
 
     clause: str
@@ -56,6 +56,7 @@ class Mistake(NamedTuple):
     swapped: bool = False
     factor: float = 1.0
     downward: bool = False
+    inverted: bool = False
 
     def undo_3d(self, points_3d: FloatArray) -> FloatArray:
         """Keypoints on the model (n, 3) without the mistake."""
@@ -78,6 +79,9 @@ _MISTAKES = (
     Mistake("v counts from the bottom", flipped=(False, True)),
 )
 DOWNWARD = Mistake("`up` points down (give its opposite)", downward=True)
+INVERTED = Mistake(
+    "`cam_from_rig` is the inverse, rig_from_cam (give np.linalg.inv of each)", inverted=True
+)
 Tried = Sequence[tuple[Mistake, Explained]]
 
 

@@ -40,11 +40,13 @@ from cadalign import (
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints, read_image_keypoints
 from cadalign.datasets.detections.image_keypoints import join_keypoints
+from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.io.observation import Observation
 
 NEAR = (1.2, 1.6)
 SWAPPED, FLIPPED = "u and v are swapped", "the photo is flipped"
 BOTTOM, MIRRORED = "v counts from the bottom", "the model is mirrored"
+INVERTED = "`cam_from_rig` is the inverse"
 FRACTIONS = "normalised coordinates (0 to 1)"
 UNIT = "in another unit (millimetres for metres)?"
 NAMES = (
@@ -118,6 +120,31 @@ def two_views(root: Path, folder: Path) -> str:
         given = sighting(model.points_3d, tuple(model.ids), rng, distance=NEAR).swapped()
         views.append(View(given.camera, given.points_2d))
     return said(lambda: align(Model(points_3d=given.points_3d), views))
+
+
+def inverted_rig(root: Path, folder: Path, *, is_inverted: bool = True, **options: Any) -> str:
+    """Two cameras 40 degrees apart, the poses of which are given, or their inverses."""
+    model = examples(root, "chair")[5]
+    given = sighting(model.points_3d, tuple(model.ids), np.random.default_rng(0), distance=NEAR)
+    in_rig, motion = given.pose.apply(given.points_3d), np.eye(4)
+    motion[:3, :3] = rotation_from_vector([0.05, 0.7, 0.0])
+    motion[:3, 3] = given.pose.translation - motion[:3, :3] @ given.pose.translation
+    beside = in_rig @ motion[:3, :3].T + motion[:3, 3]
+    noise = np.random.default_rng(1).normal(0, 1, (2, len(beside), 2))
+    views = [
+        View(
+            CAMERA,
+            CAMERA.project(seen) + own,
+            cam_from_rig=np.linalg.inv(pose) if is_inverted else pose,
+        )
+        for seen, own, pose in zip((in_rig, beside), noise, (np.eye(4), motion), strict=True)
+    ]
+    return said(lambda: align(Model(points_3d=given.points_3d), views, **options))
+
+
+def test_right_poses_of_a_rig_are_no_mistake(real_data: Path, tmp_path: Path) -> None:
+    assert INVERTED not in inverted_rig(real_data, tmp_path, is_inverted=False)
+    assert INVERTED in inverted_rig(real_data, tmp_path, ransac=RansacOptions())
 
 
 def forgotten_ids(root: Path, folder: Path) -> str:
@@ -246,6 +273,7 @@ MISTAKES: dict[str, Made] = {
     "flipped, unknown noise": plain("mug", Sighting.flipped, FLIPPED, **SIMILAR),
     "another photo": plain("bottle", moved, "outside of the image"),
     "swapped, two views": Made(SWAPPED, two_views),
+    "inverted rig": Made(INVERTED, inverted_rig),
     "flipped, learned": of_shape("mug", Sighting.flipped, FLIPPED),
     "swapped, learned": of_shape("bottle", Sighting.swapped, SWAPPED),
     "fractions, fit": plain("mug", Sighting.normalised, FRACTIONS),

@@ -333,7 +333,7 @@ def _uncovered(best: _Candidate) -> list[str]:
     for contour, fit in zip(masked.views, best.settled.fits, strict=True):
         camera = masked.camera_at(contour.image, contour.camera, state)
         rows, columns = np.nonzero(contour.mask[0] >= 0.5)
-        pixels = np.column_stack([columns, rows])[:: 1 + len(rows) // _MOST_PIXELS]
+        pixels = np.column_stack([columns, rows]).astype(float)[:: 1 + len(rows) // _MOST_PIXELS]
         covered = Sight(posed.caster, camera, poses[contour.image]).covers(pixels)
         dilated = SPACING * len(contour.contour.points) * max(fit.offset, 0.0) / len(rows)
         share = 1 - float(covered.mean()) - dilated

@@ -157,6 +157,23 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return array
 
 
+def parse_numbers(
+    text: bytes, count: int, dtype: type[np.generic] = np.float64
+) -> npt.NDArray[Any]:
+    """Read numbers between white space, (count,); raises ValueError if the text is anything else.
+
+    At "0.1.2" older NumPy stops with a mere warning, after 0.1: the number that follows the text
+    tells whether all of it was read.
+    """
+    try:
+        values = np.fromstring(text + b" 0", sep=" ", dtype=dtype)
+    except DeprecationWarning as error:  # where warnings are errors
+        raise ValueError(str(error)) from None
+    if len(values) != count + 1:
+        raise ValueError("not all of it is numbers")
+    return values[:-1]
+
+
 def as_one_or_each(value: Any, *, name: str, count: int, entries: str) -> FloatArray:
     """One positive number, or (count,) of them, one for each of the ``entries``.
 

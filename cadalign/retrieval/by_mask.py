@@ -16,10 +16,11 @@ preferred nor rejected.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import cv2
@@ -49,7 +50,6 @@ logger = logging.getLogger("cadalign")
 MOST_ALIGNED = 8
 """Models that are aligned with a mask, so that a list of matches is no longer."""
 
-_MOST_MESHES = 32
 _REACH = 24.0  # [px], farther away is no rim
 _SHORTFALL = 0.05
 _GRAB_ROUNDS = 5
@@ -62,12 +62,6 @@ class OutlineStore:
     def __init__(self, table: ModelTable) -> None:
         self._table = table
         self._known: dict[int, Whitened | None] = {}
-        # Silhouettes are known by their mesh: that of a model comes up again in the next mask.
-        self._mesh = lru_cache(_MOST_MESHES)(lambda row: table.model(row).load_mesh())
-
-    def mesh(self, row: int) -> Mesh:
-        """The mesh of a row of the table, the same one as long as few others were asked for."""
-        return self._mesh(row)
 
     def of(self, rows: list[int], workers: int) -> list[Whitened | None]:
         """Outlines of some rows of the table; None where a mesh is missing or cannot be read."""
@@ -126,7 +120,7 @@ def rank_by_mask(
     view = View(camera, mask=inside)
     with ThreadPoolExecutor(worker_count(workers)) as pool:
         rough = pool.map(
-            lambda row: _roughly_aligned(table.model(row), outlines.mesh(row), view, options),
+            lambda row: _roughly_aligned(table, table.model(row), view, options),
             resembling,
         )
         aligned = [found for found in rough if found is not None]
@@ -173,9 +167,10 @@ class _Aligned(NamedTuple):
 
 
 def _roughly_aligned(
-    model: LibraryModel, mesh: Mesh, view: View, options: RetrievalOptions
+    table: ModelTable, model: LibraryModel, view: View, options: RetrievalOptions
 ) -> _Aligned | None:
     """A model aligned with a mask that shows all of it; None if it cannot be."""
+    mesh = table.mesh_at(cast(Path, model.mesh_path))
     given = Model(mesh=mesh, stretch=options.stretch, stretch_sigma=options.stretch_sigma)
     try:
         found = align_outline(given, view)
@@ -231,13 +226,15 @@ def _match(
 # Reranking ---------------------------------------------------------------------------------------
 
 
-def rerank(matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera) -> list[Match]:
+def rerank(
+    table: ModelTable, matches: Sequence[Match], mask: npt.ArrayLike, camera: Camera
+) -> list[Match]:
     """Rank the best matches by keypoints and silhouettes together.
 
     They get their ``silhouette_iou``, and ``score`` is redistributed among them. The likelihood
     remains that of the keypoints.
     """
-    casts = (cast_match(match, camera) for match in matches)
+    casts = (cast_match(match, camera, table.mesh_at) for match in matches)
     found = [None if cast is None else silhouette_iou(est=cast.mask, gt=mask) for cast in casts]
     known = [overlap for overlap in found if overlap is not None]
     if not known:
@@ -284,12 +281,14 @@ def mask_of(
     return found
 
 
-def cast_match(match: Match, camera: Camera) -> Geometry | None:
+def cast_match(
+    match: Match, camera: Camera, mesh_at: Callable[[Path], Mesh] = load_mesh
+) -> Geometry | None:
     """Cast rays at a match's mesh; None if there is none or, with a warning, it is unreadable."""
     if match.mesh_path is None:
         return None
     try:
-        return cast_geometry(Scene(load_mesh(match.mesh_path)), camera, match.alignment)
+        return cast_geometry(Scene(mesh_at(match.mesh_path)), camera, match.alignment)
     except CadalignError as error:
         logger.warning("no silhouette: %s", error)
         return None

@@ -304,4 +304,4 @@ class Library:
             return matches
         from cadalign.retrieval.by_mask import mask_of, rerank  # with OpenCV and the renderer
 
-        return rerank(matches, mask_of(mask, image, matches, camera), camera)
+        return rerank(self._table, matches, mask_of(mask, image, matches, camera), camera)

@@ -12,7 +12,7 @@ import os
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from operator import itemgetter
 from pathlib import Path
@@ -36,6 +36,8 @@ ModelKey = tuple[str, str]
 
 _ALONG = 0.9  # share of a mirrored pair's distance that must lie along one axis
 _LARGEST = 1e50  # coordinate
+_MOST_MESHES = 32  # that are kept
+_MOST_SYMMETRIES = 4096
 _AGAIN = "build it with: cadalign library build"
 SEAL = Seal(magic=b"cadalign library", version=1, noun="library file", fix=_AGAIN)
 SCHEMA = pa.schema(
@@ -131,6 +133,12 @@ class ModelTable:
 
     def __init__(self, table: pa.Table) -> None:
         self.table = table.combine_chunks()
+        # Silhouettes are known by their mesh: that of a model comes up again in the next query.
+        self.mesh_at = lru_cache(_MOST_MESHES)(load_mesh)
+
+    def __reduce__(self) -> tuple[type[ModelTable], tuple[pa.Table]]:
+        """Copies for other processes have no meshes."""
+        return ModelTable, (self.table,)
 
     @classmethod
     def of(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> ModelTable:
@@ -287,6 +295,7 @@ def row_of(model: LibraryModel) -> dict[str, Any]:
     }
 
 
+@lru_cache(_MOST_SYMMETRIES)
 def _symmetries_from(text: str, count: int) -> Symmetries:
     try:
         data, rotations = json.loads(text), []
@@ -294,7 +303,8 @@ def _symmetries_from(text: str, count: int) -> Symmetries:
             circle = None
             if each["circle"] is not None:
                 center, radius, normal = each["circle"]
-                circle = Circle(np.array(center), radius, np.array(normal))
+                middle, axis = read_only(np.array(center)), read_only(np.array(normal))
+                circle = Circle(middle, radius, axis)
             rotations.append(RotationalSymmetry(tuple(each["keypoints"]), circle))
         reflections = tuple((first, second) for first, second in data["reflections"])
     except (ValueError, TypeError, KeyError, IndexError, RecursionError) as error:

@@ -7,14 +7,13 @@ of Bundler 0.4, https://www.cs.cornell.edu/~snavely/bundler/bundler-v0.4-manual.
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray, parse_numbers
 from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet, rigid_pose
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
@@ -240,12 +239,10 @@ def _read_values(path: Path) -> FloatArray:
     if header.strip() != _HEADER:
         fix = f"only files that begin with {_HEADER!r} can be read"
         raise DataError(f"begins with {header.strip()[:40]!r}", where=str(path), fix=fix)
+    plain = body.encode(errors="replace")
     try:
-        # Deprecated for a long time: to stop at text that is no number with a mere warning.
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)
-            return np.fromstring(body, dtype=float, sep=" ")
-    except (ValueError, DeprecationWarning):
+        return parse_numbers(plain, len(plain.split()))
+    except ValueError:
         pass
     for number, line in enumerate(body.split("\n"), start=2):
         for word in line.split():

@@ -12,12 +12,11 @@ from codecs import BOM_UTF8
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, parse_numbers
 from cadalign.errors import DataError
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.io.files import damaged, read_bytes
@@ -202,7 +201,7 @@ def _parse_rows(bodies: list[bytes], *, least: int = 1, padding: float = 0.0) ->
     lengths = _lengths(bodies, text)
     if (lengths < least).any():
         raise ValueError("too few numbers in a line")
-    values = _numbers(text, int(lengths.sum()), np.float64)
+    values = parse_numbers(text, int(lengths.sum()))
     width = int(lengths.max(initial=0))
     if width > _MAX_VALUES:
         raise ValueError("too many numbers in a line")
@@ -240,25 +239,18 @@ def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
     doubled = text.count(b"//")
     corners = np.zeros((total, 2), dtype=np.int64)
     if not forms:
-        corners[:, 0] = _numbers(text, total)
+        corners[:, 0] = parse_numbers(text, total, np.int64)
     elif forms == {b"/"} and text.count(b"/") == total:
-        corners[:] = _numbers(text.replace(b"/", b" "), 2 * total).reshape(total, 2)
+        corners[:] = parse_numbers(text.replace(b"/", b" "), 2 * total, np.int64).reshape(total, 2)
     elif forms == {b"//"} and doubled == total:
-        corners[:, 0] = _numbers(text.replace(b"//", b" "), 2 * total)[::2]
+        corners[:, 0] = parse_numbers(text.replace(b"//", b" "), 2 * total, np.int64)[::2]
     elif forms == {b"//"} and not doubled and text.count(b"/") == 2 * total:
-        corners[:] = _numbers(text.replace(b"/", b" "), 3 * total).reshape(total, 3)[:, :2]
+        corners[:] = parse_numbers(text.replace(b"/", b" "), 3 * total, np.int64).reshape(total, 3)[
+            :, :2
+        ]
     else:
         corners[:] = [_parse_corner(corner) for corner in text.split()]
     return corners, sizes
-
-
-def _numbers(text: bytes, count: int, dtype: type[np.generic] = np.int64) -> npt.NDArray[Any]:
-    # At "0.1.2" older NumPy stops with a mere warning, after 0.1: the number that follows the
-    # text tells whether all of it was read.
-    values = np.fromstring(text + b" 0", sep=" ", dtype=dtype)
-    if len(values) != count + 1:
-        raise ValueError("not all of it is numbers")
-    return values[:-1]
 
 
 def _parse_corner(corner: bytes) -> tuple[int, int]:

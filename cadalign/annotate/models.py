@@ -17,12 +17,12 @@ from cadalign.annotate.locks import LastContent
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.names import keypoints_file
 from cadalign.annotate.options import SessionOptions
-from cadalign.annotate.photos import require_text
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.model import Model
 from cadalign.geometry.mesh import Mesh
+from cadalign.io.files import require_utf8
 from cadalign.io.meshes.files import load_mesh
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
@@ -383,7 +383,7 @@ class Models:
         return self[self.number_of(path)]
 
     def _open(self, path: Path) -> OpenedModel:
-        require_text(path)
+        require_utf8(path)
         cad = ClickableModel(load_mesh(path))
         own, beside = self._keypoints_path(path), keypoints_file(path, path.parent)
         source = beside if self._models or self._keypoints is None else self._keypoints

@@ -21,7 +21,7 @@ from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.documents import Document, in_file, read_document
-from cadalign.io.files import listed, printable, read_bytes, reading, write_json
+from cadalign.io.files import listed, read_bytes, reading, require_utf8, write_json
 from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
 
 Pixel = tuple[float, float]
@@ -54,7 +54,7 @@ class PhotoFile:
     @classmethod
     def open(cls, path: Path) -> PhotoFile:
         """Read a photo's size; raises DataError if it is missing or no photo."""
-        require_text(path)
+        require_utf8(path)
         return cls(path, *photo_size(path))
 
     def thumbnail(self) -> bytes:
@@ -82,15 +82,6 @@ class PhotoFile:
         data = io.BytesIO()
         Image.fromarray(upright).save(data, format="JPEG", quality=_QUALITY, subsampling=0)
         return "image/jpeg", data.getvalue()
-
-
-def require_text(path: Path) -> None:
-    """Refuse a file whose path no JSON file can hold: names of old disks may be no UTF-8."""
-    try:
-        str(path.resolve()).encode()
-    except UnicodeEncodeError:
-        fix = "rename it, or the folder that it is in"
-        raise DataError("the path is not UTF-8", where=printable(path), fix=fix) from None
 
 
 def find_photos(path: Path) -> list[Path]:

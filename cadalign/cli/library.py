@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from cadalign.cli.common import JsonOption, answer, group_of, make_folder_of, print_json, say
-from cadalign.io.files import keeping, refuse_input
+from cadalign.io.files import keeping, refuse_input, require_utf8
 
 if TYPE_CHECKING:
     from cadalign.datasets import KeypointNet
@@ -45,6 +45,9 @@ class LibraryBuild:
         """Build the library; returns the exit code."""
         from cadalign.datasets import KeypointNet
 
+        for folder in (self.root, self.shapenet):
+            if folder is not None:
+                require_utf8(folder)
         dataset = KeypointNet(self.root, shapenet_root=self.shapenet)
         dataset = dataset.subset(categories=self.categories, split=self.split)
         with keeping(dataset.files):

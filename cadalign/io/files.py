@@ -276,6 +276,15 @@ def refuse_nul(path: Path) -> None:
         raise DataError("the path holds a NUL character", where=printable(path))
 
 
+def require_utf8(path: Path) -> None:
+    """Refuse a path that no JSON file and no table can hold: names of old disks may be no UTF-8."""
+    try:
+        str(path.resolve()).encode()
+    except UnicodeEncodeError:
+        fix = "rename it, or the folder that it is in"
+        raise DataError("the path is not UTF-8", where=printable(path), fix=fix) from None
+
+
 _HEADER = struct.Struct("<16sIIQ32s")
 
 

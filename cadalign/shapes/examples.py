@@ -14,11 +14,22 @@ from cadalign.arrays import FloatArray, as_points, read_only
 from cadalign.errors import DataError, InputError, quote, require_kind
 from cadalign.geometry.box import extent
 from cadalign.geometry.mesh import Mesh
-from cadalign.shapes.parts import BOX_ROWS, KeypointId, TrainingShapes, check_ids, checked_box
+from cadalign.io.files import as_path, require_utf8
+from cadalign.shapes.parts import (
+    BOX_ROWS,
+    KeypointId,
+    TrainingShapes,
+    check_ids,
+    check_text,
+    checked_box,
+)
 
 logger = logging.getLogger("cadalign")
 
 LEAST_MODELS = 4
+_LEAST_TO_MEASURE = 4  # keypoints; fewer may be near each other
+_LARGEST_RATIO = 20.0  # of models' sizes in one unit; an inch is 25 mm
+_FARTHEST = 0.1  # gap between all keypoints and the box, over its diagonal: thin parts, rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +55,7 @@ class Example:
     """Its mesh."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "model_id", check_text(self.model_id, "model_id"))
         where = f"model {self.model_id}"
         points = as_points(self.points_3d, name=f"{where}, points_3d", dimension=3)
         ids = check_ids(self.ids, f"{where}, ids")
@@ -54,7 +66,21 @@ class Example:
         object.__setattr__(self, "points_3d", read_only(points))
         if self.bounds is not None:
             bounds = checked_box(self.bounds, f"{where}, bounds")
+            _check_reach(points, bounds, f"{where}, bounds")
             object.__setattr__(self, "bounds", read_only(bounds))
+        if self.mesh_path is not None:
+            path = as_path(self.mesh_path, f"{where}, mesh_path").absolute()
+            require_utf8(path)
+            object.__setattr__(self, "mesh_path", path)
+
+
+def _check_reach(points: FloatArray, bounds: FloatArray, where: str) -> None:
+    """Refuse a box that is elsewhere than the keypoints, or of another unit."""
+    least, greatest = extent(points)
+    gap = np.maximum(least - bounds[1], bounds[0] - greatest).max()
+    if gap > _FARTHEST * np.linalg.norm(bounds[1] - bounds[0]):
+        what = f"no keypoint lies in the box from {bounds[0].tolist()} to {bounds[1].tolist()}"
+        raise InputError(what, where=where, fix="give the box in the keypoints' axes and unit")
 
 
 class DatasetModel(Protocol):
@@ -113,6 +139,7 @@ def tabulated(
         what = f"{len(examples)} models are too few to learn a shape from"
         raise InputError(what, where="models", fix=f"give at least {LEAST_MODELS}")
     _check_names(examples)
+    _warn_of_units(examples)
     ids = tuple(sorted({label for each in examples for label in each.ids}))
     column = {label: row for row, label in enumerate(ids)}
     rows = np.full((len(examples), len(ids) + BOX_ROWS, 3), np.nan)
@@ -145,3 +172,22 @@ def _check_names(examples: Sequence[Example]) -> None:
         seen.add(each.model_id)
     if not any(np.ptp(each.points_3d, axis=0).any() for each in examples):
         raise InputError("in every model all keypoints coincide", where="models")
+
+
+def _warn_of_units(examples: Sequence[Example]) -> None:
+    """Warn of models that are so much larger or smaller than the others as another unit makes."""
+    whole = [each for each in examples if len(each.ids) >= _LEAST_TO_MEASURE]
+    sizes = np.array([np.linalg.norm(np.ptp(each.points_3d, axis=0)) for each in whole])
+    typical = float(np.median(sizes)) if whole else 0.0
+    is_large, is_small = sizes > _LARGEST_RATIO * typical, sizes < typical / _LARGEST_RATIO
+    rows = np.flatnonzero((sizes > 0) & (is_large | is_small))
+    if typical and len(rows):
+        logger.warning(
+            "models of another size than the others: %d of %d, such as %s, whose keypoints reach "
+            "over %.3g instead of %.3g; give all in one unit",
+            len(rows),
+            len(examples),
+            quote(whole[rows[0]].model_id),
+            sizes[rows[0]],
+            typical,
+        )

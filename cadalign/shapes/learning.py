@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, is_whole
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
 from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
@@ -39,9 +39,10 @@ _TOLERANCE = 0.5  # of the mean logarithm of a model's likelihood
 _MODE_TOLERANCE = 0.1  # modes cost next to nothing
 _FOLDS = 3
 _MOST_CALIBRATED = 80  # models of a fold
-_LEAST_TO_CHOOSE = 12  # models, below which nothing can be held out
+_LEAST_TO_CHOOSE = 12  # models, below which each is held out alone, and little is chosen
 _ROUNDS = 25
 _STRENGTHS = (0.0, 0.1, 1.0, 10.0)
+_STRENGTHS_OF_FEW = (0.1, 1.0)
 _MIXTURE_STRENGTH = 10.0
 _MOST_COMPONENTS = 4  # each costs a search of its own when an image is aligned
 _CLUSTER_MODES = 10
@@ -138,8 +139,8 @@ class Choice(NamedTuple):
 
     recipe: _Recipe
     modes: int | None
-    calibration: ShapeCalibration = ShapeCalibration()
-    margins: BoxMargins | None = None
+    calibration: ShapeCalibration
+    margins: BoxMargins | None
 
 
 class _CrossValidation:
@@ -147,19 +148,35 @@ class _CrossValidation:
 
     def __init__(self, models: _Models, on_progress: Callable[[int, int], object]) -> None:
         self._models = models
-        self._folds = np.random.default_rng(0).permutation(len(models.rows)) % _FOLDS
-        self._kept = [models.some(self._folds != fold) for fold in range(_FOLDS)]
-        self._held_out = [models.some(self._folds == fold) for fold in range(_FOLDS)]
+        count = len(models.rows)
+        folds = _FOLDS if count >= _LEAST_TO_CHOOSE else count
+        self._folds = np.random.default_rng(0).permutation(count) % folds
+        self._kept = [models.some(self._folds != fold) for fold in range(folds)]
+        self._held_out = [models.some(self._folds == fold) for fold in range(folds)]
         self._on_progress, self._done = on_progress, 0
 
     def choose(self, components: int | None, modes: int | None, reflection: bool) -> Choice:
-        """Choose a recipe and the number of modes, and calibrate what they give."""
+        """Choose a recipe and the number of modes, and calibrate what they give.
+
+        Few models tell nothing but how strongly covariances are to be drawn to equal entries, and
+        how far from the truth estimates are.
+        """
+        if len(self._models.rows) < _LEAST_TO_CHOOSE:
+            return self._choose_of_few(components or 1, modes)
         best = max((self._try(_Recipe(each)) for each in _STRENGTHS), key=_total)
         if reflection:
             best = self._with_reflection(best)
         best = self._with_components(best, components)
         modes = modes or self._modes(best)
         return Choice(best.recipe, modes, self._calibration(best, modes), self._margins(best))
+
+    def _choose_of_few(self, components: int, modes: int | None) -> Choice:
+        best = max((self._try(_Recipe(each)) for each in _STRENGTHS_OF_FEW), key=_total)
+        recipe = replace(best.recipe, components=components)
+        if components > 1:  # but for one model each
+            most = len(self._models.rows) - 1
+            best = self._try(replace(recipe, components=min(components, most)))
+        return Choice(recipe, modes, self._calibration(best, modes), self._margins(best))
 
     def _with_reflection(self, best: _Trial) -> _Trial:
         completed = self._models.completed()
@@ -182,7 +199,7 @@ class _CrossValidation:
         parts = [[_truncated(each, count) for each in trial.learned] for count in counts]
         return int(counts[_least_enough([self._scores(each) for each in parts], _MODE_TOLERANCE)])
 
-    def _calibration(self, trial: _Trial, modes: int) -> ShapeCalibration:
+    def _calibration(self, trial: _Trial, modes: int | None) -> ShapeCalibration:
         held_out = [
             (self._models.rows[self._folds == fold][:_MOST_CALIBRATED], _truncated(mixture, modes))
             for fold, mixture in enumerate(trial.learned)
@@ -223,7 +240,7 @@ def learn_parts(
 ) -> dict[str, Any]:
     """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
     for name, count in (("components", components), ("modes", modes)):
-        if count is not None and (type(count) is not int or count < 1):
+        if count is not None and (not is_whole(count) or count < 1):
             raise InputError(f"{count!r} is not a whole number >= 1", where=name)
     ids, rows, training = tabulated(examples)
     if (components or 1) > len(rows):
@@ -235,11 +252,8 @@ def learn_parts(
     # The limit reaches those that are loaded: SciPy brings one of its own.
     import_module("scipy.linalg.lapack")
     with threadpool_limits(1):
-        if len(rows) < _LEAST_TO_CHOOSE:
-            choice = Choice(_Recipe(components=components or 1), modes)
-        else:
-            tried = _CrossValidation(models, on_progress)
-            choice = tried.choose(components, modes, reflection)
+        tried = _CrossValidation(models, on_progress)
+        choice = tried.choose(components, modes, reflection)
         mixture = models.mixture(choice.recipe)
     on_progress(_STEPS, _STEPS)
     weights = mixture.weights / mixture.weights.sum()
@@ -290,7 +304,7 @@ def _clusters(vectors: Vectors, common: Gaussians, count: int) -> IntArray:
     return np.asarray(labels)
 
 
-def _truncated(mixture: Gaussians, modes: int) -> Gaussians:
+def _truncated(mixture: Gaussians, modes: int | None) -> Gaussians:
     """The mixture that is left of another one when only some modes are kept."""
     parts = [
         component_of_covariance(mean.reshape(-1, 3), covariance, modes=modes).covariance

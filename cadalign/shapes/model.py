@@ -29,6 +29,7 @@ from cadalign.shapes.parts import (
     check_axis,
     check_ids,
     check_mixture,
+    check_text,
     given_ids,
 )
 from cadalign.shapes.shape_file import read_shape, write_shape
@@ -114,6 +115,8 @@ class ShapeModel:
         freedom = None if freedom is None else float(freedom)
         object.__setattr__(self, "degrees_of_freedom", freedom)
         object.__setattr__(self, "inflation", float(self.inflation))
+        for name in ("category", "unit"):
+            object.__setattr__(self, name, check_text(getattr(self, name), name))
         object.__setattr__(self, "ids", ids)
         object.__setattr__(self, "components", tuple(self.components))
 

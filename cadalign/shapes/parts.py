@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, as_floats, is_number, read_only
-from cadalign.errors import InputError
+from cadalign.errors import InputError, quote
 
 KeypointId = int | str
 """A keypoint's semantic id or name."""
@@ -164,6 +164,8 @@ class TrainingShapes:
         if len(self.mesh_paths) != count:
             what = f"{len(self.mesh_paths)} paths for {count} models"
             raise InputError(what, where="mesh_paths")
+        names = tuple(check_text(each, f"model_ids[{k}]") for k, each in enumerate(self.model_ids))
+        object.__setattr__(self, "model_ids", names)
         object.__setattr__(self, "points_3d", read_only(points))
 
     def __len__(self) -> int:
@@ -302,6 +304,14 @@ class FewKeypoints:
 def inflation_with(count: float, inflation: float, few_keypoints: FewKeypoints | None) -> float:
     """Inflation where a number of keypoints is given."""
     return inflation if few_keypoints is None else inflation * few_keypoints.share_of(count)
+
+
+def check_text(text: object, where: str) -> str:
+    """Check a text, of NumPy or not: what is none could be saved, but not read back."""
+    if not isinstance(text, str):
+        what = f"expected a text, got {type(text).__name__} {quote(text)}"
+        raise InputError(what, where=where, fix="give str(...) of it")
+    return str(text)
 
 
 def check_axis(axis: object, where: str) -> None:

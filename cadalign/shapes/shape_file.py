@@ -40,7 +40,11 @@ class _Array(Document):
 def write_shape(path: str | os.PathLike[str], model: Any) -> None:
     """Write a shape model's file atomically."""
     document = {each.name: getattr(model, each.name) for each in fields(model)}
-    SEAL.write(as_path(path), msgspec.msgpack.encode(document, enc_hook=_written))
+    try:
+        content = msgspec.msgpack.encode(document, enc_hook=_written)
+    except (UnicodeEncodeError, OverflowError) as error:  # of a name, of a number as an id
+        raise InputError(f"cannot be saved ({error})", where=model.category) from None
+    SEAL.write(as_path(path), content)
 
 
 def read_shape(path: str | os.PathLike[str], kind: type[Kind]) -> Kind:

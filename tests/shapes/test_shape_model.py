@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import warnings
@@ -13,12 +14,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from support.refusals import refusal_text
 
 import cadalign
 from cadalign.arrays import FloatArray
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, InputError
+from cadalign.geometry.rotations import vector_from_rotation
 from cadalign.io.files import Seal
 from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.examples import Example
@@ -31,16 +34,17 @@ TABLE = np.array(
     dtype=float,
 )
 IDS = list(range(7))
+CHI_SQUARE_95 = 7.815  # of three degrees of freedom
 
 
 def tables(
-    count: int, *, seed: int = 0, spread: float = 0.2, missing: float = 0.0
+    count: int, *, seed: int = 0, spread: float = 0.2, noise: float = 0.02, missing: float = 0.0
 ) -> list[Example]:
     """Tables of random sizes, some without some keypoints."""
     rng = np.random.default_rng(seed)
     found = []
     for row in range(count):
-        points = TABLE * rng.lognormal(0, spread, 3) + rng.normal(0, 0.02, TABLE.shape)
+        points = TABLE * rng.lognormal(0, spread, 3) + rng.normal(0, noise, TABLE.shape)
         kept = np.flatnonzero(rng.random(len(points)) >= missing)
         kept = kept if len(kept) else np.arange(2)
         bounds = np.array([points.min(axis=0) - 0.1, points.max(axis=0) + 0.1])
@@ -174,6 +178,42 @@ def test_few_models_still_give_a_model(count: int) -> None:
     assert (np.linalg.eigvalsh(model.components[0].covariance) > 0).all()
 
 
+def test_few_models_state_as_large_errors_as_they_make() -> None:
+    """Of shapes learned from 6 models, the 95 % regions held none of these rotations."""
+    model = ShapeModel.learn(tables(6, seed=1, noise=0.2))
+    camera = cadalign.Camera(640, 480, 900, 900, 319.5, 239.5)
+    within = 0
+    for row, each in enumerate(tables(40, seed=2, noise=0.2)):
+        rng = np.random.default_rng(row)
+        rotation = Rotation.random(random_state=row).as_matrix()
+        seen = camera.project(each.points_3d @ rotation.T + [0, 0, 12.0])
+        found = cadalign.align(model, cadalign.View(camera, seen + rng.normal(0, 1, seen.shape)))
+        error = vector_from_rotation(rotation @ found.alignment.rotation.T)
+        within += error @ np.linalg.solve(found.covariance[:3, :3], error) < CHI_SQUARE_95
+    assert within >= 34
+
+
+def test_models_on_one_line_are_learned() -> None:
+    model = ShapeModel.learn(
+        [Example(f"{row}", IDS, TABLE * [1 + row / 50, 0, 0]) for row in range(20)]
+    )
+    assert np.abs(model.mean[:7, 1:]).max() < 1e-9
+
+
+@pytest.mark.parametrize("count", [1, 10])
+def test_models_in_another_unit_are_warned_of(count: int, caplog: pytest.LogCaptureFixture) -> None:
+    models = tables(20)
+    ShapeModel.learn(models[:6])
+    assert not caplog.text
+    odd = [
+        Example(f"mm {row}", each.ids, each.points_3d * 1000)
+        for row, each in enumerate(models[:count])
+    ]
+    ShapeModel.learn([*models[count:], *odd], components=1, modes=5)
+    assert f"models of another size than the others: {count} of 20, such as" in caplog.text
+    assert "give all in one unit" in caplog.text
+
+
 def test_models_that_are_all_the_same_are_learned_without_a_warning() -> None:
     with warnings.catch_warnings(action="error"):
         model = ShapeModel.learn([Example(f"{row}", IDS, TABLE) for row in range(20)])
@@ -285,6 +325,33 @@ def test_the_nearest_model_is_itself(learned: ShapeModel) -> None:
         nearest = learned.nearest(points[seen], ids)
         assert nearest.model_id == f"table {row}"
         assert nearest.distance < 1e-6
+
+
+def test_texts_of_numpy_are_saved_and_what_is_no_text_is_refused(tmp_path: Path) -> None:
+    """Such files were written and could not be read."""
+    models = [Example(np.str_(f"{row}"), IDS, TABLE * (1 + row / 9)) for row in range(5)]
+    path = tmp_path / "table.shape"
+    ShapeModel.learn(models, category=np.str_("table"), unit=np.str_("m")).save(path)
+    read = ShapeModel.open(path)
+    assert (read.category, read.unit) == ("table", "m")
+    assert read.training is not None
+    assert read.training.model_ids[1] == "1"
+    assert refusal_text(lambda: Example(3, IDS, TABLE)) == (  # type: ignore[arg-type]
+        "model_id: expected a text, got int 3; give str(...) of it"
+    )
+    assert refusal_text(lambda: replace(read, category=3)) == (  # type: ignore[arg-type]
+        "category: expected a text, got int 3; give str(...) of it"
+    )
+    unwritable = ShapeModel.from_basis(TABLE[:4], np.zeros((0, 4, 3)), [], ids=[10**30, 1, 2, 3])
+    assert "cannot be saved" in refusal_text(lambda: unwritable.save(path))
+
+
+def test_a_mesh_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert Example("m", IDS, TABLE, mesh_path="a.obj").mesh_path == tmp_path / "a.obj"  # type: ignore[arg-type]
+    odd = Path(os.fsdecode(b"caf\xe9.obj"))
+    text = refusal_text(lambda: Example("m", IDS, TABLE, mesh_path=odd))
+    assert text.endswith("the path is not UTF-8; rename it, or the folder that it is in")
 
 
 def test_numbers_of_numpy_are_saved(tmp_path: Path) -> None:
@@ -445,6 +512,12 @@ def test_refusals(learned: ShapeModel) -> None:
     )
     assert refusal_text(lambda: ShapeModel.learn(some, components=0)) == (
         "components: 0 is not a whole number >= 1"
+    )
+    assert ShapeModel.learn(some, modes=np.int64(2)).components[0].modes.shape[0] == 2  # type: ignore[arg-type]
+    elsewhere = np.array([[-100.0, 0, -200], [-90, 10, -190]])
+    assert refusal_text(lambda: Example("m", IDS, TABLE, bounds=elsewhere)) == (
+        "model m, bounds: no keypoint lies in the box from [-100.0, 0.0, -200.0] to "
+        "[-90.0, 10.0, -190.0]; give the box in the keypoints' axes and unit"
     )
 
 

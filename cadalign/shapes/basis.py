@@ -22,6 +22,7 @@ from cadalign.shapes.parts import (
 
 # Rounding leaves eigenvalues this far below zero, relative to the largest.
 _NEGATIVE = 1e-8
+_LARGEST_GAP = 0.2  # of a keypoint from its mirror image, over the mean's diagonal
 
 
 def component_of_basis(
@@ -35,6 +36,8 @@ def component_of_basis(
 ) -> ShapeComponent:
     """Make a component from a linear shape model; see `ShapeModel.from_basis`."""
     points = as_floats(mean, name="mean", shape=(None, 3))
+    if not len(points):
+        raise InputError("there are no keypoints", where="mean")
     directions = _directions(modes, len(points))
     sigmas = as_floats(deviations, name="deviations", shape=(len(directions),))
     if (sigmas < 0).any():
@@ -184,8 +187,14 @@ def symmetric_component(
     """
     mean, modes = component.mean, component.modes
     mirrored = mirrored_motions(modes, ids, reflection)
+    of_mean = mirrored_rows(mean[None], ids, reflection)[0]
+    gaps = np.linalg.norm(of_mean - mean, axis=1)[:-BOX_ROWS]
+    worst = int(np.argmax(gaps))
+    if gaps[worst] > _LARGEST_GAP * np.linalg.norm(np.ptp(mean[:-BOX_ROWS], axis=0)):
+        what = f"keypoint {ids[worst]!r} of the mean is {gaps[worst]:.3g} from its mirror image"
+        raise InputError(what, where="reflection", fix="check axis, offset and pairs")
     return replace(
         component,
-        mean=(mean + mirrored_rows(mean[None], ids, reflection)[0]) / 2,
+        mean=(mean + of_mean) / 2,
         modes=orthogonal(np.concatenate([modes, mirrored]) / np.sqrt(2), len(mean)),
     )

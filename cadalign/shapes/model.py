@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import FloatArray, IntArray, as_floats, is_number
-from cadalign.errors import InputError, quote
+from cadalign.arrays import FloatArray, IntArray, as_floats, is_number, is_whole
+from cadalign.errors import InputError, quote, require_kind
 from cadalign.shapes.basis import component_of_basis, component_of_covariance, symmetric_component
 from cadalign.shapes.examples import LEAST_MODELS, Dataset, Example, examples_of
 from cadalign.shapes.gaussians import Gaussians
@@ -30,6 +30,7 @@ from cadalign.shapes.parts import (
     check_ids,
     check_mixture,
     check_text,
+    checked_box,
     given_ids,
 )
 from cadalign.shapes.shape_file import read_shape, write_shape
@@ -101,7 +102,9 @@ class ShapeModel:
         check_mixture(self.components, len(ids))
         if self.up_axis is not None:
             check_axis(self.up_axis, "up_axis")
+            object.__setattr__(self, "up_axis", str(self.up_axis))
         if self.reflection is not None:
+            require_kind(self.reflection, Reflection, "reflection")
             self.reflection.partners(ids)
         if self.training is not None and self.training.points_3d.shape[1] != len(ids):
             what = f"{self.training.points_3d.shape[1]} keypoints for {len(ids)} ids"
@@ -282,6 +285,7 @@ class ShapeModel:
         )
         labels = given_ids(ids, names, len(component.mean) - BOX_ROWS)
         if reflection is not None:
+            require_kind(reflection, Reflection, "reflection")
             component = symmetric_component(component, labels, reflection)
         return cls(
             category=category,
@@ -328,6 +332,9 @@ class ShapeModel:
             positive semi-definite.
         """
         rows = as_floats(mean, name="mean", shape=(None, 3))
+        if modes is not None and (not is_whole(modes) or modes < 0):
+            raise InputError(f"{modes!r} is not a whole number >= 0", where="modes")
+        checked_box(rows[-BOX_ROWS:], "mean, its last two rows, the box")
         component = component_of_covariance(rows, covariance, modes=modes)
         labels = given_ids(ids, names, len(rows) - BOX_ROWS)
         return cls(category, labels, (component,), up_axis=up_axis, unit=unit)

@@ -104,9 +104,17 @@ class Reflection:
         check_axis(self.axis, "axis")
         if not is_number(self.offset):
             raise InputError(f"{self.offset!r} is not a finite number", where="offset")
-        paired = [label for pair in self.pairs for label in pair]
+        pairs = tuple(tuple(pair) for pair in self.pairs)
+        odd = next((pair for pair in pairs if len(pair) != 2), None)
+        if odd is not None:
+            raise InputError(f"{quote(odd)} are not two keypoints", where="pairs")
+        paired = [label for pair in pairs for label in pair]
         if len(set(paired)) < len(paired):
             raise InputError("a keypoint is mirrored twice", where="pairs")
+        labels = iter(check_ids(paired, "pairs") if paired else ())
+        object.__setattr__(self, "axis", str(self.axis))
+        object.__setattr__(self, "offset", float(self.offset))
+        object.__setattr__(self, "pairs", tuple(zip(labels, labels, strict=True)))
 
     def partners(self, ids: Sequence[KeypointId]) -> npt.NDArray[np.int64]:
         """The row that each keypoint's mirror image has, (m,) int.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from cadalign.errors import InputError, require_kind
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
@@ -31,6 +32,7 @@ def rotation_loss(
     Parameters
     ----------
     found, truth : PoseBatch
+        In single or double precision, each its own.
     symmetry : Symmetry, optional
         The model's. Rotations about an axis count nothing, in closed form.
 
@@ -55,8 +57,9 @@ def rotation_loss(
     """
     if symmetry is None:
         symmetry = Symmetry.none()
+    require_kind(symmetry, Symmetry, "symmetry")
     group = group_of(symmetry)
-    between = truth.rotation.transpose(1, 2) @ found.rotation  # in the model's frame
+    between = truth.rotation.to(found.rotation).mT @ found.rotation  # in the model's frame
     if group.is_free:
         return _of_valid(torch.zeros_like(between[:, 0, 0]) * between.sum(dim=(1, 2)), found)
     rotations = torch.as_tensor(np.array(group.rotations)).to(between)
@@ -152,6 +155,9 @@ def box_loss(
     >>> round(box_loss(found, truth, bounds).item(), 3)
     0.1
     """
+    if bounds.shape[-2:] != (2, 3):
+        what = f"shape {tuple(bounds.shape)}, expected (2, 3) or (B, 2, 3)"
+        raise InputError(what, where="bounds")
     own = bounds
     if found.points_3d is not None:
         own = torch.stack([found.points_3d.amin(dim=1), found.points_3d.amax(dim=1)], dim=1)
@@ -169,6 +175,8 @@ def _least(
     distances: Callable[[Tensor], Tensor], points: Tensor, symmetry: Symmetry | None
 ) -> Tensor:
     """The least of the mean distances (B,) over a symmetry's motions, which move ``points``."""
+    if symmetry is not None:
+        require_kind(symmetry, Symmetry, "symmetry")
     motions = np.eye(4)[None] if symmetry is None else symmetry.poses(max_step=_STEP)
     means = [
         distances(points @ motion[:3, :3].T + motion[:3, 3]).mean(dim=1)

@@ -80,7 +80,7 @@ class PoseBatch:
 
     def apply(self, points_3d: Tensor) -> Tensor:
         """Model points (n, 3) or (B, n, 3) in the cameras; (B, n, 3) tensor."""
-        stretched = points_3d * self.scale[..., None, :]
+        stretched = points_3d.to(self.scale) * self.scale[..., None, :]
         return stretched @ self.rotation.mT + self.translation[..., None, :]
 
     def project(self, points_3d: Tensor, camera: Camera | Sequence[Camera]) -> Tensor:

@@ -265,3 +265,31 @@ def test_posterior_loss_refuses_what_it_cannot_integrate(
     found = fit(points, pixels, CAMERA, focal="known" if options else "estimate")
     with pytest.raises(InputError, match=re.escape(message)):
         posterior_loss(found, truth, points, pixels, CAMERA, **options)
+
+
+def test_fits_in_single_precision_are_compared_with_truths_in_double() -> None:
+    camera = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
+    corners = torch.cartesian_prod(*[torch.tensor([-0.5, 0.5]).double()] * 3)
+    bounds = torch.stack([corners.amin(dim=0), corners.amax(dim=0)])
+    truth = PoseBatch(
+        torch.eye(3).double()[None],
+        torch.tensor([[0.1, 0.0, 5.0]]).double(),
+        torch.tensor([[1.0, 1.2, 0.8]]).double(),
+    )
+    noise = torch.randn(1, 8, 2, generator=torch.Generator().manual_seed(0))
+    pixels = (truth.project(corners, camera).float() + noise).requires_grad_()
+    found = fit(corners, pixels, camera)
+    total = (
+        rotation_loss(found, truth)
+        + reprojection_loss(found, truth, corners, camera)
+        + box_loss(found, truth, bounds)
+        + posterior_loss(found, truth, corners, pixels, camera)
+    )
+    total.sum().backward()
+    assert pixels.grad.dtype == torch.float32
+    assert torch.isfinite(pixels.grad).all()
+    assert pixels.grad.any()
+    with pytest.raises(InputError, match=r"bounds: shape \(8, 3\), expected \(2, 3\)"):
+        box_loss(found, truth, corners)
+    with pytest.raises(InputError, match="symmetry: expected"):
+        rotation_loss(found, truth, symmetry="y")  # type: ignore[arg-type]

@@ -346,6 +346,24 @@ def test_texts_of_numpy_are_saved_and_what_is_no_text_is_refused(tmp_path: Path)
     assert "cannot be saved" in refusal_text(lambda: unwritable.save(path))
 
 
+def test_a_reflection_of_numpys_values_is_saved(tmp_path: Path) -> None:
+    pairs = [np.array(pair) for pair in ((0, 1), (2, 3), (4, 5))]
+    mirror = Reflection(np.str_("x"), np.float32(0), pairs)  # type: ignore[arg-type]
+    model = ShapeModel.from_basis(
+        TABLE,
+        [TABLE],
+        [0.1],
+        reflection=mirror,
+        up_axis=np.str_("y"),  # type: ignore[arg-type]
+    )
+    model.save(tmp_path / "table.shape")
+    read = ShapeModel.open(tmp_path / "table.shape")
+    assert (read.reflection, read.up_axis) == (mirror, "y")
+    assert refusal_text(lambda: Reflection("x", 0, ((0, 1, 2),))) == (  # type: ignore[arg-type]
+        "pairs: (0, 1, 2) are not two keypoints"
+    )
+
+
 def test_a_mesh_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert Example("m", IDS, TABLE, mesh_path="a.obj").mesh_path == tmp_path / "a.obj"  # type: ignore[arg-type]
@@ -534,6 +552,11 @@ def test_refusals(learned: ShapeModel) -> None:
         ({"box": [[1, 0, 0], [0, 1, 1]]}, "box: the least corner [1.0, 0.0, 0.0] exceeds"),
         ({"up_axis": "w"}, "up_axis: 'w' is not one of 'x', 'y', 'z'"),
         ({"reflection": Reflection("x", 0, ((0, 9),))}, "reflection: unknown keypoint 9"),
+        ({"reflection": "x"}, "reflection: expected a cadalign.Reflection, got str"),
+        (
+            {"reflection": Reflection("z", 0, ((0, 1), (2, 3), (4, 5)))},
+            "reflection: keypoint 0 of the mean is 4.47 from its mirror image; check axis, offset",
+        ),
         ({"residual_sigma": -1}, "residual_sigma: -1 is not a standard deviation"),
     ],
 )
@@ -552,6 +575,17 @@ def test_a_wrong_covariance_is_refused() -> None:
     assert text(np.eye(4)) == "covariance: shape (4, 4), expected (27, 27)"
     assert text(-np.eye(27)).startswith("covariance: not positive semi-definite: its least eigen")
     assert text(np.triu(np.ones((27, 27)))) == "covariance: not symmetric"
+
+
+def test_a_mean_without_its_box_is_refused() -> None:
+    text = refusal_text(lambda: ShapeModel.from_covariance(TABLE, np.eye(21)))
+    assert text.startswith("mean, its last two rows, the box: the least corner")
+    boxed = np.vstack([TABLE, TABLE.min(axis=0), TABLE.max(axis=0)])
+    for modes in (-1, 2.5, "a"):
+        text = refusal_text(lambda: ShapeModel.from_covariance(boxed, np.eye(27), modes=modes))  # type: ignore[arg-type]  # noqa: B023
+        assert text == f"modes: {modes!r} is not a whole number >= 0"
+    text = refusal_text(lambda: ShapeModel.from_basis(TABLE[:0], np.zeros((1, 0, 3)), [1.0]))
+    assert text == "mean: there are no keypoints"
 
 
 def test_components_must_agree() -> None:

@@ -28,6 +28,7 @@ from tyro.constructors import (
 from cadalign import __version__
 from cadalign.cli.common import UsageError
 from cadalign.errors import CadalignError
+from cadalign.io.files import keeping
 
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
 _EARLIER_FLAGS = {
@@ -152,7 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # A start makes a million objects that stay: the search for garbage among them takes 6 % of it.
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS, *gc.get_threshold()[1:])
     try:
-        return int(_parse(given).run())
+        with keeping(()):  # nor write over the models and textures that it reads
+            return int(_parse(given).run())
     except UsageError as error:
         sys.stderr.write(f"cadalign: {error}\n")
         raise SystemExit(2) from None

@@ -26,7 +26,7 @@ MOST_BYTES = 2**32
 """Size of the largest file that is read where its reader states no other."""
 # Opening a pipe would wait for its other end; Windows has none of this kind.
 _NOT_WAITING = getattr(os, "O_NONBLOCK", 0)
-_kept: ContextVar[frozenset[str]] = ContextVar("kept", default=frozenset())
+_kept: ContextVar[set[str] | None] = ContextVar("kept", default=None)
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -78,16 +78,23 @@ def keeping(inputs: Iterable[Path | None]) -> Iterator[None]:
     named = {path for path in inputs if path is not None}
     for path in named:
         refuse_nul(path)
-    token = _kept.set(_kept.get() | {os.path.realpath(path) for path in named})
+    token = _kept.set((_kept.get() or set()) | {os.path.realpath(path) for path in named})
     try:
         yield
     finally:
         _kept.reset(token)
 
 
+def keep(path: Path) -> None:
+    """Refuse to write over a further file to the end of the innermost block of `keeping`."""
+    kept = _kept.get()
+    if kept is not None:
+        kept.add(os.path.realpath(path))
+
+
 def refuse_input(path: Path) -> None:
     """Raise a DataError for a file that must not be written over; see `keeping`."""
-    if os.path.realpath(path) in _kept.get():
+    if os.path.realpath(path) in (_kept.get() or ()):
         what = "what is to be written is made from this file"
         raise DataError(what, where=printable(path), fix="give another name")
 

@@ -325,3 +325,19 @@ def test_doctor_runs_for_real(capsys):
     for renderer in health["renderers"]:
         assert renderer["works"] == (renderer["milliseconds"] is not None)
         assert renderer["works"] or renderer["detail"]
+
+
+def test_textures_of_the_model_are_not_written_over(model, capsys) -> None:
+    lines = [line for line in model.read_text().splitlines() if not line.startswith(("mtl", "use"))]
+    faces = [line.split() for line in lines if line.startswith("f ")]
+    corners = ["f " + " ".join(f"{word.split('/')[0]}/1" for word in face[1:]) for face in faces]
+    vertices = [line for line in lines if line.startswith("v ")]
+    words = ["mtllib paint.mtl", *vertices, "vt 0 0", "usemtl paint", *corners]
+    model.write_text("\n".join(words) + "\n")
+    model.with_name("paint.mtl").write_text("newmtl paint\nmap_Kd box.png\n")
+    texture = model.with_name("box.png")
+    Image.new("RGB", (4, 4), (200, 30, 30)).save(texture)
+    before = texture.read_bytes()
+    line = refusal_line(capsys, "render", model, "--out", texture, "--size", "32x24")
+    assert line == f"{texture}: what is to be written is made from this file; give another name"
+    assert texture.read_bytes() == before

@@ -10,13 +10,14 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.mesh import Mesh, spread_colors
-from cadalign.io.files import as_path, made_folder, refuse_folder, write_text, write_whole
+from cadalign.io.files import as_path, keep, made_folder, refuse_folder, write_text, write_whole
 from cadalign.io.images import write_image
 from cadalign.io.meshes.gltf_scene import read_gltf
 from cadalign.io.meshes.obj import read_obj
 
 # Coordinates in ShapeNet's files have 6 decimals; less than ten of these steps is rounding.
 FLAT_TOLERANCE = 1e-5
+_DIGITS = 9  # of coordinates in OBJ files
 
 
 def _read_by_trimesh(path: Path) -> Mesh:
@@ -84,6 +85,7 @@ def load_mesh(path: str | os.PathLike[str]) -> Mesh:
     try:
         if not path.stat().st_size and path.is_file():
             raise DataError("the mesh file is empty", where=str(path), fix="get it again")
+        keep(path)
         return reader(path)
     except InputError as error:  # what Mesh refuses
         where = str(path) if error.where is None else error.where
@@ -198,12 +200,30 @@ def write_ply_mesh(path: Path, mesh: Mesh) -> None:
 
 def ply_mesh(mesh: Mesh) -> bytes:
     """The content of a file of `write_ply_mesh`."""
-    import trimesh  # takes long to import, which OBJ files need not
+    number, kind = ("float", "<f4") if _digits(mesh) <= _DIGITS else ("double", "<f8")
+    vertices = np.empty(len(mesh.vertices), [("place", kind, 3), ("color", "u1", 4)])
+    vertices["place"] = mesh.vertices
+    vertices["color"] = np.round(255 * spread_colors(mesh, _palette(mesh)))
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertices)}",
+        *(f"property {number} {axis}" for axis in "xyz"),
+        *(f"property uchar {channel}" for channel in ("red", "green", "blue", "alpha")),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    return "\n".join(header).encode() + vertices.tobytes() + faces.tobytes()
 
-    colors = np.round(255 * spread_colors(mesh, _palette(mesh))).astype(np.uint8)
-    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
-    data: bytes = trimesh.exchange.ply.export_ply(plain, vertex_normal=False)
-    return data
+
+def _digits(mesh: Mesh) -> int:
+    """Digits of the coordinates that are written: more of a mesh far from its origin."""
+    extent = float(np.ptp(mesh.bounds, axis=0).max())
+    distance = float(np.abs(mesh.bounds).max())
+    return min(17, _DIGITS + max(0, int(np.log10(distance / extent)))) if extent else 17
 
 
 def _palette(mesh: Mesh) -> FloatArray:
@@ -216,10 +236,13 @@ def _palette(mesh: Mesh) -> FloatArray:
 
 
 def _vertex_lines(mesh: Mesh) -> list[str]:
+    digits = _digits(mesh)
+    rows = mesh.vertices.tolist()
+    lines = [f"v {x:.{digits}g} {y:.{digits}g} {z:.{digits}g}" for x, y, z in rows]
     if mesh.vertex_colors is None:
-        return [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
-    rows = np.column_stack([mesh.vertices, mesh.vertex_colors[:, :3]]).tolist()
-    return ["v " + " ".join(f"{value:.9g}" for value in row) for row in rows]
+        return lines
+    colors = [f"{r:.9g} {g:.9g} {b:.9g}" for r, g, b in mesh.vertex_colors[:, :3].tolist()]
+    return [f"{line} {color}" for line, color in zip(lines, colors, strict=True)]
 
 
 def _face_lines(mesh: Mesh, names: list[str], uv_rows: IntArray | None) -> list[str]:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from cadalign.errors import CadalignError, DataError, brief, quote
 from cadalign.geometry.mesh import GREY, Material
-from cadalign.io.files import read_text
+from cadalign.io.files import keep, read_text
 from cadalign.io.images import open_photo, open_picture
 
 if TYPE_CHECKING:
@@ -77,6 +77,7 @@ def _paths(obj_path: Path, library: str) -> list[Path]:
 
 def _parse_library(path: Path) -> dict[str, _Entry]:
     """The materials of a library by name: of each, the words that follow its keywords."""
+    keep(path)
     try:
         text = read_text(path, errors="replace")
     except DataError as error:
@@ -170,6 +171,7 @@ class Textures:
         if found is None:
             logger.warning("%s: the texture %s is missing; drawn grey", beside, brief(name))
             return None
+        keep(found)
         with _left_out(beside, name), open_photo(found) as image:
             self._known[path] = self._pixels(image)
         return self._known[path]

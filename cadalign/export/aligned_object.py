@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+import os
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -206,6 +207,13 @@ class AlignedObject:
         """The mesh, stretched and placed in a frame [units of the camera frame]."""
         mesh, placing = self.require_mesh(), self.frame_from_model(frame)
         return replace(mesh, vertices=placing.apply(mesh.vertices))
+
+
+def names_of(photos: Iterable[object]) -> dict[object, str]:
+    """Names of the photos that are files, relative to the folder that holds them all."""
+    paths = {photo: Path(os.path.abspath(photo)) for photo in photos if isinstance(photo, Path)}
+    root = os.path.commonpath([path.parent for path in paths.values()]) if paths else ""
+    return {photo: path.relative_to(root).as_posix() for photo, path in paths.items()}
 
 
 def photos_of(

@@ -16,7 +16,7 @@ from cadalign.datasets.photos.scan2cad import scan_entry
 from cadalign.datasets.sfm.colmap import write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, quote, refuse_unused
-from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame, photos_of
+from cadalign.export.aligned_object import FRAMES, AlignedObject, Frame, names_of, photos_of
 from cadalign.export.camera_files import write_nerf, write_open3d
 from cadalign.export.scene_parts import write_line_set
 from cadalign.export.usd import write_usd
@@ -175,14 +175,26 @@ def _nerf(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
     write_nerf(path, [replace(view, name=name) for view, name in zip(placed, names, strict=True)])
 
 
+def _coco(path: Path, exported: AlignedObject, options: ExportOptions) -> None:
+    names = zip(photos_of(exported), _names(exported), strict=True)
+    write_coco_keypoints(path, [replace(photo, name=name) for photo, name in names])
+
+
+def _names(exported: AlignedObject) -> list[str]:
+    """Names of the photos: several of one name are told apart by their folders."""
+    known = names_of(view.image for view in exported.views if isinstance(view.image, Path))
+    views = enumerate(exported.views)
+    return [known[v.image] if isinstance(v.image, Path) else f"{row}.png" for row, v in views]
+
+
 def _camera_views(exported: AlignedObject, options: ExportOptions) -> list[CameraView]:
     views = []
-    for number, view in enumerate(exported.views):
+    for number, (view, name) in enumerate(zip(exported.views, _names(exported), strict=True)):
         frame_from_cam = exported.frame_from_cam(options.frame, number)
         pose = np.asarray(np.linalg.inv(frame_from_cam), dtype=np.float64)
         pose[:3, 3] *= exported.metres
         placed = Alignment(pose[:3, :3], pose[:3, 3], np.ones(3))
-        views.append(CameraView(view.camera, placed, view.image_name or f"{number}.png"))
+        views.append(CameraView(view.camera, placed, name))
     return views
 
 
@@ -228,12 +240,7 @@ FORMATS: dict[str, Format] = {
         lambda path, *given: write_open3d(path, _camera_views(*given)),
         ("camera.json",),
     ),
-    "coco": Format(
-        "keypoints in the photos",
-        lambda path, exported, options: write_coco_keypoints(path, photos_of(exported)),
-        (".coco.json", "keypoints.json"),
-        options=(),
-    ),
+    "coco": Format("keypoints in the photos", _coco, (".coco.json", "keypoints.json"), options=()),
 }
 """The formats by name."""
 

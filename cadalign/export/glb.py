@@ -26,7 +26,7 @@ from trimesh.visual.color import srgb_to_linear
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.scene_parts import MeshPart, PlacedPhoto, parts_of, placed_parts
+from cadalign.export.scene_parts import OPAQUE, MeshPart, PlacedPhoto, parts_of, placed_parts
 from cadalign.geometry.conventions import OPENGL_AXES
 from cadalign.geometry.mesh import Material, Mesh
 from cadalign.geometry.rotations import quat_wxyz_from_rotation
@@ -36,7 +36,6 @@ _gltf: Any = trimesh.exchange.gltf  # which has no types
 _visual: Any = trimesh.visual
 _UNLIT = "KHR_materials_unlit"
 _CLAMP_TO_EDGE = 33071  # as OpenGL numbers it
-_OPAQUE = 0.999
 
 
 _Node = tuple[str, trimesh.Trimesh, dict[str, Any], FloatArray]
@@ -64,14 +63,22 @@ def write_glb(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -
         if photo.plane.image is not None
     ]
     scene = trimesh.Scene()
-    for name, surface, _, place in nodes:
-        scene.add_geometry(surface, geom_name=name, node_name=name, transform=place)
+    for number, (_, surface, _, place) in enumerate(nodes):
+        own = str(number)
+        scene.add_geometry(surface, geom_name=own, node_name=own, transform=place)
 
     def complete(tree: dict[str, Any]) -> None:
-        set_materials(tree, {name: material for name, _, material, _ in nodes})
+        set_materials(tree, {str(row): material for row, (_, _, material, _) in enumerate(nodes)})
+        _set_names(tree, {str(row): name for row, (name, *_) in enumerate(nodes)})
         _add_cameras(tree, photos)
 
     _write(path, scene, complete)
+
+
+def _set_names(tree: dict[str, Any], names: dict[str, str]) -> None:
+    """Give nodes and meshes their names: of those of users trimesh changes some that are equal."""
+    for each in (*tree["nodes"], *tree["meshes"]):
+        each["name"] = names.get(each["name"], each["name"])
 
 
 def _write(path: Path, scene: Any, complete: Callable[[dict[str, Any]], None]) -> None:
@@ -120,11 +127,9 @@ def part_material(part: MeshPart) -> dict[str, Any]:
         },
         "doubleSided": True,  # faces of CAD models point either way
     }
-    texture = material.texture
-    is_cut_out = texture is not None and texture.shape[2] == 4 and (texture[..., 3] < 255).any()
-    if alpha < _OPAQUE:
+    if alpha < OPAQUE:
         look["alphaMode"] = "BLEND"
-    elif is_cut_out:
+    elif part.is_cut_out:
         look["alphaMode"] = "MASK"
     return look
 
@@ -213,30 +218,33 @@ def write_moving_glb(path: Path, objects: Sequence[MovingObject]) -> None:
     if not names or len(set(names)) < len(names):
         raise InputError(f"{len(names)} objects, {len(set(names))} names", where="objects")
     scene: Any = trimesh.Scene()
-    materials = {}
-    for each in objects:
-        scene.graph.update(frame_to=each.name, matrix=np.eye(4))
+    materials, called = {}, {}
+    for row, each in enumerate(objects):
+        node = str(row)
+        called[node] = each.name
+        scene.graph.update(frame_to=node, matrix=np.eye(4))
         for number, part in enumerate(parts_of(each.mesh)):
-            own = f"{each.name}_{number}"
-            materials[own] = part_material(part)
-            scene.add_geometry(
-                part_mesh(part), geom_name=own, node_name=own, parent_node_name=each.name
-            )
+            own = f"{row}_{number}"
+            called[own], materials[own] = f"{each.name}_{number}", part_material(part)
+            scene.add_geometry(part_mesh(part), geom_name=own, node_name=own, parent_node_name=node)
 
     def complete(tree: dict[str, Any]) -> None:
         set_materials(tree, materials)
         _animate(tree, objects)
+        _set_names(tree, called)
 
     _write(path, scene, complete)
 
 
 def _animate(tree: dict[str, Any], objects: Sequence[MovingObject]) -> None:
+    """Move the nodes of the objects, which have the objects' numbers as names."""
     nodes = {node.get("name"): number for number, node in enumerate(tree["nodes"])}
     arrays: list[FloatArray] = []
     channels: list[dict[str, Any]] = []
     samplers: list[dict[str, Any]] = []
-    for each in objects:
-        node = tree["nodes"][nodes[each.name]]
+    for row, each in enumerate(objects):
+        target = nodes[str(row)]
+        node = tree["nodes"][target]
         node.pop("matrix", None)
         clock, keyframes = len(arrays), each.keyframes
         arrays += [np.asarray(each.times), *keyframes]
@@ -244,9 +252,7 @@ def _animate(tree: dict[str, Any], objects: Sequence[MovingObject]) -> None:
             zip(("translation", "rotation"), keyframes, strict=True), start=1
         ):
             node[kind] = values[0].tolist()
-            channels.append(
-                {"sampler": len(samplers), "target": {"node": nodes[each.name], "path": kind}}
-            )
+            channels.append({"sampler": len(samplers), "target": {"node": target, "path": kind}})
             samplers.append({"input": clock, "output": clock + offset, "interpolation": "LINEAR"})
     first = _append(tree, arrays)
     samplers = [{**s, "input": s["input"] + first, "output": s["output"] + first} for s in samplers]

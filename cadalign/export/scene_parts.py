@@ -30,6 +30,8 @@ _AGREES = 1e-6
 _RIM = 1.5  # how far the border's colours go on beyond the photo [px]
 _BEHIND = 1.5  # depth of the photo over that of the object's farthest corner
 _FAR_OFF = 100.0  # coordinates over the extent
+OPAQUE = 0.999
+"""Least opacity of what is drawn as opaque."""
 _NEAR, _FAR = 1e-3, 10.0  # depths between which a viewer draws, over that of the photo
 
 
@@ -200,6 +202,13 @@ class MeshPart:
     faces: IntArray
     uv: FloatArray | None
     colors: FloatArray | None
+
+    @property
+    def is_cut_out(self) -> bool:
+        """Whether the texture has transparent pixels."""
+        texture = self.material.texture
+        is_open = texture is not None and texture.shape[2] == 4 and (texture[..., 3] < 255).any()
+        return bool(is_open) and self.uv is not None
 
 
 def parts_of(mesh: Mesh) -> Iterator[MeshPart]:

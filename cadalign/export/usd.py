@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import InputError
 from cadalign.export.aligned_object import AlignedObject, Frame
-from cadalign.export.scene_parts import PlacedPhoto, parts_of, placed_parts
+from cadalign.export.scene_parts import OPAQUE, PlacedPhoto, parts_of, placed_parts
 from cadalign.geometry.box import extent
 from cadalign.io.files import refuse_folder, write_whole
 from cadalign.io.images import ByteImage, write_image
@@ -41,6 +41,7 @@ class _Surface:
     texture: str | None
     colors: FloatArray | None = None
     is_photo: bool = False
+    is_cut_out: bool = False
 
 
 def write_usd(path: Path, exported: AlignedObject, *, frame: Frame = "camera") -> None:
@@ -94,7 +95,8 @@ def _write_stage(path: Path, exported: AlignedObject, frame: Frame) -> None:
             texture = _write_texture(path, f"texture_{number}", part.material.texture)
         shape, color = (part.vertices, part.faces, part.uv), part.material.color
         colors = part.colors if texture is None else None
-        _add_surface(stage, _Surface(f"model/part_{number}", *shape, color, texture, colors))
+        surface = _Surface(f"model/part_{number}", *shape, color, texture, colors)
+        _add_surface(stage, replace(surface, is_cut_out=part.is_cut_out))
     for number, photo in enumerate(photos):
         view, plane = f"view_{number}", photo.plane
         _place(UsdGeom.Xform.Define(stage, f"/scene/{view}"), photo.pose)
@@ -176,6 +178,10 @@ def _add_material(stage: Usd.Stage, place: str, surface: _Surface) -> Any:
         if surface.is_photo:  # it shines by itself
             target = shader.CreateInput("emissiveColor", types.Color3f)
         target.ConnectToSource(picture, "rgb")
+        if surface.is_cut_out:
+            shader.GetInput("opacity").ConnectToSource(picture, "a")
+            if surface.color[3] >= OPAQUE:  # as glTF's MASK, or the parts behind shine through
+                shader.CreateInput("opacityThreshold", types.Float).Set(0.5)
     elif surface.colors is not None:
         reader = UsdShade.Shader.Define(stage, f"{place}/material/colors")
         reader.CreateIdAttr("UsdPrimvarReader_float3")
@@ -204,10 +210,12 @@ def _add_texture(stage: Usd.Stage, place: str, surface: _Surface) -> Any:
     picture.CreateIdAttr("UsdUVTexture")
     picture.CreateInput("file", types.Asset).Set(f"./{surface.texture}")
     if not surface.is_photo:  # the material's colour multiplies with the texture
-        picture.CreateInput("scale", types.Float4).Set(Gf.Vec4f(*_linear(surface.color), 1))
+        scale = Gf.Vec4f(*_linear(surface.color), float(surface.color[3]))
+        picture.CreateInput("scale", types.Float4).Set(scale)
     picture.CreateInput("sourceColorSpace", types.Token).Set("sRGB")
     for axis in ("wrapS", "wrapT"):
         picture.CreateInput(axis, types.Token).Set("clamp" if surface.is_photo else "repeat")
     picture.CreateInput("st", types.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
     picture.CreateOutput("rgb", types.Float3)
+    picture.CreateOutput("a", types.Float)
     return picture.ConnectableAPI()

@@ -218,3 +218,49 @@ def test_unknown_options_are_refused(tmp_path: Path) -> None:
         ExportOptions(scene_id=-1)
     with pytest.raises(InputError, match="world_from_cam: not a rigid motion"):
         aligned(tmp_path, world_from_cam=2 * np.eye(4))
+
+
+@pytest.mark.parametrize("name", ["far.ply", "far.obj"])
+def test_mesh_files_far_from_their_origin_keep_their_form(tmp_path: Path, name: str) -> None:
+    world = np.eye(4)
+    world[:3, 3] = 400_000.123, 5_800_000.456, 30.0
+    exported = aligned(tmp_path, world_from_cam=world)
+    options = ExportOptions(frame="world")
+    mesh = load_mesh(export_object(tmp_path / name, exported, options=options))
+    expected = POSE.apply(wedge().vertices) + world[:3, 3]
+    np.testing.assert_allclose(mesh.vertices, expected, rtol=0, atol=1e-7)
+
+
+def test_photos_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    first = aligned(tmp_path).views[0]
+    views = []
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+        photo = tmp_path / side / "000007.png"
+        photo.write_bytes((tmp_path / "000007.png").read_bytes())
+        views.append(replace(first, image=photo))
+    two = replace(aligned(tmp_path), views=tuple(views))
+    names = ["left/000007.png", "right/000007.png"]
+    export_object(tmp_path / "a.coco.json", two)
+    coco = json.loads((tmp_path / "a.coco.json").read_text())
+    assert [image["file_name"] for image in coco["images"]] == names
+    export_object(tmp_path / "cameras", two, format="colmap")
+    assert [view.name for view in read_camera_views(tmp_path / "cameras")] == names
+
+
+def test_usd_cuts_out_the_transparent_pixels_of_textures(tmp_path: Path) -> None:
+    pytest.importorskip("pxr", reason="usd-core is not installed")
+    from pxr import Usd, UsdShade
+
+    plain = wedge()
+    cloth, red = plain.materials
+    assert cloth.texture is not None
+    opacity = np.where(np.arange(8) < 4, 0, 255).astype(np.uint8)
+    leaf = np.dstack([cloth.texture, np.tile(opacity, (8, 1))])
+    mesh = replace(plain, materials=(replace(cloth, texture=leaf), red))
+    stage = Usd.Stage.Open(str(export_object(tmp_path / "a.usda", aligned(tmp_path, mesh=mesh))))
+    shader = UsdShade.Shader.Get(stage, "/scene/model/part_0/material/surface")
+    assert shader.GetInput("opacity").HasConnectedSource()
+    assert shader.GetInput("opacityThreshold").Get() == 0.5
+    other = UsdShade.Shader.Get(stage, "/scene/model/part_1/material/surface")
+    assert not other.GetInput("opacity").HasConnectedSource()

@@ -221,3 +221,10 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no rig"):
         export_object(tmp_path / "a.glb", aligned(tmp_path), options=ExportOptions(frame="rig"))
     assert not (tmp_path / "a.glb").exists()
+
+
+def test_a_model_may_be_called_as_a_photo_is(tmp_path: Path) -> None:
+    path = export_object(tmp_path / "a.glb", aligned(tmp_path, name="photo"))
+    scene = trimesh.load(path)
+    assert isinstance(scene, trimesh.Scene)
+    assert len(scene.geometry) == 3

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, fields
 from typing import Any
 
 _QUOTED_LENGTH = 200
+_REASONS = 3  # of many, that are listed
 _NEAR = 0.7  # similarity of names from which one may be meant by the other
 
 
@@ -125,6 +126,23 @@ def unknown(
     return InputError(f"unknown {kind} {quote(value)}{hint}", where=where or kind, fix=fix)
 
 
+def all_left_out(problems: Sequence[CadalignError]) -> CadalignError:
+    """The error of work that leaves out everything, with its first reasons; or the only reason.
+
+    Examples
+    --------
+    >>> print(all_left_out([InputError("no mesh", where="row 0"), InputError("no photo")]))
+    all 2 are left out: (1) row 0: no mesh; (2) no photo
+    """
+    reasons = list(dict.fromkeys(map(str, problems)))
+    if len(reasons) == 1:
+        return problems[0]
+    listed = (f"({number}) {text}" for number, text in enumerate(reasons[:_REASONS], start=1))
+    more = len(reasons) - _REASONS
+    rest = f"; and {more} more" if more > 0 else ""
+    return InputError(f"all {len(problems)} are left out: {'; '.join(listed)}{rest}")
+
+
 def quote(value: Any) -> str:
     """Quote a value for a message, in at most 200 characters.
 
@@ -160,9 +178,11 @@ def _cut(text: str) -> str:
     return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."
 
 
-def refuse_unused(options: Any, names: Iterable[str], why: str) -> None:
+def refuse_unused(
+    options: Any, names: Iterable[str], why: str, *, fix: str = "leave it out"
+) -> None:
     """Refuse fields of options that are given, not at their defaults, though not used."""
     for each in fields(options):
         default = each.default if each.default_factory is MISSING else each.default_factory()
         if each.name in names and getattr(options, each.name) != default:
-            raise InputError(f"has no effect {why}", where=each.name, fix="leave it out")
+            raise InputError(f"has no effect {why}", where=each.name, fix=fix)

@@ -15,7 +15,7 @@ from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import placed_objects
 from cadalign.datasets.sfm import blind_pnp, bundler, colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
-from cadalign.errors import DataError, InputError, unknown
+from cadalign.errors import DataError, InputError, all_left_out, unknown
 from cadalign.io.files import as_path, open_input, writing
 
 PHOTO_FORMATS = (
@@ -129,7 +129,7 @@ def write_photos(
     try:
         problems += writers[form](folder, placed_objects(photos, problems))
         if len(problems) == count:
-            raise problems[0]
+            raise all_left_out(problems)
     except BaseException:  # what is half written would be in the way of another try
         shutil.rmtree(folder, ignore_errors=True)
         raise

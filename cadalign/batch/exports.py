@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,17 +19,25 @@ from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.sfm.colmap import write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView
-from cadalign.errors import CadalignError, DataError, InputError, RenderError, quote
+from cadalign.errors import (
+    CadalignError,
+    DataError,
+    InputError,
+    RenderError,
+    all_left_out,
+    brief,
+    quote,
+)
 from cadalign.estimation.result import Result
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_groups
-from cadalign.export.aligned_object import FORMS, AlignedObject, ExportView, photos_of
+from cadalign.export.aligned_object import FORMS, AlignedObject, ExportView, names_of, photos_of
 from cadalign.export.camera_files import write_nerf
 from cadalign.export.formats import export_object, format_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import join
 from cadalign.io.documents import parse_json, written_path
-from cadalign.io.files import keeping, made_folder, write_json
+from cadalign.io.files import keeping, listed, made_folder, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model
@@ -104,6 +111,8 @@ def export_run(
     DataError
         If the run cannot be read, or the files cannot be written.
     """
+    folder = RunFolder(run)
+    require_run(folder)
     known = (DOCUMENTS, *RUN_FORMATS)
     fix = f"of a run, give one of {', '.join(known)}"
     if format is None and to.name not in known:
@@ -114,13 +123,12 @@ def export_run(
     name = format or to.name
     if name not in known:
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
-    total = (RunFolder(run).read_config() or {}).get("tasks", 0)
+    total = (folder.read_config() or {}).get("tasks", 0)
     for row in rows:
         if not 0 <= row < total:
             fix = f"give numbers from 0 to {total - 1}"
             raise InputError(f"the run has no observation {row}", where="rows", fix=fix)
     left_out: list[CadalignError] = []
-    folder = RunFolder(run)
     results = _run_results(folder, rows)
     made_folder(to.parent)
     with keeping(_inputs(folder)):
@@ -132,9 +140,24 @@ def export_run(
             count = write(to, objects, left_out)
     if not count:
         if left_out:
-            raise left_out[0]
+            raise all_left_out(left_out)
         raise InputError("no observation of the run is aligned", where=str(run))
     return Exported(to, count, tuple(left_out))
+
+
+def require_run(folder: RunFolder) -> None:
+    """Raise a DataError for a folder that is no finished run."""
+    if folder.is_finished:
+        return
+    where = str(folder.path)
+    if folder.read_config() is not None:
+        fix = "start the command that made it again: it goes on"
+        raise DataError("not a finished run of fits", where=where, fix=fix)
+    fits = [path.parent.name for path in listed(folder.path, "*/fit.json")]
+    fix = "give a fit.json, its folder, or the folder of a run"
+    if fits:  # as of the objects of a scene
+        fix = f"give the folder of one of the fits in it: {brief(', '.join(fits))}"
+    raise DataError("neither a fit nor a run of fits", where=where, fix=fix)
 
 
 def _made_file(path: Path, name: str) -> Path:
@@ -167,9 +190,6 @@ def _run_results(folder: RunFolder, rows: Collection[int]) -> Iterator[_Stored]:
 
 def _records(folder: RunFolder) -> Iterator[tuple[Path, int, Observation, str]]:
     """As `_run_results`, of all observations that could be read, with the results' text."""
-    if not folder.is_finished:
-        fix = "start the command that made it again: it goes on"
-        raise DataError("not a finished run of fits", where=str(folder.path), fix=fix)
     for table in read_groups(folder.records, fix=_FIX):
         if not {name for name, _ in RECORD_COLUMNS} <= set(table.column_names):
             raise DataError("not a run of fits", where=str(folder.path))
@@ -220,7 +240,7 @@ def _write_glb(path: Path, objects: Iterator[RunObject], left_out: list[Cadalign
                 export_object(path / f"{each.row:06d}.glb", each.exported)
             count += 1
         except InputError as error:
-            left_out.append(error)
+            left_out.append(InputError(error.what, where=f"row {each.row}", fix=error.fix))
     if view is not None:
         export_object(path, AlignedObject((view,), mesh=join(placed, str(path)), name="objects"))
     return count
@@ -264,17 +284,10 @@ def _write_coco(path: Path, objects: Iterator[RunObject], left_out: list[Cadalig
         if known is not photo:
             photos[key] = replace(known, objects=known.objects + photo.objects)
         count += 1
-    names = _names(photos)
+    names = names_of(photos)
     named = [replace(photo, name=names.get(key, photo.name)) for key, photo in photos.items()]
     write_coco_keypoints(_made_file(path, "keypoints.json"), named)
     return count
-
-
-def _names(photos: Iterable[Path | str]) -> dict[Path | str, str]:
-    """Names of the photos that are files, relative to the folder that holds them all."""
-    paths = {photo: Path(os.path.abspath(photo)) for photo in photos if isinstance(photo, Path)}
-    root = os.path.commonpath([path.parent for path in paths.values()]) if paths else ""
-    return {photo: path.relative_to(root).as_posix() for photo, path in paths.items()}
 
 
 def _photos(objects: Iterator[RunObject]) -> Iterator[Photo]:
@@ -346,7 +359,7 @@ def _cameras(objects: Iterator[RunObject]) -> list[tuple[CameraView, Path | str]
 def _write_colmap(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
     """Write the cameras with names of their own: a photo's first one has that of the photo."""
     found, views = _cameras(objects), {}
-    names = _names(photo for _, photo in found)
+    names = names_of(photo for _, photo in found)
     for view, photo in found:
         name = names.get(photo, view.name)
         if name in views:

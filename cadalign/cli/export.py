@@ -88,8 +88,10 @@ class Export:
 
     def _export_run(self) -> int:
         """Write a run; returns the exit code, 3 where some objects are left out."""
-        from cadalign.batch.exports import export_run
+        from cadalign.batch.exports import export_run, require_run
+        from cadalign.evaluation.runs.folder import RunFolder
 
+        require_run(RunFolder(self.fit))
         with named_as_flags(self, self.options):
             refuse_unused(self, ["observation", "shape", "world"], "on a run")
             names = [each.name for each in fields(self.options)]

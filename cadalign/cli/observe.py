@@ -31,7 +31,7 @@ from cadalign.datasets import (
 )
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.detections.image_keypoints import photo_in
-from cadalign.errors import CadalignError, DataError, InputError
+from cadalign.errors import CadalignError, DataError, InputError, refuse_unused
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file
 from cadalign.io.evidence import ObservedImage
@@ -86,6 +86,10 @@ class Observe(CameraOptions, EvidenceOptions):
         """Write the observation, or those of all objects; returns the exit code."""
         if self.tracks and not self.every:
             raise InputError("given without --every", where="--tracks", fix="give both")
+        if not self.weigh:
+            with named_as_flags(self):
+                fix = "give both, or the fit `--sigma`"
+                refuse_unused(self, ["sigma"], "without --weigh", fix=fix)
         objects = read_image_keypoints(self.keypoints)
         model = ModelKeypoints.load(self.model_keypoints)
         inputs = [self.keypoints, self.model_keypoints, model.model, self.camera, self.image]

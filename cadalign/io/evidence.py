@@ -226,6 +226,8 @@ class ImageEvidence(DeclaredEvidence):
         for name, shape in (("up", (3,)), ("cam_from_rig", (4, 4))):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_floats(value, name=name, shape=shape))
+        if self.up is not None and not self.up.any():
+            raise InputError("a direction must not be zero", where="up")
 
 
 @dataclass(frozen=True, eq=False)

@@ -177,8 +177,16 @@ def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not tell the format; of a run, give one of json"):
         export_run(run, tmp_path / "out")
     assert export_run(run, tmp_path / "json").objects == 3
-    with pytest.raises(DataError, match="not a finished run of fits"):
+    with pytest.raises(DataError, match="neither a fit nor a run of fits; give"):
         export_run(tmp_path, tmp_path / "out.csv")
+    (tmp_path / "chair_fit").mkdir()
+    (tmp_path / "chair_fit" / "fit.json").write_text("{}")
+    with pytest.raises(DataError, match="give the folder of one of the fits in it: chair_fit"):
+        export_run(tmp_path, tmp_path / "out.obj")
+    unfinished = shutil.copytree(run, tmp_path / "unfinished")
+    (unfinished / "results.parquet").unlink()
+    with pytest.raises(DataError, match="not a finished run of fits; start the command that made"):
+        export_run(unfinished, tmp_path / "out.csv")
     with pytest.raises(InputError, match="rows: the run has no observation 99; give numbers from"):
         export_run(run, tmp_path / "out.csv", rows=[0, 99])
 

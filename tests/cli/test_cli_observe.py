@@ -409,3 +409,14 @@ def test_tracks_are_for_all_objects(folder: Path, capsys: pytest.CaptureFixture[
 
 def test_files_of_names_that_read_alike_stay_apart() -> None:
     assert _slugs(["a", "a", "a_0", "A/b", "a_b"]) == ["a_0", "a_1", "a_0_2", "A_b", "a_b_2"]
+
+
+def test_what_would_have_no_effect_or_be_no_direction_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["observe", folder / "found.json", folder / "model.keypoints.json"]
+    given += ["--image", folder / "photo.jpg"]
+    assert refusal_line(capsys, *given, "--sigma", "3") == (
+        "--sigma: has no effect without --weigh; give both, or the fit `--sigma`"
+    )
+    assert "up: a direction must not be zero" in refusal_line(capsys, *given, "--up", 0, 0, 0)

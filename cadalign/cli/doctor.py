@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from cadalign.datasets import PhotoSummary
     from cadalign.render.probe import Probe
 
-
 # Problems of a data set that are printed; JSON has all.
 _SHOWN = 10
 

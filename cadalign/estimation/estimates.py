@@ -104,7 +104,7 @@ def curvature_of_rotations(covariance: FloatArray) -> FloatArray:
 
 
 def has_linear_box(model: ShapePrior | ShapeModel) -> bool:
-    """Whether the box is always that of the shape's own last two points."""
+    """True if the box is always that of the shape's own last two points."""
     return model.has_box and model.box_margins is None
 
 

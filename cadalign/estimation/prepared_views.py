@@ -22,12 +22,11 @@ from cadalign.estimation.model import is_exact_model
 from cadalign.estimation.options import pixel_information
 from cadalign.estimation.pack import evidence_of, tells_something
 from cadalign.estimation.prior import ShapePrior, with_known_shape
-from cadalign.estimation.problems import are_on_a_line
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated, Statistics, ViewResult
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box
+from cadalign.geometry.box import Box, are_on_a_line
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.io.evidence import Size
 from cadalign.solvers.joint.search import refine_joint

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray, IntArray, as_points, is_number, worker_count
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.options import SIGMA_HELP, FitOptions, Sigma, pixel_information
+from cadalign.geometry.box import are_on_a_line
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.solvers.constants import NOT_FOUND, OUT_OF_RANGE, TOO_FEW
@@ -320,12 +321,6 @@ def _places(size: int, known_axis: str) -> IntArray:
     """Entries of a flattened covariance that belong to unknowns of the solvers."""
     rows = np.delete(np.arange(size), 6 + "xyz".index(known_axis))
     return (size * rows[:, None] + rows).ravel()
-
-
-def are_on_a_line(points: FloatArray, flat: float) -> bool:
-    """True for points (n, 3) whose second extent is at most ``flat`` times the first."""
-    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(extents[1] <= flat * extents[0])
 
 
 def are_in_one_plane(points: FloatArray) -> bool:

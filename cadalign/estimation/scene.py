@@ -227,9 +227,8 @@ def align_scene(
     for member in members:
         found[member.number] = member.result
     for number, each in enumerate(objects):
-        if isinstance(
-            found[number], CadalignError
-        ):  # as of a mask that does not tell the focal length
+        # As of a mask alone, which does not tell the focal length.
+        if isinstance(found[number], CadalignError):
             with suppress(CadalignError):
                 found[number] = aligned(each, shared.tilted(tilt))
     scene = AlignedScene(Results.of(found), camera, warnings=(*warnings, *contradictions))

@@ -205,7 +205,7 @@ class MeshPart:
 
     @property
     def is_cut_out(self) -> bool:
-        """Whether the texture has transparent pixels."""
+        """True if the texture has transparent pixels."""
         texture = self.material.texture
         is_open = texture is not None and texture.shape[2] == 4 and (texture[..., 3] < 255).any()
         return bool(is_open) and self.uv is not None

@@ -24,6 +24,12 @@ def extent(points: FloatArray) -> FloatArray:
     return np.array([points.min(axis=0), points.max(axis=0)])
 
 
+def are_on_a_line(points: FloatArray, flat: float) -> bool:
+    """True for points (n, 3) whose second extent is at most ``flat`` times the first."""
+    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(extents[1] <= flat * extents[0])
+
+
 def bounds_corners(low: FloatArray, high: FloatArray) -> FloatArray:
     """The 8 corners (8, 3) between lowest and highest coordinates, in the order of a `Box`."""
     return np.where(_CORNER_SIGNS > 0, high, low)

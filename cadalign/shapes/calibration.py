@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
+from cadalign.geometry.box import are_on_a_line
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.parts import (
@@ -32,7 +33,7 @@ from cadalign.shapes.parts import (
 _FACTORS = np.geomspace(1.0, 3.0, 12)  # sigmas are never narrowed; the first is no factor
 _DEGREES_OF_FREEDOM = (None, 20.0, 10.0, 7.0, 5.0, 4.0, 3.0)
 _LEAST_KEYPOINTS = 4
-_ON_A_LINE = 1e-6  # spread across the line, over that along it
+_ON_A_LINE = 1e-6  # below which no image tells how points are turned about their line
 _NOMINAL = np.array([0.68, 0.95])
 _TOLERANCE = np.array([0.08, 0.05])  # of these shares of truths
 _EXCEEDED = 95.0  # percentile of the linear box's errors
@@ -79,12 +80,12 @@ def calibrate(
         for row in rows:
             known = np.flatnonzero(np.isfinite(row[:-BOX_ROWS]).all(axis=1))
             count = len(known)
-            if count >= _LEAST_KEYPOINTS and not _are_on_a_line(row[known]):
+            if count >= _LEAST_KEYPOINTS and not are_on_a_line(row[known], _ON_A_LINE):
                 counts.append(count)
                 view = _view(known, np.arange(count), row, sigma, rng)
                 every.append(_squares(view, mixture, sigma))
             given = rng.permutation(count)[:FEW] if count > FEW else None
-            if given is not None and not _are_on_a_line(row[known[given]]):
+            if given is not None and not are_on_a_line(row[known[given]], _ON_A_LINE):
                 view = _view(known, given, row, sigma, rng)
                 few.append(_squares(view, mixture, sigma))
     if not counts:
@@ -98,12 +99,6 @@ def calibrate(
     if gaps.shape[2] > 1:
         of_few = FewKeypoints(typical, float(_FACTORS[lower]) / factor)
     return ShapeCalibration(factor, _DEGREES_OF_FREEDOM[freedom], of_few)
-
-
-def _are_on_a_line(points: FloatArray) -> bool:
-    """True where no image of the points tells how they are turned about their line."""
-    spreads = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(spreads[1] <= _ON_A_LINE * spreads[0])
 
 
 def _departures(squares: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:

@@ -1,7 +1,8 @@
 """Test instances of an annotated model: a view, a stretch, noisy visible keypoints, symmetry.
 
 An estimate that is off by a rotation that maps the object onto itself shows the same object in the
-same place: that is no error. `cadalign.datasets.models.keypoints` finds these rotations.
+same place: that is no error. `cadalign.datasets.models.keypoints.annotated_symmetry` finds
+these rotations.
 """
 
 from __future__ import annotations

@@ -245,9 +245,8 @@ def _parse_faces(bodies: list[bytes]) -> tuple[IntArray, IntArray]:
     elif forms == {b"//"} and doubled == total:
         corners[:, 0] = parse_numbers(text.replace(b"//", b" "), 2 * total, np.int64)[::2]
     elif forms == {b"//"} and not doubled and text.count(b"/") == 2 * total:
-        corners[:] = parse_numbers(text.replace(b"/", b" "), 3 * total, np.int64).reshape(total, 3)[
-            :, :2
-        ]
+        values = parse_numbers(text.replace(b"/", b" "), 3 * total, np.int64)
+        corners[:] = values.reshape(total, 3)[:, :2]
     else:
         corners[:] = [_parse_corner(corner) for corner in text.split()]
     return corners, sizes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shutil
 import tempfile
@@ -28,6 +29,18 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("cadalign")
+
+# In memory where there is room: a disk takes some milliseconds for every file that takes another's
+# place, as all do that are written whole.
+_MEMORY = Path("/dev/shm")
+_ROOM = 4e9  # [bytes]
+if (
+    os.access(_MEMORY, os.W_OK)
+    and shutil.disk_usage(_MEMORY).free > _ROOM
+    and not os.statvfs(_MEMORY).f_flag & os.ST_NOEXEC
+):
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
+    tempfile.tempdir = os.environ.setdefault("TMPDIR", str(_MEMORY))
 
 # Undo histories of the annotator are kept there.
 os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cadalign-tests-")
@@ -135,14 +148,29 @@ def sample_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_sample_dataset(tmp_path_factory.mktemp("data") / "sample", per_category=1)
 
 
-# Not for the whole session: an event loop runs while Playwright does, and other tests need theirs.
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    """See `chromium`; tests are skipped where there is none."""
+@pytest.fixture(scope="session")
+def launched() -> Iterator[tuple[Browser, asyncio.AbstractEventLoop]]:
+    """One Chromium for all modules, and Playwright's event loop, which is hidden between them.
+
+    That loop runs as long as Playwright does, and no other could beside it. Tests are skipped where
+    there is no Chromium.
+    """
     with ExitStack() as stack:
         try:
-            launched = stack.enter_context(chromium())
+            found = stack.enter_context(chromium())
         except Error as error:
             reason = error.message.strip().splitlines()[0]
             pytest.skip(f"no Chromium here ({reason}); on Debian: apt-get install chromium")
-        yield launched
+        loop = asyncio.get_running_loop()
+        asyncio._set_running_loop(None)
+        yield found, loop
+        asyncio._set_running_loop(loop)
+
+
+@pytest.fixture(scope="module")
+def browser(launched: tuple[Browser, asyncio.AbstractEventLoop]) -> Iterator[Browser]:
+    """See `launched`; not for modules whose tests have an event loop of their own."""
+    found, loop = launched
+    asyncio._set_running_loop(loop)
+    yield found
+    asyncio._set_running_loop(None)

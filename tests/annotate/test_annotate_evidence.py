@@ -106,7 +106,19 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
     live, _ = session.live(state)
     assert isinstance(live, LiveAlignment)
     assert live.result is not None
-    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(case.observation),
+                "--json",
+                "--no-picture",
+                "--out",
+                str(case.folder / "x"),
+            ]
+        )
+        == 0
+    )
     command = json.loads(capsys.readouterr().out)
     page = live.result.to_dict()
     for name in ("alignment", "covariance", "std", "stretch", "points_3d"):

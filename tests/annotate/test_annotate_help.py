@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Page, expect
 from support.annotating import IDLE, Case, opened_page, served, wait
 
 import cadalign.web
@@ -21,79 +22,76 @@ pytestmark = pytest.mark.long
 SCRIPTS = Path(cadalign.web.__file__).parent / "annotate"
 
 
-@pytest.mark.parametrize(("width", "height"), [(1366, 768), (390, 844)])
-def test_tour_has_three_steps_and_comes_once(
-    browser: Browser, case: Case, width: int, height: int
-) -> None:
-    context = browser.new_context(viewport={"width": width, "height": height})
-    with served(case.open()) as access:
-        page = context.new_page()
-        page.goto(access.url)
-        wait(page, IDLE)
-        page.evaluate("annotator.tour.startOnce()")
-        box = page.get_by_role("dialog", name=re.compile(r"^\d\. "))
-        for step in (1, 2, 3):
-            expect(box).to_contain_text(f"{step}. ")
-            assert page.locator(".toured").count() == 1
-            assert page.evaluate(
-                "(() => { const b = document.querySelector('.tour').getBoundingClientRect();"
-                " return b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight; })()"
-            )
-            page.keyboard.press("Enter")
-        expect(box).to_be_hidden()
-        assert page.locator(".toured").count() == 0
-        page.evaluate("annotator.tour.startOnce()")
-        expect(box).to_be_hidden()
-        page.keyboard.press("?")
-        page.get_by_role("button", name="Show the tour").click()
-        expect(box).to_be_visible()
-        page.keyboard.press("Escape")
-        expect(box).to_be_hidden()
-        context.close()
+@pytest.fixture(scope="module", params=[(1366, 768), (390, 844)], ids=["desktop", "phone"])
+def page(
+    request: pytest.FixtureRequest,
+    browser: Browser,
+    original: Case,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Page]:
+    """One page for the tests that change no annotation; each leaves it without a dialog."""
+    width, height = request.param
+    session = original.copied_to(tmp_path_factory.mktemp("help") / "photos").open()
+    with opened_page(browser, session, width=width, height=height) as page:
+        yield page
 
 
-@pytest.mark.parametrize(("width", "height"), [(1366, 768), (390, 844)])
-def test_help_opens_at_its_beginning_and_covers_no_photo(
-    browser: Browser, case: Case, width: int, height: int
-) -> None:
-    with opened_page(browser, case.open(), width=width, height=height) as page:
-        page.keyboard.press("?")
-        title = page.get_by_role("heading", name="Keys and mouse")
-        expect(title).to_be_focused()
-        assert page.locator("dialog.help").evaluate("d => d.scrollTop") == 0
-        help_box = page.locator("dialog.help").bounding_box()
-        photo = page.locator("section[aria-label=Photo]").bounding_box()
-        assert help_box is not None
-        assert photo is not None
-        beside = help_box["x"] >= photo["x"] + photo["width"]
-        assert beside or help_box["y"] >= photo["y"] + photo["height"]
-        page.locator("dialog.help").evaluate("d => d.scrollTo(0, 1e6)")
-        page.keyboard.press("Escape")
-        expect(title).to_be_hidden()
-        page.keyboard.press("?")
-        assert page.locator("dialog.help").evaluate("d => d.scrollTop") == 0
+def test_tour_has_three_steps_and_comes_once(page: Page) -> None:
+    page.evaluate("annotator.tour.startOnce()")
+    box = page.get_by_role("dialog", name=re.compile(r"^\d\. "))
+    for step in (1, 2, 3):
+        expect(box).to_contain_text(f"{step}. ")
+        assert page.locator(".toured").count() == 1
+        assert page.evaluate(
+            "(() => { const b = document.querySelector('.tour').getBoundingClientRect();"
+            " return b.left >= 0 && b.right <= innerWidth && b.bottom <= innerHeight; })()"
+        )
+        page.keyboard.press("Enter")
+    expect(box).to_be_hidden()
+    assert page.locator(".toured").count() == 0
+    page.evaluate("annotator.tour.startOnce()")
+    expect(box).to_be_hidden()
+    page.keyboard.press("?")
+    page.get_by_role("button", name="Show the tour").click()
+    expect(box).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(box).to_be_hidden()
 
 
-def test_every_key_is_listed_and_controls_have_tooltips_or_texts(
-    browser: Browser, case: Case
-) -> None:
+def test_help_opens_at_its_beginning_and_covers_no_photo(page: Page) -> None:
+    page.keyboard.press("?")
+    title = page.get_by_role("heading", name="Keys and mouse")
+    expect(title).to_be_focused()
+    assert page.locator("dialog.help").evaluate("d => d.scrollTop") == 0
+    help_box = page.locator("dialog.help").bounding_box()
+    photo = page.locator("section[aria-label=Photo]").bounding_box()
+    assert help_box is not None
+    assert photo is not None
+    beside = help_box["x"] >= photo["x"] + photo["width"]
+    assert beside or help_box["y"] >= photo["y"] + photo["height"]
+    page.locator("dialog.help").evaluate("d => d.scrollTo(0, 1e6)")
+    page.keyboard.press("Escape")
+    expect(title).to_be_hidden()
+    page.keyboard.press("?")
+    assert page.locator("dialog.help").evaluate("d => d.scrollTop") == 0
+    page.keyboard.press("Escape")
+    expect(title).to_be_hidden()
+
+
+def test_every_key_is_listed_and_controls_have_tooltips_or_texts(page: Page) -> None:
     keys = re.findall(r'case "(\w)":', (SCRIPTS / "keys.js").read_text())
     keys += re.findall(r'key: "(\w)"', (SCRIPTS / "marking.js").read_text())
     keys += re.findall(r"[{ ](\w): \(app, held\)", (SCRIPTS / "keys.js").read_text())
-    context = browser.new_context(viewport={"width": 1366, "height": 768})
-    with served(case.open()) as access:
-        page = context.new_page()
-        page.goto(access.url)
-        wait(page, IDLE)
-        page.keyboard.press("?")
-        listed = " ".join(page.locator("dialog[open] dt").all_inner_texts())
-        words = set(re.findall(r"\b\w\b", listed))
-        assert len(set(keys)) > 12
-        assert {key.upper() for key in keys} <= words
-        page.keyboard.press("Escape")
-        for control in page.locator("button:visible, select:visible").all():
-            assert control.evaluate("c => c.title || c.ariaLabel || c.textContent").strip()
-        context.close()
+    page.keyboard.press("?")
+    listed = " ".join(page.locator("dialog[open] dt").all_inner_texts())
+    words = set(re.findall(r"\b\w\b", listed))
+    assert len(set(keys)) > 12
+    assert {key.upper() for key in keys} <= words
+    page.keyboard.press("Escape")
+    for name in page.locator("button:visible, select:visible").evaluate_all(
+        "(all) => all.map((c) => c.title || c.ariaLabel || c.textContent)"
+    ):
+        assert name.strip()
 
 
 # --- a team ------------------------------------------------------------------------------------

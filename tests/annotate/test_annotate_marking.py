@@ -60,7 +60,19 @@ def agree_with_fit(
     """The page's alignment, which `cadalign fit` must find in the saved file."""
     live, _ = session.live(session.photos[0])
     assert live.result is not None, live.message
-    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(case.observation),
+                "--json",
+                "--no-picture",
+                "--out",
+                str(case.folder / "x"),
+            ]
+        )
+        == 0
+    )
     command, page = json.loads(capsys.readouterr().out), live.result.to_dict()
     for name in ("alignment", "covariance", "std", "stretch"):
         np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)

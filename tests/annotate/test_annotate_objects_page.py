@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from functools import partial
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.annotating import IDLE, Case, opened_page, place, place_of_pixel
-from support.annotating import wait as support_wait
+from support.annotating import IDLE, Case, opened_page, place, place_of_pixel, wait
 
 from cadalign.annotate.actions import perform
 from cadalign.annotate.session import Session
@@ -24,9 +22,6 @@ SHIFTS = """() => {
         for (const entry of list.getEntries()) window.moved += entry.value;
     }).observe({ type: "layout-shift", buffered: true });
 }"""
-
-
-wait = partial(support_wait, polls=1500)
 
 
 def click(page: Page, uv: list[float]) -> None:

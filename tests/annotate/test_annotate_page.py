@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.annotating import IDLE, Case, place_all, place_of_pixel, place_twenty, served
+from support.annotating import IDLE, Case, place_all, place_of_pixel, place_twenty, served, wait
 from support.timing import Yardstick, reference_seconds
 
 from cadalign import ShapeModel
@@ -28,7 +28,7 @@ from cadalign.shapes.examples import Example
 
 pytestmark = pytest.mark.long
 
-POLLS = 3000  # 20 ms apart; what fails after them does not come at all, however slow the machine
+POLLS = 6000  # 10 ms apart; what fails after them does not come at all, however slow the machine
 
 # Without the thousands of numbers of the lines.
 STATE = """() => annotator.api.idle && annotator.state && {
@@ -66,20 +66,15 @@ class Driver:
         self.page.goto(access.url)
         self.wait(IDLE)
 
-    # Not `wait_for_function`, which evaluates text in the page: its policy forbids that.
     def wait(self, condition: str) -> None:
-        for _ in range(POLLS):
-            if self.page.evaluate(condition):
-                return
-            self.page.wait_for_timeout(20)
-        pytest.fail(f"never true: {condition}; errors: {self.errors}")
+        wait(self.page, condition)
 
     def wait_for_state(self, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         for _ in range(POLLS):
             state = self.page.evaluate(STATE)
             if state and condition(state):
                 return dict(state)
-            self.page.wait_for_timeout(20)
+            self.page.wait_for_timeout(10)
         pytest.fail(f"the state never came; errors: {self.errors}")
 
     def pixel(self, uv: list[float]) -> tuple[float, float]:
@@ -191,7 +186,19 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
     # It is saved, and the file gives the alignment that the page shows.
     saved = re.compile("^Saved to photo.json at ")
     expect(page.locator("[role=status]")).to_have_text(saved, use_inner_text=True)
-    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(case.observation),
+                "--json",
+                "--no-picture",
+                "--out",
+                str(case.folder / "x"),
+            ]
+        )
+        == 0
+    )
     data = json.loads(capsys.readouterr().out)
     assert data["alignment"] == undone["alignment"]["alignment"]
 
@@ -482,12 +489,12 @@ def test_every_control_has_a_name_and_nothing_sticks_out(
         driver.open(access)
         page = driver.page
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-        for control in page.locator("button, input, [role=application], summary").all():
-            if control.is_visible():
-                name = control.evaluate(
-                    "c => c.ariaLabel || c.labels?.[0]?.textContent || c.textContent"
-                )
-                assert name.strip()
+        controls = ("button", "input", "[role=application]", "summary")
+        names = page.locator(", ".join(f"{each}:visible" for each in controls)).evaluate_all(
+            "all => all.map(c => c.ariaLabel || c.labels?.[0]?.textContent || c.textContent)"
+        )
+        assert len(names) > 20
+        assert all(name.strip() for name in names)
         assert page.locator("h1").count() == 1
         assert driver.errors == []
     context.close()

@@ -60,7 +60,7 @@ def used(
         errors: list[str] = []
         found: dict[str, Any] = {}
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.evaluate(axe_script(folder))
+        page.evaluate(axe_script())
 
         # What has not to do with colours is the same in both schemes, and colours at any size.
         desktop = [("dark", ONLY_COLOURS), ("light", {})]

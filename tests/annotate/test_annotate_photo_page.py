@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.annotating import IDLE, Case, make_case, opened_page, place_of_pixel, wait
+from support.annotating import (
+    IDLE,
+    Case,
+    make_case,
+    masks_searched_once,
+    opened_page,
+    place_of_pixel,
+    wait,
+)
 
 from cadalign.annotate.session import Session
 from cadalign.geometry.alignment import Alignment
@@ -15,6 +24,12 @@ from cadalign.metrics import rotation_error
 from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _searched_once() -> Iterator[None]:
+    with masks_searched_once():
+        yield
 
 
 def draw_box(page: Page, case: Case) -> None:

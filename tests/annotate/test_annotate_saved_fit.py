@@ -63,7 +63,19 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     assert page is not None
     assert (live.sigma > 1) == (noise > 1)
 
-    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(case.observation),
+                "--json",
+                "--no-picture",
+                "--out",
+                str(case.folder / "x"),
+            ]
+        )
+        == 0
+    )
     command = json.loads(capsys.readouterr().out)
     saved = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
     assert page.std is not None
@@ -133,7 +145,19 @@ def test_a_stored_sigma_counts_and_is_kept(
     live, _ = session.live(session.photos[0])
     assert live.result is not None
     assert live.sigma == 3.0
-    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(case.observation),
+                "--json",
+                "--no-picture",
+                "--out",
+                str(case.folder / "x"),
+            ]
+        )
+        == 0
+    )
     command = Result.from_json(capsys.readouterr().out)
     np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)
 

@@ -55,7 +55,19 @@ def test_file_gives_the_same_alignment_as_the_page(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state = place_all(case.open(), case)
-    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(case.observation),
+                "--json",
+                "--no-picture",
+                "--out",
+                str(case.folder / "x"),
+            ]
+        )
+        == 0
+    )
     data = json.loads(capsys.readouterr().out)
     assert data["alignment"] == state["alignment"]["alignment"]
     written = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())

@@ -93,7 +93,19 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     perform(session, 0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
     page = live_shape(session).result
     assert page is not None
-    assert main(["fit", str(case.observation), "--json", "--out", str(case.folder / "x")]) == 0
+    assert (
+        main(
+            [
+                "fit",
+                str(case.observation),
+                "--json",
+                "--no-picture",
+                "--out",
+                str(case.folder / "x"),
+            ]
+        )
+        == 0
+    )
     command = Result.from_dict(json.loads(capsys.readouterr().out))
     saved = Result.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
     for fitted in (command, saved):

@@ -28,7 +28,7 @@ def test_a_clip_is_marked_by_few_clicks_and_tracked(
 ) -> None:
     session = open_session(clip.options(tmp_path / "out", every=EVERY))
     session.warm_up()
-    with opened_page(browser, session, width=1600, height=1400) as page:
+    with opened_page(browser, session, width=1100, height=900) as page:
         clicks = mark_clip(page, session, clip, (0, 4, 9))
         page.keyboard.press("Control+z")  # what was taken last is proposed again
         expect(page.get_by_text("predicted from other frames")).to_be_visible()

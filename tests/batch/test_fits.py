@@ -135,10 +135,17 @@ cadalign.fit_many(sys.argv[1], out=sys.argv[2], workers=0)
 """
 
 
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run of 200 observations that nothing disturbs, beside their file."""
+    folder = tmp_path_factory.mktemp("calm")
+    cadalign.fit_many(lines(folder / "o.jsonl", 200), out=folder / "run", workers=0)
+    return folder / "run"
+
+
 @pytest.mark.long
-def test_killed_twice_it_gives_the_same_bytes(tmp_path: Path) -> None:
-    source = lines(tmp_path / "o.jsonl", 200)
-    cadalign.fit_many(source, out=tmp_path / "calm", workers=0)
+def test_killed_twice_it_gives_the_same_bytes(tmp_path: Path, calm: Path) -> None:
+    source = calm.parent / "o.jsonl"
     hit = RunFolder(tmp_path / "hit")
     done = 0
     for _ in range(2):
@@ -155,14 +162,13 @@ def test_killed_twice_it_gives_the_same_bytes(tmp_path: Path) -> None:
     cadalign.fit_many(source, out=hit.path, workers=0, on_progress=seen.append)
     assert seen[0].done >= 2 * 4
     for name in ("results.parquet", "records.parquet", "results.csv", "run.json"):
-        assert (hit.path / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+        assert (hit.path / name).read_bytes() == (calm / name).read_bytes()
 
 
 @pytest.mark.long
-def test_a_dask_worker_killed_in_between_loses_nothing(tmp_path: Path) -> None:
+def test_a_dask_worker_killed_in_between_loses_nothing(tmp_path: Path, calm: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="pip install 'cadalign[dask]'")
-    source = lines(tmp_path / "o.jsonl", 200)
-    cadalign.fit_many(source, out=tmp_path / "calm", workers=0)
+    source = calm.parent / "o.jsonl"
     killed: list[int] = []
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
@@ -178,7 +184,7 @@ def test_a_dask_worker_killed_in_between_loses_nothing(tmp_path: Path) -> None:
         cadalign.fit_many(source, out=tmp_path / "hit", dask=address, on_progress=kill_one)
     assert killed
     for name in ("results.parquet", "records.parquet"):
-        assert (tmp_path / "hit" / name).read_bytes() == (tmp_path / "calm" / name).read_bytes()
+        assert (tmp_path / "hit" / name).read_bytes() == (calm / name).read_bytes()
 
 
 def test_workers_may_have_been_started_elsewhere(

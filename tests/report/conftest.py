@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser
-from support.pages import Opened, watched
+from support.pages import Opened, Shown, views_of, watched
 from support.reports import Recipe, write_page
 
 
@@ -20,3 +20,10 @@ def opened(browser: Browser) -> Iterator[Opened]:
 def plain(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Address of the page of an ordinary run."""
     return write_page(tmp_path_factory.mktemp("plain") / "report.html", Recipe())
+
+
+@pytest.fixture(scope="module")
+def shown(browser: Browser, plain: str) -> Iterator[Shown]:
+    """Shows views of the page of an ordinary run, opened once for a module."""
+    with views_of(browser, plain) as show:
+        yield show

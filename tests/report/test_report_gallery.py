@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
-from support.pages import Opened, card_names, open_first, page_yardstick, scroll_through
+from support.pages import Opened, Shown, card_names, open_first, page_yardstick, scroll_through
 from support.reports import Recipe, listed, payload_of, write_page
 from support.timing import Measure, reference_seconds
 
@@ -23,8 +23,8 @@ def two_runs(tmp_path_factory: pytest.TempPathFactory) -> str:
     return write_page(tmp_path_factory.mktemp("two") / "report.html", Recipe(runs=2))
 
 
-def test_worst_best_and_random_are_one_click_away(opened: Opened, plain: str) -> None:
-    page = opened(plain)
+def test_worst_best_and_random_are_one_click_away(shown: Shown) -> None:
+    page = shown("")
     instances = listed(payload_of(Recipe()), "rotation_error_deg")
     worst = sorted(instances, key=lambda i: -np.inf if i["error"] is None else -i["error"])
     assert card_names(page)[:12] == [i["model"] for i in worst][:12]
@@ -45,8 +45,8 @@ def test_worst_best_and_random_are_one_click_away(opened: Opened, plain: str) ->
     assert card_names(page)[:12] != first[:12]
 
 
-def test_filters_keep_what_they_say(opened: Opened, plain: str) -> None:
-    page = opened(plain)
+def test_filters_keep_what_they_say(shown: Shown) -> None:
+    page = shown("")
     gallery = page.locator("#gallery")
     instances = listed(payload_of(Recipe()), "rotation_error_deg")
 
@@ -83,8 +83,8 @@ def test_filters_keep_what_they_say(opened: Opened, plain: str) -> None:
     assert gallery.locator(".found").get_attribute("role") == "status"
 
 
-def test_the_fragment_restores_the_view(opened: Opened, plain: str) -> None:
-    page = opened(plain)
+def test_the_fragment_restores_the_view(opened: Opened, shown: Shown) -> None:
+    page = shown("")
     gallery = page.locator("#gallery")
     gallery.get_by_label("category").select_option("vessel")
     page.get_by_role("button", name="Best", exact=True).click()

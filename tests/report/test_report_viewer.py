@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Locator, expect
-from support.pages import Opened, card_names, open_first
+from support.pages import Opened, Shown, card_names, open_first
 from support.reports import METHODS, WARNING, Recipe, listed, payload_of, write_page
 
 from cadalign import Alignment
@@ -45,8 +45,8 @@ def changed(before: np.ndarray, after: np.ndarray) -> float:
 
 
 @pytest.mark.long
-def test_an_instance_opens_with_layers_numbers_and_warnings(opened: Opened, plain: str) -> None:
-    page = opened(plain + "#order=best")
+def test_an_instance_opens_with_layers_numbers_and_warnings(shown: Shown) -> None:
+    page = shown("#order=best")
     dialog = open_first(page)
     best = listed(payload_of(Recipe()), "rotation_error_deg")
     best = min(best, key=lambda i: np.inf if i["error"] is None else i["error"])
@@ -85,9 +85,9 @@ def test_layers_that_an_instance_lacks_are_not_offered(opened: Opened, tmp_path:
 
 
 @pytest.mark.long
-def test_boxes_and_keypoints_are_where_the_camera_sees_them(opened: Opened, plain: str) -> None:
+def test_boxes_and_keypoints_are_where_the_camera_sees_them(shown: Shown) -> None:
     payload = payload_of(Recipe())
-    page = opened(f"{plain}#order=listed&show={METHODS[1]}")
+    page = shown(f"#order=listed&show={METHODS[1]}")
     dialog = open_first(page)
     exhibit = payload["exhibits"]["0"]
     gt = Alignment(np.reshape(exhibit["gt"]["rotation"], (3, 3)), *_rest(exhibit["gt"]))
@@ -113,8 +113,8 @@ def _rest(pose: dict[str, Any]) -> tuple[list[float], list[float]]:
     return pose["translation"], pose["scale"]
 
 
-def test_keys_walk_through_and_close(opened: Opened, plain: str) -> None:
-    page = opened(plain)
+def test_keys_walk_through_and_close(shown: Shown) -> None:
+    page = shown("")
     order = card_names(page)
     dialog = open_first(page)
     expect(dialog.get_by_label("previous instance")).to_be_disabled()
@@ -142,8 +142,8 @@ def test_keys_walk_through_and_close(opened: Opened, plain: str) -> None:
     expect(page.locator("#gallery")).to_be_visible()
 
 
-def test_the_scene_is_drawn_and_orbits(opened: Opened, plain: str) -> None:
-    page = opened(plain + "#order=best")
+def test_the_scene_is_drawn_and_orbits(shown: Shown) -> None:
+    page = shown("#order=best")
     canvas = open_first(page).locator("canvas")
     canvas.scroll_into_view_if_needed()
     views = [look(canvas)]

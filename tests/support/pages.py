@@ -15,6 +15,8 @@ from support.timing import Yardstick
 
 Opened = Callable[..., Page]
 """Opens an address: ``script`` runs before the page's, console errors with ``allowed`` pass."""
+Shown = Callable[[str], Page]
+"""Shows the view that a fragment names, in a page that several tests share."""
 
 
 def embedded_payload(page: Path) -> dict[str, Any]:
@@ -66,6 +68,31 @@ def watched(browser: Browser) -> Iterator[Opened]:
     for context in contexts:
         context.close()
     assert not complaints
+
+
+_SHOW_VIEW = """async (fragment) => {
+    document.activeElement.blur();
+    scrollTo(0, 0);
+    if (location.hash !== fragment) {
+        const changed = new Promise((done) => addEventListener("hashchange", done, { once: true }));
+        location.hash = fragment;
+        await changed;
+    }
+    for (let k = 0; k < 2; k += 1) await new Promise((drawn) => requestAnimationFrame(drawn));
+}"""
+
+
+@contextmanager
+def views_of(browser: Browser, address: str) -> Iterator[Shown]:
+    """Yield a function that shows views of one page: its fragment is all of its state."""
+    with watched(browser) as open_page:
+        page = open_page(address)
+
+        def show(fragment: str) -> Page:
+            page.evaluate(_SHOW_VIEW, fragment)
+            return page
+
+        yield show
 
 
 _USUAL_WORK = """() => {

@@ -38,7 +38,6 @@ AXE = """async (options) => {
         ({ id, impact, nodes: nodes.map((each) => `${each.html}: ${each.failureSummary}`) }));
 }"""
 PHOTO, MODEL = "section[aria-label=Photo] canvas", "section[aria-label=Model] canvas"
-_POLLS = 4000
 _TWO_FRAMES = """async () => {
     for (let k = 0; k < 2; k += 1) await new Promise((drawn) => requestAnimationFrame(drawn));
 }"""
@@ -78,7 +77,7 @@ class Keyboard:
     visited: list[str] = field(default_factory=list)
 
     def wait(self, condition: str = SETTLED) -> None:
-        wait(self.page, condition, polls=_POLLS)
+        wait(self.page, condition)
 
     def keys(self, *keys: str, then: str = SETTLED) -> None:
         """Press keys where the focus is, and wait."""
@@ -108,7 +107,7 @@ class Keyboard:
 
     def look(self, name: str) -> None:
         self.visited.append(name)
-        self.page.wait_for_timeout(50)
+        self.page.evaluate(_TWO_FRAMES)
         self.seen(name)
 
     def session(self) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import shutil
 import subprocess
+import tempfile
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -25,21 +28,28 @@ def npm_or_skip() -> str:
 
 def copy_with_modules(folder: Path) -> Path:
     """Copy the pages' sources with their packages beside them; skip where npm cannot get these."""
-    npm, copy = npm_or_skip(), folder / "web"
+    copy = folder / "web"
     shutil.copytree(WEB, copy, ignore=shutil.ignore_patterns("node_modules", "dist", "__pycache__"))
-    if (WEB / "node_modules").is_dir():
-        (copy / "node_modules").symlink_to(WEB / "node_modules")
-        return copy
-    command = [npm, "ci", "--no-audit", "--no-fund"]
-    installed = subprocess.run(command, cwd=copy, env=QUIET, capture_output=True, text=True)
-    if installed.returncode:
-        pytest.skip(f"npm ci cannot get the packages here: {installed.stderr.strip()[-300:]}")
+    (copy / "node_modules").symlink_to(_modules())
     return copy
 
 
-def axe_script(folder: Path) -> str:
+@cache
+def _modules() -> Path:
+    """The folder of the packages; those that npm has to get are got once, for all tests."""
+    if (WEB / "node_modules").is_dir():
+        return WEB / "node_modules"
+    npm, folder = npm_or_skip(), Path(tempfile.mkdtemp(prefix="cadalign-modules-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    for name in ("package.json", "package-lock.json"):
+        shutil.copy(WEB / name, folder)
+    command = [npm, "ci", "--no-audit", "--no-fund"]
+    installed = subprocess.run(command, cwd=folder, env=QUIET, capture_output=True, text=True)
+    if installed.returncode:
+        pytest.skip(f"npm ci cannot get the packages here: {installed.stderr.strip()[-300:]}")
+    return folder / "node_modules"
+
+
+def axe_script() -> str:
     """The source of axe-core, which finds what a page lacks for those who cannot see or click."""
-    place = Path("node_modules", "axe-core", "axe.min.js")
-    if not (WEB / place).is_file():
-        return (copy_with_modules(folder) / place).read_text(encoding="utf-8")
-    return (WEB / place).read_text(encoding="utf-8")
+    return (_modules() / "axe-core" / "axe.min.js").read_text(encoding="utf-8")

@@ -61,6 +61,7 @@ def _compiled(
         "boundscheck": False,
         "forceinline": forceinline,
         "_nrt": counts,
+        "no_cfunc_wrapper": True,
     }
     return cast(F, KernelDispatcher(function, options))
 
@@ -121,7 +122,7 @@ class KernelDispatcher(CPUDispatcher):
     def _part(self) -> Any:
         """Code that kernels call; where all compiled code is on disk, nothing asks for it."""
         compiler = FastPartCompiler if self.targetoptions["fastmath"] else PartCompiler
-        bare = {**self.targetoptions, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        bare = {**self.targetoptions, "no_cpython_wrapper": True}
         part: Any = CPUDispatcher(self.py_func, targetoptions=bare, pipeline_class=compiler)
         part._cache = KernelCache(self.py_func, "part")
         return part
@@ -206,6 +207,21 @@ def _is_notebook() -> bool:
     return "ipykernel" in sys.modules
 
 
+class KernelLibrary(JITCodeLibrary):
+    """Code of a kernel that Python calls.
+
+    LLVM's rewriting of the addresses in loops is left out: it takes more than a quarter of the time
+    of writing machine code, and kernels are as fast without.
+    """
+
+    def _finalize_final_module(self) -> None:
+        binding.set_option("cadalign", "-disable-lsr=true")
+        try:  # Numba's lock keeps other compilations out
+            super()._finalize_final_module()
+        finally:
+            binding.set_option("cadalign", "-disable-lsr=false")
+
+
 _KIND = "part"
 
 
@@ -258,7 +274,7 @@ class PartLibrary(JITCodeLibrary):
 class KernelCompiler(compiler.Compiler):
     """Compiler of a kernel that Python calls."""
 
-    library: type[JITCodeLibrary] = JITCodeLibrary
+    library: type[JITCodeLibrary] = KernelLibrary
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function; what it calls, Numba's own functions among it, becomes its parts."""

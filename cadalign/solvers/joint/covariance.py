@@ -51,34 +51,28 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
         evidence = evidence._replace(scales=evidence.scales._replace(bound=whole))
     reduction, row = reduced_row(evidence, state)
     basis = np.ascontiguousarray(reduction.basis[: len(evidence.shape.modes)])
-    return _covariance_of(evidence, reduction.evidence, basis, row, sighted_points(evidence))
-
-
-@kernel
-def _covariance_of(
-    evidence: Evidence,
-    reduced: Evidence,
-    basis: FloatArray,
-    row: FloatArray,
-    sighted: BoolArray,
-) -> JointCovariance:
-    """Covariances from those in ``reduced`` modes, whose ``basis`` (K, r) is that of all."""
-    system = Joint(reduced, False)
+    reduced, sighted = reduction.evidence, sighted_points(evidence)
     equations = joint_room(reduced, 6, 0)
-    evaluate_joint(system, row, equations)
-    arrow = equations.arrow
-    decide_on_undetermined(arrow, arrow.blocks.shape[0] > 1)
-    if not factorize_arrow(arrow):
-        return unbounded(evidence, arrow.blocks.shape[0])
-    inverse = invert_arrow(arrow)
+    evaluate_joint(Joint(reduced, False), row, equations)
+    is_determined, inverse = _inverse_of(equations.arrow)
+    if not is_determined:
+        return unbounded(evidence, len(inverse.blocks))
     return covariances_from(evidence, reduced, basis, row, equations, inverse, sighted)
 
 
 @kernel
+def _inverse_of(arrow: Arrow) -> tuple[bool, Arrow]:
+    """The inverse information about poses and border; False if it is not determined."""
+    decide_on_undetermined(arrow, arrow.blocks.shape[0] > 1)
+    if not factorize_arrow(arrow):
+        return False, arrow
+    return True, invert_arrow(arrow)
+
+
 def unbounded(evidence: Evidence, poses: int) -> JointCovariance:
     """Infinite covariances, of what is not determined."""
-    size, points = first_scale(evidence) + 3, evidence.shape.mean.shape[0]
-    size += evidence.shape.modes.shape[0]
+    size = len(evidence.focals.low) + 3 + len(evidence.shape.modes)
+    points = len(evidence.shape.mean)
     return JointCovariance(
         np.full((poses, 6, 6), np.inf),
         np.full((poses, 6, size), np.inf),
@@ -98,7 +92,10 @@ def covariances_from(
     inverse: Arrow,
     sighted: BoolArray,
 ) -> JointCovariance:
-    """Covariances from the ``inverse`` information about poses and border in reduced modes."""
+    """Covariances from the ``inverse`` information about poses and border in ``reduced`` modes.
+
+    The ``basis`` (K, r) of these is that of all.
+    """
     state, first = unpacked(reduced, row), first_scale(evidence)
     points = evidence.shape.mean.shape[0]
     for a in range(3):

@@ -96,7 +96,7 @@ def objective_of(evidence: Evidence, state: State) -> float:
 def score_state(evidence: Evidence, state: State) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
     reduction, row = reduced_row(evidence, state)
-    return float(joint_score(Joint(reduction.evidence, False), row, 0.0))
+    return float(joint_score(reduction.evidence, row))
 
 
 def keypoints_of(evidence: Evidence, view: int) -> KeypointEvidence:

@@ -126,8 +126,12 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
 
 @cost_at.of(Joint)
 @kernel
+def _cost_at(system: Joint, row: FloatArray) -> float:
+    return evaluate_joint(system, row, joint_room(system.evidence, 6, 0))
+
+
 def joint_cost(system: Joint, row: FloatArray) -> float:
-    """The cost at a state."""
+    """The cost at a state; not one kernel, since `evaluate_joint` takes long to compile."""
     return evaluate_joint(system, row, joint_room(system.evidence, 6, 0))
 
 
@@ -184,18 +188,31 @@ def _bounded(log_step: float) -> float:
 
 @score_of.of(Joint)
 @kernel
-def joint_score(system: Joint, row: FloatArray, cost: float) -> float:
-    """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
+def _score_of(system: Joint, row: FloatArray, cost: float) -> float:
     equations = joint_room(system.evidence, 6, 0)
     cost = evaluate_joint(Joint(system.evidence, False), row, equations)
+    return _score_from(system.evidence, row, cost, equations)
+
+
+def joint_score(evidence: Evidence, row: FloatArray) -> float:
+    """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
+    equations = joint_room(evidence, 6, 0)
+    cost = evaluate_joint(Joint(evidence, False), row, equations)
+    return _score_from(evidence, row, cost, equations)
+
+
+@kernel
+def _score_from(
+    evidence: Evidence, row: FloatArray, cost: float, equations: JointEquations
+) -> float:
     if not cost < np.inf:
         return np.inf
     decide_on_undetermined(equations.arrow, equations.arrow.blocks.shape[0] > 1)
-    _bound_volume(system.evidence, equations.arrow)
+    _bound_volume(evidence, equations.arrow)
     if not factorize_arrow(equations.arrow):
         return np.inf
     score = cost + log_determinant(equations.arrow) + equations.log_determinant[0]
-    return float(score + _score_of_distances(system.evidence, unpacked(system.evidence, row)))
+    return float(score + _score_of_distances(evidence, unpacked(evidence, row)))
 
 
 @kernel

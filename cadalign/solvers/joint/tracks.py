@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import FloatArray
 from cadalign.compile import kernel
 from cadalign.solvers.joint.arrow import (
     Arrow,
@@ -262,27 +262,46 @@ def moving_covariance(evidence: Evidence, motion: MotionPrior, path: Path) -> Pa
     reduction, row = reduced_row(evidence, path.state)
     row = np.concatenate([row, path.velocities.ravel()])
     basis = np.ascontiguousarray(reduction.basis[: len(evidence.shape.modes)])
-    system = Moving(reduction.evidence, False, motion._replace(told=0.0), NOTHING_KNOWN)
-    return _covariance_of(evidence, system, basis, row, sighted_points(evidence))
+    reduced, sighted = reduction.evidence, sighted_points(evidence)
+    system = Moving(reduced, False, motion._replace(told=0.0), NOTHING_KNOWN)
+    equations = joint_room(reduced, STATE, STATE)
+    joint = row[: -path.velocities.size]
+    cost = evaluate_joint(Joint(reduced, False), joint, equations)
+    found = _inverse_of(system, row, equations, cost)
+    if not found.is_determined:
+        frames = len(equations.arrow.blocks)
+        nothing, unknown = np.full((frames, STATE, STATE), np.inf), np.full(2, np.inf)
+        endless = unbounded(evidence, frames)
+        return PathCovariance(endless, nothing, nothing, unknown, unknown, unknown)
+    of_all = covariances_from(evidence, reduced, basis, joint, equations, found.of_poses, sighted)
+    return PathCovariance(of_all, *found[2:])
+
+
+class _Inverse(NamedTuple):
+    """The inverse information: that ``of_poses`` and border, and what `PathCovariance` holds."""
+
+    is_determined: bool
+    of_poses: Arrow
+    frames: FloatArray
+    links: FloatArray
+    squares: FloatArray
+    variances: FloatArray
+    costs: FloatArray
 
 
 @kernel
-def _covariance_of(
-    evidence: Evidence, system: Moving, basis: FloatArray, row: FloatArray, sighted: BoolArray
-) -> PathCovariance:
-    equations = joint_room(system.evidence, STATE, STATE)
+def _inverse_of(
+    system: Moving, row: FloatArray, equations: JointEquations, cost: float
+) -> _Inverse:
+    """The inverse information at a path, from the equations of its evidence and their cost."""
     arrow = equations.arrow
-    cost = _evaluate_evidence(system, row, equations)
     # Before the motion, whose information may be more than a trillion times that of the evidence.
     decide_on_undetermined(arrow, True)
     if cost < np.inf:
         cost += _add_motion(system, row, equations)
     if not factorize_arrow(arrow):
-        frames = arrow.blocks.shape[0]
-        nothing = np.full((frames, STATE, STATE), np.inf)
-        unknown = np.full(2, np.inf)
-        found = unbounded(evidence, frames)
-        return PathCovariance(found, nothing, nothing, unknown, unknown, unknown)
+        nothing = np.empty(0)
+        return _Inverse(False, arrow, arrow.blocks, arrow.blocks, nothing, nothing, nothing)
     inverse = invert_arrow(arrow)
     of_poses = Arrow(
         inverse.blocks[:, :6, :6].copy(),
@@ -290,10 +309,8 @@ def _covariance_of(
         inverse.border,
         inverse.gradient,
     )
-    joint = _joint_part(system, row)
-    found = covariances_from(evidence, system.evidence, basis, joint, equations, of_poses, sighted)
-    poses = unpacked(system.evidence, joint).poses
+    poses = unpacked(system.evidence, _joint_part(system, row)).poses
     squares, variances = moments(system.motion, poses, _velocities(system, row), inverse)
     links = inverse.coupling[:, :, :STATE].copy()
     costs = np.array([cost - squares.sum(), squares.sum()])
-    return PathCovariance(found, inverse.blocks, links, squares, variances, costs)
+    return _Inverse(True, of_poses, inverse.blocks, links, squares, variances, costs)

@@ -78,12 +78,7 @@ def probe_renderer(name: str, *, timed: bool = False) -> Probe:
     """
     if name not in RENDERERS:
         raise unknown("renderer", name, RENDERERS)
-    # What was timed was tried, too, and needs no further process.
-    _timed.update({name} if timed else ())
-    return _probe(name, name in _timed)
-
-
-_timed: set[str] = set()
+    return _probe(name, timed)
 
 
 @cache

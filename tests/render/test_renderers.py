@@ -373,13 +373,6 @@ def test_probes_are_remembered(monkeypatch):
     assert probe_renderer("raycast") is first
 
 
-def test_what_was_timed_is_not_tried_again(monkeypatch):
-    monkeypatch.setattr(probing, "_probe", lambda name, timed: timed)
-    monkeypatch.setattr(probing, "_timed", set())
-    asked = [probe_renderer("pyrender", timed=timed) for timed in (False, True, False)]
-    assert asked == [False, True, True]
-
-
 def test_remedies_name_the_packages(monkeypatch):
     monkeypatch.setattr("cadalign.render.probe._loads", lambda library: library not in missing)
     monkeypatch.setattr("cadalign.render.probe.find_spec", lambda name: object())

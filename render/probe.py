@@ -25,7 +25,7 @@ from cadalign.render.raycast.surface import Studio
 from cadalign.render.scene import Renderer, Scene
 
 RENDERERS: dict[str, str] = {
-    "pyrender": "cadalign.render.opengl.renderer:PyrenderRenderer",
+    "pyrender": "cadalign.render.opengl:PyrenderRenderer",
     "open3d": "cadalign.render.raycast.renderer:Open3DRenderer",
     "raycast": "cadalign.render.raycast.renderer:RaycastRenderer",
 }

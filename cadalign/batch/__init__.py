@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
+    from cadalign.batch.experiment import FitRunOptions
     from cadalign.batch.fits import fit_many, run_many, stream_fits
     from cadalign.batch.libraries import RetrieveRunOptions
-    from cadalign.batch.options import FitRunOptions
     from cadalign.io.observation import DetectorOptions
 
 __all__ = [

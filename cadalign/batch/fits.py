@@ -18,8 +18,7 @@ import numpy as np
 import pyarrow.compute as pc
 
 from cadalign.arrays import is_number
-from cadalign.batch.experiment import ManyEstimates, plan_run
-from cadalign.batch.options import FitRunOptions, ManyOptions
+from cadalign.batch.experiment import FitRunOptions, ManyEstimates, ManyOptions, plan_run
 from cadalign.batch.sources import ObservationTask
 from cadalign.batch.table import write_csv
 from cadalign.errors import CadalignError, DataError, InputError, require_kind

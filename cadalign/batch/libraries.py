@@ -37,9 +37,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from cadalign.arrays import worker_count
-from cadalign.batch.experiment import plan_run
+from cadalign.batch.experiment import Estimated, ManyOptions, plan_run
 from cadalign.batch.fits import pool_of
-from cadalign.batch.options import Estimated, ManyOptions
 from cadalign.batch.spec import SPEC as FIT_SPEC
 from cadalign.batch.spec import summarize_by
 from cadalign.datasets import AnnotatedModel, KeypointNet

@@ -11,8 +11,7 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
-from cadalign.batch.experiment import plan_run
-from cadalign.batch.options import FitRunOptions
+from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.pictures import NAMING, page_names
 from cadalign.batch.table import COLUMNS as TABLE_COLUMNS
 from cadalign.batch.table import RECORD_COLUMNS, without_lists

@@ -171,7 +171,7 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
 
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""
-        from cadalign.batch.options import FitRunOptions
+        from cadalign.batch.experiment import FitRunOptions
         from cadalign.cli.runs import inputs_of, run_command, run_folder, write_overlays
 
         style = None

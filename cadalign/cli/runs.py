@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from pathlib import Path
 
-    from cadalign.batch.options import ManyOptions
+    from cadalign.batch.experiment import ManyOptions
     from cadalign.cli.options import ManyCommand
     from cadalign.evaluation.registry import Spec
     from cadalign.evaluation.runs.folder import RunFolder

@@ -10,10 +10,10 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError, unknown
+from cadalign.evaluation.methods.method import names_of
 from cadalign.evaluation.methods.registry import register_method
 from cadalign.evaluation.metrics.registry import refuse_taken, register_metric
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, tuples
-from cadalign.evaluation.portable import names_of
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.parallel import Workers

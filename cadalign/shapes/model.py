@@ -17,6 +17,7 @@ from cadalign.shapes.basis import component_of_basis, component_of_covariance, s
 from cadalign.shapes.examples import LEAST_MODELS, Dataset, Example, examples_of
 from cadalign.shapes.gaussians import Gaussians
 from cadalign.shapes.learning import learn_parts
+from cadalign.shapes.outputs import read_shape, write_shape
 from cadalign.shapes.parts import (
     BOX_ROWS,
     BoxMargins,
@@ -33,7 +34,6 @@ from cadalign.shapes.parts import (
     checked_box,
     given_ids,
 )
-from cadalign.shapes.shape_file import read_shape, write_shape
 
 OnProgress = Callable[[int, int], object]
 """Called with the number of steps that are done and that of all."""
@@ -361,7 +361,7 @@ class ShapeModel:
         return f"ShapeModel({self.category!r}, {text}{models})"
 
     def _repr_html_(self) -> str:
-        from cadalign.shapes.plots import shape_html
+        from cadalign.shapes.outputs import shape_html
 
         return shape_html(self)
 

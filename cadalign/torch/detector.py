@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, instance_rng
 from cadalign.datasets.sample.model import SampleModel
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
@@ -24,7 +24,6 @@ from cadalign.geometry.camera import Camera
 from cadalign.render.raycast.renderer import RaycastRenderer
 from cadalign.render.scene import Scene
 from cadalign.render.viewpoints import frame_object, look_at, visible_keypoints
-from cadalign.seeding import instance_rng
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel
 from cadalign.torch.poses import torch

@@ -14,11 +14,9 @@ import numpy as np
 
 from cadalign.arrays import is_whole
 from cadalign.datasets.models.shapenet import SYNSETS
-from cadalign.datasets.sample.bottles import bottle
-from cadalign.datasets.sample.cars import car
-from cadalign.datasets.sample.chairs import chair
+from cadalign.datasets.sample.household import bottle, chair
 from cadalign.datasets.sample.model import SampleModel, finish
-from cadalign.datasets.sample.vessels import vessel
+from cadalign.datasets.sample.vehicles import car, vessel
 from cadalign.errors import DataError, InputError, unknown
 from cadalign.io.files import as_path, dense_json, writing_folder
 from cadalign.io.meshes.files import write_ply_mesh

@@ -13,14 +13,13 @@ import cadalign
 from benchmarks import section
 from benchmarks.cars import car_scenes
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.simulation import UNIT_BOUNDS, Problem, simulate_standing_boxes
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error
 from cadalign.render import look_at
-from cadalign.seeding import instance_rng
 
 _CAMERA = cadalign.Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
 _UNKNOWN = cadalign.Camera.without_focal(_CAMERA.width, _CAMERA.height)

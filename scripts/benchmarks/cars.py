@@ -16,7 +16,7 @@ import numpy as np
 import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import ImageKeypoints
 from cadalign.datasets import open as open_data
 from cadalign.datasets.photos.kitti import KittiLabel, read_labels
@@ -31,7 +31,6 @@ from cadalign.datasets.photos.kitti_keypoints import (
 from cadalign.evaluation.experiments.tracks import TracksOptions
 from cadalign.evaluation.instances.tracks import pose_of, recorded_videos
 from cadalign.metrics import rotation_error
-from cadalign.seeding import instance_rng
 
 _LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6
 _WIDTHS = 0.06  # relative standard deviation of cars' widths

@@ -11,7 +11,7 @@ import numpy as np
 import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
@@ -20,7 +20,6 @@ from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import box_iou, rotation_error
 from cadalign.render import look_at
-from cadalign.seeding import instance_rng
 from cadalign.solvers.projection import projection_jacobian
 
 _SECOND_VIEW = rotation_from_vector(np.array([0.0, np.radians(25.0), 0.0]))

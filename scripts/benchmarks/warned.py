@@ -13,13 +13,12 @@ import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables, percent
 from cadalign import Alignment, Model, Result, ShapeModel, View
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.metrics import rotation_error
-from cadalign.seeding import instance_rng
 
 _PAIRS = 200  # of training models, which tell how models of a category differ
 _LEAST_KEYPOINTS = 4

@@ -19,9 +19,8 @@ from support.forked import Program
 
 import cadalign
 from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
-from cadalign.batch.experiment import plan_run
+from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.fits import options_of, run_many
-from cadalign.batch.options import FitRunOptions
 from cadalign.batch.table import COLUMNS
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.observation_fit import ObservationFit

@@ -20,7 +20,7 @@ from support.forked import MAIN, Program
 
 import cadalign
 from cadalign import Camera, Observation
-from cadalign.batch.options import FitRunOptions
+from cadalign.batch.experiment import FitRunOptions
 from cadalign.cli import main
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.runs.folder import RunFolder

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.sample import SampleModel, sample_models, write_sample_dataset
-from cadalign.datasets.sample.parts import box, lathe
+from cadalign.datasets.sample.model import box, lathe
 from cadalign.datasets.sample.writer import MAKERS
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.mesh import join

@@ -17,9 +17,9 @@ from directives import further_names, named, rooms, shown_by_itself
 
 SOURCE = Path(cadalign.__file__).parent
 PUBLIC = sorted(
-    f"cadalign.{init.parent.name}"
-    for init in SOURCE.glob("*/__init__.py")
-    if "__all__" in init.read_text(encoding="utf-8")
+    f"cadalign.{(path.parent if path.stem == '__init__' else path).stem}"
+    for path in [*SOURCE.glob("*/__init__.py"), *SOURCE.glob("[!_]*.py")]
+    if "\n__all__" in path.read_text(encoding="utf-8")
 )
 INTERNAL = {"cadalign.compile"}
 

@@ -20,7 +20,7 @@ from cadalign.errors import DataError, InputError
 from cadalign.evaluation import metrics as room
 from cadalign.evaluation import register_metric
 from cadalign.evaluation.metrics import registry
-from cadalign.evaluation.metrics.sets import score_columns
+from cadalign.evaluation.metrics.photos import score_columns
 from cadalign.evaluation.metrics.table import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.photos.protocols import SETS
 from cadalign.evaluation.plots import cumulative

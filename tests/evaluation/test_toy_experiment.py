@@ -15,6 +15,7 @@ import pytest
 import tyro
 
 import cadalign
+from cadalign.arrays import instance_rng
 from cadalign.cli import main
 from cadalign.errors import DataError
 from cadalign.evaluation import registry
@@ -29,7 +30,6 @@ from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.runs.work import Columns, Outcome, Plan, Rows
 from cadalign.evaluation.summary import medians
 from cadalign.report import headline_text, write_report
-from cadalign.seeding import instance_rng
 
 # --- the experiment: estimate the middle of noisy numbers -------------------------------------
 

@@ -23,7 +23,7 @@ from cadalign.evaluation.experiments import photos
 from cadalign.evaluation.experiments.photos import PhotosOptions
 from cadalign.evaluation.methods.method import MethodInput
 from cadalign.evaluation.metrics import photos as metrics
-from cadalign.evaluation.metrics.sets import medians_of, score_alignment, score_columns
+from cadalign.evaluation.metrics.photos import medians_of, score_alignment, score_columns
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.photos.methods import Sighting
 from cadalign.evaluation.photos.objects import PhotoObjects

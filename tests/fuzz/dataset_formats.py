@@ -25,7 +25,7 @@ from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import read_json
 from cadalign.io.images import read_grey, read_photo
-from cadalign.shapes.shape_file import SEAL
+from cadalign.shapes.outputs import SEAL
 
 _CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 _POINTS = np.random.default_rng(3).uniform(-0.4, 0.4, (8, 3))

@@ -26,8 +26,8 @@ from cadalign.io.files import Seal
 from cadalign.shapes.basis import find_reflection
 from cadalign.shapes.examples import Example
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.outputs import SEAL
 from cadalign.shapes.parts import FewKeypoints, Reflection, ShapeComponent
-from cadalign.shapes.shape_file import SEAL
 
 TABLE = np.array(
     [[-1, 0, -2], [1, 0, -2], [-1, 0, 2], [1, 0, 2], [-1, 1, -2], [1, 1, -2], [0, 1.5, 0]],

@@ -20,9 +20,18 @@ from cadalign.evaluation.methods.registry import is_registered
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.bop import BOP
 from cadalign.evaluation.metrics.photos import DEPTH as DEPTH_ERROR
-from cadalign.evaluation.metrics.photos import IOU_3D, KITTI, NINE_DOF, ROTATION, VIEWPOINT
+from cadalign.evaluation.metrics.photos import (
+    IOU_3D,
+    KITTI,
+    NINE_DOF,
+    ROTATION,
+    VIEWPOINT,
+    measured_columns,
+    medians_of,
+    score_columns,
+    shares_of,
+)
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.metrics.sets import measured_columns, medians_of, score_columns, shares_of
 from cadalign.evaluation.metrics.table import BOX_IOU, Metric
 from cadalign.evaluation.options import FunctionOptions, PhotoOptions
 from cadalign.evaluation.photos import protocols

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import tyro
 
+from cadalign.arrays import instance_rng
 from cadalign.errors import DataError, InputError, refuse_unused, unknown
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
 from cadalign.evaluation.methods.method import Method, MethodInput
@@ -29,7 +30,6 @@ from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.evaluation.summary import ConsoleTable, Quartiles, Summary, group_name
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import convert, in_file
-from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
     from cadalign.estimation.result import Result

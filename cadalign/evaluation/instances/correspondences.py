@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray
+from cadalign.arrays import FloatArray, instance_rng
 from cadalign.datasets import Correspondences, CorrespondenceSet
 from cadalign.errors import DataError
 from cadalign.estimation.options import RansacOptions
@@ -27,7 +27,6 @@ from cadalign.evaluation.runs.work import Row, fingerprint
 from cadalign.evaluation.simulation import Problem, simulate_problem
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.seeding import instance_rng
 
 
 @dataclass(frozen=True, eq=False)

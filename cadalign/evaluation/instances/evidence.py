@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel
 from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.align import align
@@ -56,7 +56,6 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.evidence import Size
 from cadalign.io.images import ByteImage
 from cadalign.render import RaycastRenderer, Scene, cast_geometry, visible_keypoints
-from cadalign.seeding import instance_rng
 from cadalign.solvers.constants import LINEAR
 from cadalign.solvers.joint.covariance import joint_covariance
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets import AnnotatedModel, KeypointNet, check_solid
 from cadalign.datasets.models.keypoints import symmetry_group
 from cadalign.errors import CadalignError, TooFewVisibleError
@@ -25,7 +25,6 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import perspective
 from cadalign.geometry.symmetry_group import SymmetryGroup
-from cadalign.seeding import instance_rng
 
 if TYPE_CHECKING:
     # Workers that look at annotations only are not to carry the renderer's libraries.

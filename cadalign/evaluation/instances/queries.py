@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, IntArray
+from cadalign.arrays import FloatArray, IntArray, instance_rng
 from cadalign.datasets.models.shapenet import require_category
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
@@ -40,7 +40,6 @@ from cadalign.retrieval.absence import SAME_SHAPE, distances, shape_distance
 from cadalign.retrieval.library import Library
 from cadalign.retrieval.match import Match
 from cadalign.retrieval.models import LibraryModel, ModelKey
-from cadalign.seeding import instance_rng
 
 TOP = 50
 """Ranks beyond this are one."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.datasets.photos.kitti_keypoints import (
     HIDDEN,
@@ -50,7 +50,6 @@ from cadalign.evaluation.simulated_tracks import (
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.rotations import angles_between, vector_from_rotation
 from cadalign.io.files import read_bytes
-from cadalign.seeding import instance_rng
 from cadalign.shapes.model import ShapeModel
 
 _RATE, _KITTI_RATE = 30.0, 10.0  # frames in a second

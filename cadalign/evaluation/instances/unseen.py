@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray, IntArray, instance_rng
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, DegenerateError
 from cadalign.estimation.align import align
@@ -43,7 +43,6 @@ from cadalign.geometry.metrics import (
     translation_error_up_to_scale,
 )
 from cadalign.geometry.rotations import vector_from_rotation
-from cadalign.seeding import instance_rng
 from cadalign.shapes.model import ShapeModel
 
 _LEAST_SIGMA = 0.5  # of retrieval [px]: keypoints without noise would leave no model any chance

@@ -29,10 +29,12 @@ from cadalign.evaluation.methods.method import (
     POINTS,
     VIEWS,
     Method,
+    Portable,
     RegisteredFunction,
+    code_hash,
     fit_methods,
+    module_of,
 )
-from cadalign.evaluation.portable import Portable, code_hash, module_of
 
 ENTRY_POINTS = "cadalign.methods"
 """Group of entry points whose functions are methods by the entry points' names."""

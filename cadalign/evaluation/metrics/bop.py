@@ -16,7 +16,7 @@ from cadalign.arrays import BoolArray, FloatArray, as_floats, as_points
 from cadalign.datasets.photos.bop import MILLIMETRES
 from cadalign.errors import InputError
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.sets import MetricSet
+from cadalign.evaluation.metrics.photos import MetricSet
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment

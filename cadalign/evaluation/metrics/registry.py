@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.arrays import is_number, is_real
 from cadalign.errors import InputError, quote, unknown
-from cadalign.evaluation.methods.method import MethodInput
+from cadalign.evaluation.methods.method import MethodInput, Portable, code_hash
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.portable import Portable, code_hash
 from cadalign.evaluation.runs.work import Columns
 from cadalign.geometry.alignment import Alignment
 

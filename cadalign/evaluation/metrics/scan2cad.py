@@ -15,7 +15,7 @@ import numpy as np
 
 from cadalign.arrays import FloatArray
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.sets import MetricSet
+from cadalign.evaluation.metrics.photos import MetricSet
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment

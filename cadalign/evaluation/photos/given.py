@@ -20,7 +20,7 @@ from cadalign.evaluation.experiments.photos import COLUMNS, summarize_cells
 from cadalign.evaluation.instances.record import RECORD_COLUMNS
 from cadalign.evaluation.methods.method import Method
 from cadalign.evaluation.metrics.bop import mssd
-from cadalign.evaluation.metrics.sets import score_alignment
+from cadalign.evaluation.metrics.photos import score_alignment
 from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
 from cadalign.evaluation.photos.objects import draw_sighting, sighting_record
 from cadalign.evaluation.photos.protocols import protocol_of

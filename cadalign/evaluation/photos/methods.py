@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
-from cadalign.arrays import BoolArray, FloatArray
+from cadalign.arrays import BoolArray, FloatArray, instance_rng
 from cadalign.datasets.photos.photo import NamedPoints, PhotoObject
 from cadalign.estimation.align import align
 from cadalign.estimation.fit import fit
@@ -28,7 +28,6 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.render.viewpoints import visible_keypoints
-from cadalign.seeding import instance_rng
 from cadalign.shapes.model import ShapeModel
 
 ANNOTATED, DETECTED = "annotated", "detected"

@@ -39,7 +39,7 @@ from cadalign.evaluation.instances.record import (
     record_stem,
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.metrics.sets import score_alignment
+from cadalign.evaluation.metrics.photos import score_alignment
 from cadalign.evaluation.photos.methods import (
     PhotoEstimate,
     Sighting,

@@ -19,9 +19,8 @@ from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
 from cadalign.evaluation.methods.method import SHAPE
 from cadalign.evaluation.metrics.bop import BOP
-from cadalign.evaluation.metrics.photos import KITTI, NINE_DOF, VIEWPOINT
+from cadalign.evaluation.metrics.photos import KITTI, NINE_DOF, VIEWPOINT, MetricSet
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.metrics.sets import MetricSet
 from cadalign.evaluation.options import ExperimentOptions
 
 SIMULATED = "simulated"

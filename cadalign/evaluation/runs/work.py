@@ -3,7 +3,7 @@
 An experiment is a small picklable object; a task is all that it needs to know of one instance, also
 picklable. Chunks are handled on any machine and in any order, and an experiment must not let its
 rows depend on that: all randomness comes from the run's seed and the task's name
-(`cadalign.seeding.instance_rng`).
+(`cadalign.arrays.instance_rng`).
 """
 
 from __future__ import annotations

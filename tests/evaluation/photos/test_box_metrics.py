@@ -11,11 +11,12 @@ from cadalign.datasets.photos.kitti_keypoints import car_box
 from cadalign.evaluation.metrics.photos import (
     NINE_DOF,
     VIEWPOINT,
+    MetricSet,
     degree_cm,
     kitti_errors,
     nine_dof_iou,
+    shares_of,
 )
-from cadalign.evaluation.metrics.sets import MetricSet, shares_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.symmetry import Symmetry

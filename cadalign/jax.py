@@ -1,4 +1,9 @@
-"""`fit` for arrays of JAX: a callback to the compiled kernels, with derivatives of its own."""
+"""Alignment in JAX programs: fits with gradients.
+
+Needs the extra ``jax``: ``pip install "cadalign[jax]"``. Fits run in the compiled kernels, on the
+processor, called back from JAX; gradients are those of the optimum, by the implicit function
+theorem.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +23,8 @@ from cadalign.torch.poses import cameras_of
 if TYPE_CHECKING:
     from jax import Array
     from jax.typing import ArrayLike
+
+__all__ = ["FitArrays", "fit"]
 
 
 class FitArrays(NamedTuple):

@@ -47,7 +47,7 @@ class PyrenderRenderer:
         self._context = shared_context()
         self._context.check_process()
         # It imports pyrender, which reads the environment that the context has set.
-        from cadalign.render.opengl.stage import GlStage
+        from cadalign.render.opengl_stage import GlStage
 
         self._stage = GlStage(self.studio)
         self._fallback = RaycastRenderer(studio=self.studio)

@@ -1,1 +1,0 @@
-"""Draw colour with OpenGL through pyrender."""

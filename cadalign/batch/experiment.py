@@ -12,8 +12,8 @@ from typing import Any, ClassVar, NamedTuple
 import msgspec
 import numpy as np
 
+from cadalign.batch.outputs import COLUMNS, RECORD_COLUMNS, TIMING_COLUMNS, naming_row, result_row
 from cadalign.batch.sources import ObservationTask, read_sources
-from cadalign.batch.table import COLUMNS, RECORD_COLUMNS, TIMING_COLUMNS, naming_row, result_row
 from cadalign.datasets.detections.image_keypoints import (
     ImageKeypoints,
     join_keypoints,
@@ -247,7 +247,7 @@ class ManyEstimates:
         """Write the pictures of an observation, if it is one of those; says what is not drawn."""
         if self.folder is None or task.row >= self.options.pictures:
             return ()
-        from cadalign.batch.pictures import draw_fit
+        from cadalign.batch.outputs import draw_fit
 
         return draw_fit(self.folder, row, seen, result)
 

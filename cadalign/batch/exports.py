@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.batch.exported import exported_object
-from cadalign.batch.table import RECORD_COLUMNS
+from cadalign.batch.outputs import RECORD_COLUMNS
 from cadalign.datasets.detections.coco import write_coco_keypoints
 from cadalign.datasets.formats import write_photos
 from cadalign.datasets.photos import bop_files

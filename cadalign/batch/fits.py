@@ -19,8 +19,8 @@ import pyarrow.compute as pc
 
 from cadalign.arrays import is_number
 from cadalign.batch.experiment import FitRunOptions, ManyEstimates, ManyOptions, plan_run
+from cadalign.batch.outputs import write_csv
 from cadalign.batch.sources import ObservationTask
-from cadalign.batch.table import write_csv
 from cadalign.errors import CadalignError, DataError, InputError, require_kind
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.observation_fit import ObservationFit
@@ -72,9 +72,9 @@ def fit_many(
         JSON or CSV); or observations, for example of a generator, which are first written to
         ``observations.jsonl`` in the run's folder.
     out : path-like, optional
-        The run's folder: ``results.parquet`` and ``results.csv`` (`cadalign.batch.table` names the
-        columns), and what `Results.open` needs. Started again with the same arguments, a run that
-        was killed goes on, and a finished one is read. Without it nothing is kept.
+        The run's folder: ``results.parquet`` and ``results.csv`` (`cadalign.batch.outputs` names
+        the columns), and what `Results.open` needs. Started again with the same arguments, a run
+        that was killed goes on, and a finished one is read. Without it nothing is kept.
     workers : int, optional
         Processes; -1 for one for each core, 0 for none. By default -1, for few observations 0.
     dask : str, optional

@@ -12,9 +12,8 @@ import numpy as np
 import pyarrow as pa
 
 from cadalign.batch.experiment import FitRunOptions, plan_run
-from cadalign.batch.pictures import NAMING, page_names
-from cadalign.batch.table import COLUMNS as TABLE_COLUMNS
-from cadalign.batch.table import RECORD_COLUMNS, without_lists
+from cadalign.batch.outputs import COLUMNS as TABLE_COLUMNS
+from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, without_lists
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.plots import Plot, cumulative_curves

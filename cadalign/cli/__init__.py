@@ -123,7 +123,7 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
         "evaluate.Simulate",
         "Repeat the AEPnP paper's simulation: tables, a page, and figures as PNG and PDF.",
     ),
-    "report": ("report.ReportCommand", "Show the result of one or more runs."),
+    "report": ("evaluate.ReportCommand", "Show the result of one or more runs."),
     "export": ("export.Export", "Write a fit for another tool."),
     "render": (
         "render.Render",

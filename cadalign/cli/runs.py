@@ -144,7 +144,7 @@ def run_command(command: ManyCommand, options: ManyOptions, *, done: str) -> int
     ``done`` is what was done to those that have not. The reasons of failures are said.
     """
     from cadalign.batch.fits import run_many
-    from cadalign.batch.table import read_rows
+    from cadalign.batch.outputs import read_rows
 
     folder = run_folder(command, options)
     with run_progress(options.experiment) as on_progress:

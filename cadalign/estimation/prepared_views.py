@@ -29,12 +29,12 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box, are_on_a_line
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.io.evidence import Size
+from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.joint.search import refine_joint
 
 Align = Callable[[Sequence[View], Sequence[Alignment | None]], Result]
 """Alignment of some views, with a start or None for each."""
 
-_LEAST_POINTS = 3
 _ON_A_LINE = 1e-3  # second over first extent of keypoints that determine no rotation about it
 _ITERATIONS = 50
 _MOST_STARTS = 8
@@ -157,7 +157,7 @@ def _renumbered(text: str, used: Sequence[int]) -> str:
 
 def lie_on_a_line(points: FloatArray) -> bool:
     """True for points (n, 3) that determine no rotation: fewer than three, or on one line."""
-    return len(points) < _LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
+    return len(points) < LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
 
 
 def _camera_of(view: View, estimated: Mapping[Camera, Camera]) -> Camera:

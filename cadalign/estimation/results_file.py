@@ -1,6 +1,6 @@
 """Results of a run over many observations, read from the run's folder.
 
-The tables are those of `cadalign.batch.table`.
+The tables are those of `cadalign.batch.outputs`.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class StoredResults:
 def read_arrays(folder: Path) -> dict[str, Any]:
     """The arguments of `Results` for a run's folder, without ``single``.
 
-    The table is that of `cadalign.batch.table`.
+    The table is that of `cadalign.batch.outputs`.
     """
     import pyarrow.parquet as pq
     from scipy.spatial.transform import Rotation

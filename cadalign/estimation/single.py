@@ -32,13 +32,12 @@ from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
-from cadalign.solvers.constants import LINEAR
+from cadalign.solvers.constants import LEAST_POINTS, LINEAR
 from cadalign.solvers.marginal.equations import POSE, force_of
 from cadalign.solvers.marginal.posterior import posteriors_of
 from cadalign.solvers.marginal.problem import Mixture
 from cadalign.solvers.marginal.search import search_view
 
-_LEAST_POINTS = 3
 _SUSPICIOUS = 2.0  # reduced chi-square at which a mistake in the keypoints is looked for
 _DECISIVE = 10.0  # of -2 log likelihood, times the variance of shapes that were held out
 
@@ -52,7 +51,7 @@ def is_single(model: object, views: Sequence[View]) -> bool:
     """True where nothing but the keypoints of one view and a learned shape is given."""
     if not isinstance(model, ShapeModel) or not _has_keypoints_alone(views):
         return False
-    return views[0].sigma is not None and len(views[0].keypoint_ids) >= _LEAST_POINTS
+    return views[0].sigma is not None and len(views[0].keypoint_ids) >= LEAST_POINTS
 
 
 def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignment | None]) -> bool:
@@ -71,7 +70,7 @@ def begins_at_outline(
     """
     if len(views) > 1 or inits[0] is None or is_exact_model(model):
         return False
-    few = 0 < len(views[0].keypoint_ids) < _LEAST_POINTS
+    few = 0 < len(views[0].keypoint_ids) < LEAST_POINTS
     return few and (views[0].mask is not None or views[0].image is not None)
 
 

@@ -22,6 +22,7 @@ from cadalign.estimation.pack import told_by
 from cadalign.estimation.prior import has_scale_prior
 from cadalign.estimation.uncertainty.evidence import count_equations
 from cadalign.geometry.rotations import spread_rotations
+from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.joint.evidence import Evidence, distances_of
 from cadalign.solvers.joint.search import MOST_PER_VIEW, view_starts
 from cadalign.solvers.marginal.problem import GaussianTarget
@@ -30,7 +31,6 @@ from cadalign.solvers.marginal.search import after_motion, half_turns
 _MOST_STARTS = 24
 _MOST_CARRIED = 3  # stretches of the other view
 _MOST_SIZED = 3
-_LEAST_POINTS = 3
 
 _GRID = 400  # rotations
 _SCREENED = 64
@@ -216,7 +216,7 @@ def _half_turned(evidence: Evidence, view: int, poses: FloatArray) -> list[Float
     """Turn poses (12,) of the mean by half a turn, about each axis that its shape allows."""
     sightings, shape = evidence.sightings, evidence.shape
     names = np.unique(sightings.point[(sightings.image == view) & (sightings.whitening[:, 2] > 0)])
-    if len(names) < _LEAST_POINTS or evidence.scales.free.any():
+    if len(names) < LEAST_POINTS or evidence.scales.free.any():
         return []
     modes = shape.modes[:, names].reshape(len(shape.modes), 3 * len(names))
     covariance = modes.T @ modes + np.diag(np.repeat(shape.spread[names] ** 2, 3))

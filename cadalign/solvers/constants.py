@@ -20,6 +20,8 @@ AEPNP: Final = 1
 """Minimal solvers of RANSAC."""
 SAMPLE_SIZES: Final = (4, 6)
 """Points per sample, by minimal solver."""
+LEAST_POINTS: Final = 3
+"""Keypoints that leave a pose a few alternatives; fewer leave it open."""
 
 
 class ScalePrior(NamedTuple):

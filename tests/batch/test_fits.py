@@ -21,7 +21,7 @@ import cadalign
 from cadalign import Alignment, CadalignError, Camera, FocalPrior, Observation, Result, Results
 from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.fits import options_of, run_many
-from cadalign.batch.table import COLUMNS
+from cadalign.batch.outputs import COLUMNS
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.evaluation.runs.folder import RunFolder
@@ -86,9 +86,9 @@ def test_the_table_has_the_documented_columns(tmp_path: Path) -> None:
     cadalign.fit_many(lines(tmp_path / "o.jsonl", 3), out=tmp_path / "run")
     table = pq.read_table(tmp_path / "run" / "results.parquet")
     assert table.column_names == [name for name, _ in COLUMNS]
-    assert cadalign.batch.table.__doc__ is not None
+    assert cadalign.batch.outputs.__doc__ is not None
     for name in table.column_names:
-        assert name in cadalign.batch.table.__doc__, name
+        assert name in cadalign.batch.outputs.__doc__, name
     row = table.to_pylist()[1]
     found = Results.open(tmp_path / "run")[1]
     assert isinstance(found, Result)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cadalign.batch.table import shape_coefficients
+from cadalign.batch.outputs import shape_coefficients
 
 
 @pytest.mark.parametrize("residual_sigma", [0.0, 0.02, 0.5])

@@ -8,7 +8,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.compile import fast_sums
-from cadalign.solvers.constants import LINEAR, UNKNOWNS, ScalePrior
+from cadalign.solvers.constants import LEAST_POINTS, LINEAR, UNKNOWNS, ScalePrior
 from cadalign.solvers.evidence import KeypointEvidence
 from cadalign.solvers.joint.evidence import Evidence, Shape, State, packed, unpacked
 from cadalign.solvers.joint.system import Joint, joint_cost, joint_score
@@ -22,7 +22,6 @@ _FEW_ITERATIONS = 3  # of a start, before the shape is integrated out
 _LESS_LIKELY = 20.0  # excess score of a start that is refined no further
 _UNLIKELY = 40.0  # excess cost, after the probe, at which a start is given up
 MOST_PER_VIEW = 8
-_LEAST_POINTS = 3
 _UNLIKELY_POSE = 60.0  # excess cost of a pose of the mean shape that is still a start
 
 
@@ -116,7 +115,7 @@ def keypoints_of(evidence: Evidence, view: int) -> KeypointEvidence:
 def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
     """Camera poses (S, 12) and log scales (S, 3) from one view's keypoints, the likeliest first."""
     given, scales = keypoints_of(evidence, view), evidence.scales
-    if len(given.points) < _LEAST_POINTS:
+    if len(given.points) < LEAST_POINTS:
         return np.empty((0, 12)), np.empty((0, 3))
     # The solvers' first axis is one whose scale is known; the order of the others is cyclic, since
     # it must not be a reflection.
@@ -133,7 +132,7 @@ def view_starts(evidence: Evidence, view: int) -> tuple[FloatArray, FloatArray]:
         np.array([prior.weight]),
         float(prior.width),
         np.append(np.ones(UNKNOWNS - 2), scales.free[order[1:]]),
-        _LEAST_POINTS,
+        LEAST_POINTS,
     )
     own = costs[0, : min(info[0, 0], MOST_PER_VIEW)]
     poses = found[0, : int((own < costs[0, 0] + _UNLIKELY_POSE).sum())]

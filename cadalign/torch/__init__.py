@@ -10,8 +10,7 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.torch.fits import align, fit
-    from cadalign.torch.losses import box_loss, reprojection_loss, rotation_loss
-    from cadalign.torch.poses import PoseBatch
+    from cadalign.torch.poses import PoseBatch, box_loss, reprojection_loss, rotation_loss
     from cadalign.torch.posterior import posterior_loss
 
 __all__ = [

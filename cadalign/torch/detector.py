@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, instance_rng
+from cadalign.arrays import BoolArray, FloatArray, instance_rng, is_whole
 from cadalign.datasets.sample.model import SampleModel
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
@@ -62,8 +62,13 @@ class KeypointDetector:
 
     @classmethod
     def untrained(cls, keypoints: int, *, width: int = 24, seed: int = 0) -> KeypointDetector:
-        """An untrained network of so many keypoints; ``width`` channels in its first layer."""
-        torch.manual_seed(seed)
+        """An untrained network of so many keypoints; ``width`` channels in its first layer.
+
+        Raises InputError if a number is below 1 or ``width`` not a multiple of 8.
+        """
+        _require_counts(keypoints=keypoints, width=width)
+        if width % _GROUPS:
+            raise InputError(f"{width} is not a multiple of {_GROUPS}", where="width")
         nn = torch.nn
 
         def block(inputs: int, outputs: int, stride: int) -> Any:
@@ -72,16 +77,18 @@ class KeypointDetector:
 
         def residual(*layers: Any, inputs: int, outputs: int) -> Any:
             """Layers at half the resolution beside a skip, joined by a convolution."""
-            inner = nn.Sequential(*layers, nn.Upsample(scale_factor=2, mode="bilinear"))
-            inner.register_forward_hook(lambda _, given, made: torch.cat([given[0], made], dim=1))
+            inner = nn.Sequential(*layers)
+            inner.register_forward_hook(_beside)
             return nn.Sequential(inner, block(inputs, outputs, 1))
 
         w = width
-        lowest = block(4 * w, 4 * w, 2), block(4 * w, 4 * w, 1)
-        deepest = residual(*lowest, inputs=8 * w, outputs=4 * w)
-        middle = residual(block(2 * w, 4 * w, 2), deepest, inputs=6 * w, outputs=4 * w)
-        head = nn.Conv2d(4 * w, keypoints, 1)
-        return cls(nn.Sequential(block(3, w, 2), block(w, 2 * w, 2), middle, head))
+        with torch.random.fork_rng(devices=()):  # the program's own random numbers go on
+            torch.manual_seed(seed)
+            lowest = block(4 * w, 4 * w, 2), block(4 * w, 4 * w, 1)
+            deepest = residual(*lowest, inputs=8 * w, outputs=4 * w)
+            middle = residual(block(2 * w, 4 * w, 2), deepest, inputs=6 * w, outputs=4 * w)
+            head = nn.Conv2d(4 * w, keypoints, 1)
+            return cls(nn.Sequential(block(3, w, 2), block(w, 2 * w, 2), middle, head))
 
     def __call__(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (B, k, 2) and sigmas (B, k) [px] of images (B, h, w, 3), 0 to 255."""
@@ -121,6 +128,13 @@ class KeypointDetector:
     def copy(self) -> KeypointDetector:
         """A copy that is trained apart."""
         return KeypointDetector(deepcopy(self.network), self.calibration)
+
+
+def _beside(_: Any, given: tuple[Tensor], made: Tensor) -> Tensor:
+    """What layers were given, and beside it what they made of it, at its resolution."""
+    size = given[0].shape[2:]
+    large = torch.nn.functional.interpolate(made, size=size, mode="bilinear")
+    return torch.cat([given[0], large], dim=1)
 
 
 def heatmap_loss(logits: Tensor, points_2d: Tensor) -> Tensor:
@@ -167,7 +181,13 @@ def train(
     -------
     list of float
         The whole loss of every step.
+
+    Raises
+    ------
+    InputError
+        If a number of steps or views is below 1.
     """
+    _require_counts(steps=steps, batch=batch)
     detector.network.train()
     optimizer = torch.optim.AdamW(detector.network.parameters(), lr=rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
@@ -271,8 +291,11 @@ def render_views(
     Raises
     ------
     InputError
-        If a model lacks a keypoint.
+        If there is no model, a model lacks a keypoint, or a number is below 1.
     """
+    _require_counts(count=count, size=size)
+    if not models:
+        raise InputError("there is none", where="models", fix="give at least one")
     camera = Camera.from_fov(size, size, fov_x=40.0)
     renderer = RaycastRenderer()
     scenes = [Scene(each.mesh) for each in models]
@@ -299,6 +322,12 @@ def render_views(
         )
     columns: list[Any] = [np.array(each) for each in zip(*rows, strict=True)]
     return RenderedViews(*[*columns, camera, tuple(ids)])
+
+
+def _require_counts(**given: int) -> None:
+    for name, value in given.items():
+        if not is_whole(value) or value < 1:
+            raise InputError(f"{value!r} is not a whole number >= 1", where=name)
 
 
 def _points(model: SampleModel, ids: Sequence[int]) -> FloatArray:

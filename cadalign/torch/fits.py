@@ -21,6 +21,7 @@ from cadalign.estimation.problems import in_threads, whitening_by
 from cadalign.geometry.camera import Camera
 from cadalign.names import renamed
 from cadalign.shapes.model import ShapeModel
+from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.marginal.equations import POSE, force_of
 from cadalign.solvers.marginal.posterior import slopes_of
 from cadalign.solvers.marginal.problem import Mixture, Seen, shape_at
@@ -30,7 +31,6 @@ from cadalign.torch.poses import PoseBatch, as_array, checked, expanded, torch
 if TYPE_CHECKING:
     from torch import Tensor
 
-_LEAST_POINTS = 4
 _NO_STARTS = np.empty((0, POSE))
 _NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1])
 
@@ -57,7 +57,7 @@ def fit(
 
     Problems without a solution do not raise: ``valid`` of the result marks the others. Gradients
     are those of the optimum, by ``points_2d``, ``sigma`` and ``points_3d``; there are no second
-    ones.
+    ones, and `torch.func` (``grad``, ``vmap``) does not pass: a batch is what ``vmap`` would make.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ class _ShapeTask:
     def _minimum(self, problem: int) -> _Aligned | None:
         """The best minimum of a problem; None where there is none."""
         seen = self._seen(problem)
-        if len(seen.points) < _LEAST_POINTS:
+        if len(seen.points) < LEAST_POINTS:
             return None
         minima, _ = search_view(self.mixture, seen, _NO_STARTS)
         if not minima.counts[0] or not np.isfinite(minima.states[0]).all():

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from cadalign.datasets import sample_models
+from cadalign.errors import InputError
 
 torch = pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
 from cadalign.torch import PoseBatch, fit, rotation_loss  # noqa: E402
@@ -92,3 +96,50 @@ def test_a_shape_is_learned_of_the_models_keypoints() -> None:
     ids = tuple(each.semantic_id for each in cars[0].keypoints)
     shape = learned_shape(cars, ids, "car")
     assert shape.ids == ids
+
+
+def test_an_untrained_network_leaves_the_programs_random_numbers_alone() -> None:
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    first = KeypointDetector.untrained(4, seed=1)
+    assert (torch.rand(3) == expected).all()
+    image = torch.full((1, 48, 48, 3), 90.0)
+    again = KeypointDetector.untrained(4, seed=1)
+    assert (first(image)[0] == again(image)[0]).all()
+
+
+@pytest.mark.parametrize(("height", "width"), [(33, 50), (60, 100)])
+def test_images_of_any_size_are_read(height: int, width: int) -> None:
+    detector = KeypointDetector.untrained(4, width=8)
+    image = torch.full((2, height, width, 3), 90.0)
+    assert detector.logits(image).shape == (2, 4, -(-height // 4), -(-width // 4))
+    assert detector(image)[0].shape == (2, 4, 2)
+
+
+def test_a_detector_is_pickled() -> None:
+    detector = KeypointDetector.untrained(4, width=8)
+    image = torch.full((1, 48, 48, 3), 90.0)
+    assert (pickle.loads(pickle.dumps(detector))(image)[0] == detector(image)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda views: KeypointDetector.untrained(0), "keypoints: 0 is not a whole number >= 1"),
+        (lambda views: KeypointDetector.untrained(3, width=12), "width: 12 is not a multiple of 8"),
+        (
+            lambda views: train(KeypointDetector.untrained(3), views, steps=1, batch=0),
+            "batch: 0 is not a whole number >= 1",
+        ),
+        (lambda views: render_views([], ids=(0,), count=1), "models: there is none"),
+        (lambda views: render_views([], ids=(0,), count=0), "count: 0 is not a whole number >= 1"),
+    ],
+)
+def test_wrong_numbers_are_refused(
+    views: tuple[RenderedViews, RenderedViews],
+    call: Callable[[RenderedViews], object],
+    words: str,
+) -> None:
+    with pytest.raises(InputError, match=words):
+        call(views[0])

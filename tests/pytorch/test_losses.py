@@ -72,6 +72,20 @@ def test_zero_for_what_looks_the_same_and_positive_otherwise(
         assert loss.min() > 1e-3
 
 
+def test_one_truth_is_that_of_all_and_other_numbers_are_refused() -> None:
+    found, truth = poses(np.full((4, 3), 0.3)), poses(np.zeros((3, 3)))
+    one = PoseBatch(truth.rotation[:1], truth.translation[:1], truth.scale[:1])
+    for loss in losses(found, one, None):
+        assert loss.shape == (4,)
+    for call in (
+        lambda: rotation_loss(found, truth),
+        lambda: reprojection_loss(found, truth, CORNERS, CAMERA),
+        lambda: box_loss(found, truth, BOUNDS),
+    ):
+        with pytest.raises(InputError, match="truth: 3 alignments, but 4 are compared with it"):
+            call()
+
+
 def test_rotation_loss_is_one_minus_the_cosine() -> None:
     angles = torch.tensor([0.0, 0.3, 1.2, math.pi]).double()
     found = poses(np.outer(angles, [0, 0, 1.0]))

@@ -214,6 +214,33 @@ def test_models_in_another_unit_are_warned_of(count: int, caplog: pytest.LogCapt
     assert "give all in one unit" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("turn", "words"),
+    [
+        ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], "with (x, z, -y) as (x, y, z);"),
+        ([[-1, 0, 0], [0, 1, 0], [0, 0, 1]], "with (-x, y, z) as (x, y, z), mirrored;"),
+    ],
+)
+def test_models_with_other_axes_are_warned_of(
+    turn: list[list[int]], words: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    models = tables(20)
+    points = models[3].points_3d @ np.transpose(turn) + [0, 0.4, 0]
+    models[3] = Example("odd one", models[3].ids, 2 * points)
+    ShapeModel.learn(models, components=1, modes=5)
+    assert "models with other axes than the others: 1 of 20, such as 'odd one'" in caplog.text
+    assert words in caplog.text
+
+
+def test_models_without_a_common_keypoint_are_refused() -> None:
+    models = [
+        Example(f"{row}", [f"{row // 2} {label}" for label in IDS], TABLE + row)
+        for row in range(40)
+    ]
+    with pytest.raises(InputError, match="20 groups of them share no keypoint, such as those of"):
+        ShapeModel.learn(models)
+
+
 def test_models_that_are_all_the_same_are_learned_without_a_warning() -> None:
     with warnings.catch_warnings(action="error"):
         model = ShapeModel.learn([Example(f"{row}", IDS, TABLE) for row in range(20)])

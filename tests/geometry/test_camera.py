@@ -75,7 +75,8 @@ def test_normalize_agrees_with_opencv(lens: str) -> None:
     pixels = np.random.default_rng(0).uniform([100, 100], [540, 380], (40, 2))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 500, 1e-14)
     coefficients = np.array(camera.distortion) if camera.distortion else np.zeros(4)
-    expected = cv2.undistortPoints(
+    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4 has both
+    expected = undistort(
         pixels[:, None], camera.matrix, coefficients, R=np.eye(3), P=np.eye(3), criteria=criteria
     )
     np.testing.assert_allclose(camera.normalize(pixels), expected[:, 0], rtol=0, atol=1e-7)

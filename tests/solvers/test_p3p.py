@@ -43,6 +43,7 @@ def test_the_true_pose_is_among_the_solutions(seed: int, distance: float) -> Non
     sides = points - np.roll(points, 1, axis=0)
     assume(np.linalg.norm(np.cross(sides[0], sides[1])) > 0.02)
     translation = distance * np.array([*rng.uniform(-0.3, 0.3, 2), 1.0])
+    assume((points @ rotation.T + translation)[:, 2].min() > 0.1)
     rays = seen(points, rotation, translation)
     rotations, translations = poses_of(points, rays)
     assert len(rotations) > 0

@@ -20,7 +20,7 @@ class Render:
     """Draw a model: a still, a contact sheet of several views, or a turntable.
 
     One view gives a still, several give a contact sheet, and an --out that ends in .mp4,
-    .webm or .gif gives a turntable.
+    .webm or .gif gives a turntable, which starts in the view.
     """
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]

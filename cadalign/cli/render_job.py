@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
-from cadalign.errors import DataError, InputError, refuse_unused
+from cadalign.errors import DataError, InputError, brief, refuse_unused
 from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -77,6 +77,11 @@ class RenderJob:
             refuse_unused(command, ["size", "fov"], "beside camera files, which have their own")
         if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
+        if ending in MOVIES:
+            _refuse_no_turntable(views)
+        else:
+            refuse_unused(command, ["seconds", "fps"], "on a still")
+            _refuse_several_sizes(views, camera)
         path = command.keypoints
         if color is None and (ending != ".png" or len(views) > 1 or path is not None):
             what = "only a PNG still without keypoints can be transparent"
@@ -125,8 +130,7 @@ class RenderJob:
                 where="--seconds",
             )
         view = self.views[0][1]
-        if not isinstance(view, Angles):
-            raise InputError("a turntable starts from angles, not a camera file", where="--view")
+        assert isinstance(view, Angles)  # `_refuse_no_turntable`
         count, scale = round(frames), self.command.scale
         poses = turntable(self.scene, self.camera, view, count=count, scale=scale)
         return (self._draw(self.camera, pose) for pose in poses), count
@@ -166,6 +170,28 @@ def read_keypoints(path: Path, model: Path, mesh: Mesh) -> FloatArray:
         return as_points(data, name="keypoints", dimension=3)
     except InputError as error:
         raise DataError(error.what, where=str(path), fix="give a list of [x, y, z]") from None
+
+
+def _refuse_no_turntable(views: Sequence[LabelledView]) -> None:
+    """Refuse views that a turntable cannot start in."""
+    if len(views) > 1:
+        what, fix = f"a turntable starts in one view, not in {len(views)}", "give one"
+        raise InputError(what, where="--view", fix=fix)
+    if not isinstance(views[0][1], Angles):
+        raise InputError("a turntable starts from angles, not a camera file", where="--view")
+
+
+def _refuse_several_sizes(views: Sequence[LabelledView], camera: Camera) -> None:
+    """Refuse views of several sizes, angles having ``camera``'s: no contact sheet holds them."""
+    sizes = dict[str, str]()
+    for label, view in views:
+        used = camera if isinstance(view, Angles) else view[0]
+        sizes.setdefault(f"{used.width}x{used.height}", label)
+    if len(sizes) > 1:
+        listed = ", ".join(f"{size} ({label})" for size, label in sizes.items())
+        what = f"the views have several sizes, of which no contact sheet is made: {brief(listed)}"
+        fix = "give those of one size; --size is that of angles"
+        raise InputError(what, where="--view", fix=fix)
 
 
 def _views(word: str, scale: FloatArray) -> list[LabelledView]:

@@ -130,6 +130,10 @@ def test_a_camera_file_gives_the_view(model, tmp_path):
     # The side of 0.8 x 0.6, at a depth of 2 - 0.2.
     assert np.ptp(rows) + 1 == pytest.approx(0.8 / 1.8 * camera.fx, abs=1.5)
     assert np.ptp(columns) + 1 == pytest.approx(0.6 / 1.8 * camera.fx, abs=1.5)
+    views = ("--view", tmp_path / "viewpoint.json", "iso", "--size")
+    with pytest.raises(InputError, match=r"--view: .* 120x90 \(.*\), 200x100 \(iso\); give"):
+        _run(model, "--out", out, *views, "200x100")
+    assert _run(model, "--out", tmp_path / "sheet.png", *views, "120x90") == 0
     for option in (("--size", "64x48"), ("--fov", "20")):
         with pytest.raises(InputError, match=f"{option[0]}: has no effect beside camera files"):
             _run(model, "--out", out, "--view", tmp_path / "viewpoint.json", *option)
@@ -205,6 +209,13 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
         (["--view", "10,200"], InputError, "--view: 200 is not between -90 and 90"),
         (["--samples", "0"], InputError, "--samples: 0 is not from 1 to 256"),
         (["--out", "t.mp4", "--seconds", "0"], InputError, "not 1 to 10000 frames"),
+        (
+            ["--out", "t.gif", "--view", "iso", "top"],
+            InputError,
+            "--view: .* in one view, not in 2",
+        ),
+        (["--seconds", "1"], InputError, "--seconds: has no effect on a still"),
+        (["--out", "s.jpg", "--fps", "10"], InputError, "--fps: has no effect on a still"),
     ],
 )
 def test_wrong_words_are_refused(model, tmp_path, monkeypatch, arguments, error, message):

@@ -126,6 +126,8 @@ def build_library(
     DataError if there are no models, or the folder cannot be written or holds something else.
     """
     tasks = [_task(dataset, key) for key in dataset.ids()]
+    if not tasks:
+        raise DataError("the data set has no such models", where=str(dataset.root))
     run = RunFolder(folder)
     run.refuse_foreign()
     if run.is_finished and (run.read_config() or {}).get("experiment") == _EXPERIMENT:
@@ -144,7 +146,8 @@ def build_library(
     )
     models = [json.loads(row["model"]) for row in records if row["model"]]
     if not models:
-        raise DataError("the data set has no such models", where=str(dataset.root))
+        what, fix = f"none of {len(tasks)} models can be read", f"{run.results} has the reasons"
+        raise DataError(what, where=str(dataset.root), fix=fix)
     troubles = [row for row in results if row["reason"] or row["warning"]]
     return Library(ModelTable.of_rows(models)), troubles
 

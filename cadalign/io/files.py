@@ -10,7 +10,7 @@ import os
 import stat
 import struct
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache, wraps
@@ -97,6 +97,22 @@ def refuse_input(path: Path) -> None:
     if os.path.realpath(path) in (_kept.get() or ()):
         what = "what is to be written is made from this file"
         raise DataError(what, where=printable(path), fix="give another name")
+
+
+def remove_earlier(folder: Path, files: Iterable[Path]) -> None:
+    """Remove files that earlier work wrote to a folder, and folders in it that are empty then.
+
+    Raises a DataError, before anything is removed, if something is made from one of them.
+    """
+    paths = list(files)
+    for path in paths:
+        refuse_input(path)
+    for path in paths:
+        with writing(folder):
+            path.unlink(missing_ok=True)
+        if path.parent != folder:
+            with suppress(OSError):  # something else is in it
+                path.parent.rmdir()
 
 
 def refuse_folder(path: Path) -> None:

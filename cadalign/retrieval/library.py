@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 
 from cadalign.datasets import AnnotatedModel, KeypointNet
-from cadalign.errors import DataError, InputError, refuse_unused
+from cadalign.errors import DataError, InputError, quote, refuse_unused
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum
@@ -147,6 +147,9 @@ class Library:
 
     def __getitem__(self, key: ModelKey) -> LibraryModel:
         """Find a model, as ``library["chair", model_id]``; raises InputError if there is none."""
+        if not (isinstance(key, tuple) and len(key) == 2 and all(isinstance(k, str) for k in key)):
+            fix = "give category and id, as library['chair', model_id]; library.keys lists them"
+            raise InputError(f"{quote(key)} names no model", where="library", fix=fix)
         keys = self._table.keys
         row = bisect_left(keys, key)
         if keys[row : row + 1] != [key]:

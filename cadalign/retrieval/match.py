@@ -92,6 +92,11 @@ class Match:
         """Number of keypoints that model and image share."""
         return len(self.ids)
 
+    @property
+    def observed(self) -> int:
+        """Number of keypoints in the image; 0 where a mask alone was matched."""
+        return self.shared + len(self.missing_ids)
+
     def __repr__(self) -> str:
         stretch = ", ".join(f"{value:.3g}" for value in self.alignment.scale)
         return (
@@ -108,7 +113,7 @@ class Match:
             ("model", self.model_id),
             ("score", f"{100 * self.score:.3g} %"),
             *none,
-            ("keypoints", f"{self.shared} of {self.shared + len(self.missing_ids)}"),
+            ("keypoints", f"{self.shared} of {self.observed}"),
             ("residuals (rms)", f"{self.rms:.3g} px"),
             ("stretch", ", ".join(f"{axis} {value:.3g}" for axis, value in scales)),
         ]

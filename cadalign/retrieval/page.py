@@ -13,7 +13,7 @@ import numpy as np
 from cadalign.errors import DataError
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
-from cadalign.io.files import made_folder, refuse_input, write_json, write_text, writing
+from cadalign.io.files import made_folder, remove_earlier, write_json, write_text
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
@@ -62,6 +62,7 @@ def write_retrieval(
         style=asset("retrieval.css"),
         count=len(matches),
         library=escape(library),
+        evidence="keypoints" if any(match.observed for match in matches) else "mask",
         none="" if none is None else f'<p class="lead"><strong>{escape(none)}</strong></p>',
         matches="".join(_card(rank, match) for rank, match in enumerate(matches, start=1)),
     )
@@ -76,15 +77,7 @@ def _remove_earlier(folder: Path) -> None:
     with suppress(DataError):  # there is none
         earlier = read_json(folder / _MATCHES)
     count = len(earlier) if isinstance(earlier, list) else 0
-    files = [path for rank in range(1, count + 1) for path in _files(folder, rank)]
-    for path in files:
-        refuse_input(path)
-    for path in files:
-        with writing(folder):
-            path.unlink(missing_ok=True)
-        if path.parent != folder:
-            with suppress(OSError):  # something else is in it
-                path.parent.rmdir()
+    remove_earlier(folder, (path for rank in range(1, count + 1) for path in _files(folder, rank)))
 
 
 def _files(folder: Path, rank: int) -> tuple[Path, Path, Path]:
@@ -118,12 +111,13 @@ def none_text(matches: Sequence[Match]) -> str | None:
 
 def _card(rank: int, match: Match) -> str:
     scale = match.alignment.scale
-    values = {
-        "stretch": f"y {scale[1]:.2f}, z {scale[2]:.2f}",
-        "residuals": f"{match.rms:.2f} px",
-        "shared keypoints": f"{match.shared} of {match.shared + len(match.missing_ids)}",
-        "log-likelihood": f"{match.log_likelihood:.1f}",
-    }
+    values = {"stretch": f"y {scale[1]:.2f}, z {scale[2]:.2f}"}
+    if match.observed:
+        values["residuals"] = f"{match.rms:.2f} px"
+        values["shared keypoints"] = f"{match.shared} of {match.observed}"
+    else:
+        values["residuals of the contour"] = f"{match.rms:.2f} px"
+    values["log-likelihood"] = f"{match.log_likelihood:.1f}"
     if match.silhouette_iou is not None:
         values["silhouette IoU"] = f"{match.silhouette_iou:.3f}"
     if match.mirrored:

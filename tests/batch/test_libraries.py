@@ -95,6 +95,24 @@ def test_models_that_cannot_be_read_are_rows(
     assert len(Library.open(tmp_path / "lib")) == 7
 
 
+def test_a_build_of_no_model_leaves_its_rows_where_there_are_any(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, folder = root / "annotations" / "chair.json", tmp_path / "lib_build"
+    entries = json.loads(path.read_text())
+    for text, said in (
+        ("[]", f"{root}: the data set has no such models"),
+        (
+            json.dumps([{"model_id": each["model_id"]} for each in entries]),
+            f"{root}: none of 4 models can be read; {folder / 'results.parquet'} has the reasons",
+        ),
+    ):
+        path.write_text(text)
+        chairs = ["library", "build", root, "--categories", "chair"]
+        assert refusal_line(capsys, *chairs, "--out", tmp_path / "lib") == said
+        assert folder.exists() == (text != "[]")
+
+
 def test_a_library_that_is_written_can_be_opened(root: Path, tmp_path: Path) -> None:
     """Whatever the coordinates: of a keypoint, and of a mesh."""
     path = root / "annotations" / "chair.json"

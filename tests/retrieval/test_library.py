@@ -112,6 +112,9 @@ def test_looking_up_an_unknown_model_is_refused(library: Library) -> None:
     for key in (("box", "0003x"), ("car", "0003"), ("zebra", "9")):
         with pytest.raises(InputError, match="library: no model"):
             library[key]
+    for key in ("box", 0, ("box",), ("box", 3), ("box", "0003", "x")):
+        with pytest.raises(InputError, match=r"library: .* names no model; give category and id"):
+            library[key]
 
 
 def test_duplicated_models_and_semantic_ids_are_refused() -> None:

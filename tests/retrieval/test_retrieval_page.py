@@ -352,6 +352,28 @@ def test_the_mask_of_an_observation_is_used(
     assert json.loads(capsys.readouterr().out)[0]["silhouette_iou"] > 0.5
 
 
+def test_what_is_shown_of_a_mask_alone_does_not_speak_of_keypoints(
+    case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = replace(
+        case.observation,
+        points_3d=np.empty((0, 3)),
+        points_2d=np.empty((0, 2)),
+        ids=None,
+        evidence=ImageEvidence(mask=case.folder / "mask.png"),
+    )
+    seen.save(tmp_path / "seen.json")
+    arguments = [str(tmp_path / "seen.json"), *case.arguments[1:], "--out", str(tmp_path / "out")]
+    assert main(["retrieve", *arguments, "--top", "1"]) == 0
+    first = capsys.readouterr().out.splitlines()[2].split()
+    assert first[2] == case.model_id
+    assert first[-4] == "-"  # keypoints
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "to explain the mask." in page
+    assert "residuals of the contour" in page
+    assert "keypoints" not in page
+
+
 @pytest.mark.long
 def test_a_photo_with_opacity_needs_no_cutting_out(
     case: Case, capsys: pytest.CaptureFixture[str]

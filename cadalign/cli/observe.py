@@ -31,13 +31,13 @@ from cadalign.datasets import (
 )
 from cadalign.datasets.detections.coco import decode_segmentation
 from cadalign.datasets.detections.image_keypoints import photo_in
-from cadalign.errors import CadalignError, DataError, InputError, refuse_unused
+from cadalign.errors import CadalignError, DataError, InputError, brief, refuse_unused
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import in_file
+from cadalign.io.documents import in_file, read_json
 from cadalign.io.evidence import ObservedImage
-from cadalign.io.files import keeping
-from cadalign.io.images import photo_size, write_image
-from cadalign.io.observation import Observation, with_lens
+from cadalign.io.files import keeping, listed
+from cadalign.io.images import photo_size, read_grey, read_mask, write_image
+from cadalign.io.observation import OBSERVATION, Observation, kind_of, with_lens
 
 # Arguments of the library's functions, and their names on the command line.
 _FLAGS = {"image": "--image", "number": "--object", "sigma_from_scores": "--sigma"}
@@ -170,8 +170,11 @@ class Observe(CameraOptions, EvidenceOptions):
     def _camera(self, found: ImageKeypoints, image: Path | None) -> Camera:
         """Read the camera, or make one of the photo's size without focal length."""
         given = self.given
-        paths = [path for path in (image, given.get("mask"), given.get("depth")) if path]
-        sizes = {str(path): photo_size(path) for path in paths}
+        sizes = {} if image is None else {str(image): photo_size(image)}
+        for name, read in (("mask", read_mask), ("depth", read_grey)):
+            if name in given:  # read as a fit reads it, which refuses others
+                height, width = read(given[name]).shape
+                sizes[str(given[name])] = (width, height)
         if found.size is not None:
             sizes[found.source] = found.size
         camera = self.read_camera(next(iter(sizes.values()), None))
@@ -206,7 +209,7 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
         raise InputError(what, where="--image", fix="give the photos' folder, or leave out --every")
     folder = command.out or beside(command.keypoints, "_observations")
     make_folder(folder)
-    failed = 0
+    failed, written = 0, set[Path]()
     if command.tracks:
         tracks: dict[str | None, list[ImageKeypoints]] = {}  # those without are one
         for each in objects:
@@ -226,9 +229,23 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
         except CadalignError as error:
             failed += 1
             say(f"left out: {name}: {error}")
+        else:
+            written.add(out)
+    others = [path.name for path in listed(folder, "*.json") if path not in written]
+    others = [name for name in others if _is_observation(folder / name)]
+    if others:
+        names = brief(", ".join(others))
+        say(f"Not written now, but in the folder, too, which a fit takes whole: {names}")
     kind = "tracks" if command.tracks else "objects"
     answer(f"{len(groups) - failed} of {len(groups)} {kind}: {folder}")
     return exit_code(failed, len(groups))
+
+
+def _is_observation(path: Path) -> bool:
+    try:
+        return kind_of(read_json(path)) == OBSERVATION
+    except DataError:
+        return False
 
 
 def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:

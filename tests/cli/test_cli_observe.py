@@ -349,6 +349,8 @@ def test_options_give_depth_gravity_and_size(masked: Path) -> None:
         (["--depth-scale", ".001"], "--depth-scale: given without depth; "),
         (["--depth", "{folder}/none.png"], "{folder}/none.png: no such file"),
         (["--mask", "{folder}/small.png"], "{folder}/small.png: the image has 8 x 6 pixels, "),
+        (["--mask", "{folder}/photo.jpg"], "{folder}/photo.jpg: the image has the mode RGB; give"),
+        (["--depth", "{folder}/photo.jpg"], "{folder}/photo.jpg: the image has the mode RGB; give"),
         (["--size", "height", "-1"], "--size.height: -1.0 is not a positive number"),
         (["--size", "depth", "1"], "--size: unknown field 'depth'; known are height, length, "),
         (["--size", "sigma", "1"], "--size: no length is given; give width, height or length"),
@@ -400,6 +402,30 @@ def test_the_photos_of_a_track_are_views_of_one_observation(
     for view, pose in zip(result.views, poses, strict=False):
         np.testing.assert_allclose(view.alignment.scale, pose.scale, rtol=0.03)
         np.testing.assert_allclose(view.alignment.rotation, pose.rotation, atol=0.02)
+
+
+def test_observations_of_another_time_in_the_folder_are_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, lines = folder / "all", ["image,name,u,v"]
+    (folder / "camera.json").write_text(json.dumps(TRUE.to_dict()))
+    for photo in ("a.jpg", "b.jpg"):
+        points = zip(NAMES, POINTS_2D, strict=True)
+        lines += [f"{photo},{name},{u},{v}" for name, (u, v) in points]
+    command = observing(folder, "--every", "--camera", str(folder / "camera.json"))
+    command[1] = str(folder / "found.csv")
+    cases = (
+        (lines, ""),
+        (lines[:25], "b.json"),
+        ([*lines[:1], "a.jpg,tail,1,2"], "a.json, b.json"),
+    )
+    for rows, said in cases:
+        (folder / "found.csv").write_text("\n".join(rows))
+        main([*command, "--out", str(out)])
+        (out / "camera.json").write_text("{}")  # which is no observation
+        start = "Not written now, but in the folder, too, which a fit takes whole: "
+        found = [line for line in capsys.readouterr().err.splitlines() if line.startswith(start)]
+        assert found == ([start + said] if said else [])
 
 
 def test_tracks_are_for_all_objects(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ from cadalign.datasets.formats import write_photos
 from cadalign.datasets.photos import bop_files
 from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.datasets.photos.photo import Photo
-from cadalign.datasets.sfm.colmap import write_colmap
+from cadalign.datasets.sfm.colmap import require_name, write_colmap
 from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import (
     CadalignError,
@@ -32,7 +32,7 @@ from cadalign.estimation.result import Result
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_groups
 from cadalign.export.aligned_object import FORMS, AlignedObject, ExportView, names_of, photos_of
-from cadalign.export.camera_files import write_nerf
+from cadalign.export.camera_files import nerf_camera, write_nerf
 from cadalign.export.formats import export_object, format_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import join
@@ -356,11 +356,32 @@ def _cameras(objects: Iterator[RunObject]) -> list[tuple[CameraView, Path | str]
     return found
 
 
+def _accepted(
+    cameras: list[tuple[CameraView, Path | str]],
+    require: Callable[[CameraView, Path | str], object],
+    left_out: list[CadalignError],
+) -> list[tuple[CameraView, Path | str]]:
+    """The cameras that ``require`` does not refuse by an InputError; others are left out."""
+    accepted = []
+    for view, photo in cameras:
+        try:
+            require(view, photo)
+        except InputError as error:
+            left_out.append(error)
+        else:
+            accepted.append((view, photo))
+    return accepted
+
+
 def _write_colmap(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
     """Write the cameras with names of their own: a photo's first one has that of the photo."""
-    found, views = _cameras(objects), {}
-    names = names_of(photo for _, photo in found)
-    for view, photo in found:
+    cameras, views = _cameras(objects), {}
+    names = names_of(photo for _, photo in cameras)
+
+    def require(view: CameraView, photo: Path | str) -> None:
+        require_name(names.get(photo, view.name), str(photo))
+
+    for view, photo in _accepted(cameras, require, left_out):
         name = names.get(photo, view.name)
         if name in views:
             name = f"{Path(view.name).stem}_{name}"
@@ -372,7 +393,9 @@ def _write_colmap(path: Path, objects: Iterator[RunObject], left_out: list[Cadal
 
 def _write_nerf(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
     """Write the cameras with the paths of their photos."""
-    found = _cameras(objects)
+    found = _accepted(
+        _cameras(objects), lambda view, photo: nerf_camera(view.camera, str(photo)), left_out
+    )
     if found:
         file = _made_file(path, "transforms.json")
         folder = file.parent.absolute()

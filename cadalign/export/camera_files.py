@@ -103,7 +103,7 @@ def write_nerf(path: str | os.PathLike[str], views: Sequence[CameraView]) -> Non
     and poses with a scale.
     """
     _require_views(views)
-    cameras = [_nerf_camera(view.camera, number) for number, view in enumerate(views)]
+    cameras = [nerf_camera(view.camera, f"views[{number}]") for number, view in enumerate(views)]
     shared = {k: v for k, v in cameras[0].items() if all(camera[k] == v for camera in cameras)}
     frames = []
     for number, (view, camera) in enumerate(zip(views, cameras, strict=True)):
@@ -133,10 +133,11 @@ def _open3d_entry(view: CameraView, number: int) -> dict[str, Any]:
     }
 
 
-def _nerf_camera(camera: Camera, number: int) -> dict[str, Any]:
+def nerf_camera(camera: Camera, where: str) -> dict[str, Any]:
+    """The fields of a camera in ``transforms.json``; raises InputError if it has no place there."""
     if any(camera.distortion[4:]) or camera.lens == "fov":
         what = "transforms.json has no place for more than k1, k2, p1, p2, or a fisheye's k1 to k4"
-        raise InputError(what, where=f"views[{number}]")
+        raise InputError(what, where=where)
     coefficients = camera.distortion[:4] or (0.0,) * 4
     model = "OPENCV_FISHEYE" if camera.lens == "fisheye" else "OPENCV"
     return {

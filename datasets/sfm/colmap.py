@@ -152,9 +152,7 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
     if len(set(names)) < len(names) or not all(names):
         raise InputError("every view needs an image name of its own", where="views")
     for number, name in enumerate(names):
-        if name.split() != [name]:
-            what = f"COLMAP's text files end the name {quote(name)} at its white space"
-            raise InputError(what, where=f"views[{number}]", fix="rename the photo")
+        require_name(name, f"views[{number}]")
     numbers: dict[Camera, int] = {}
     images, cameras = [], []
     for number, view in enumerate(views, start=1):
@@ -169,6 +167,13 @@ def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) ->
     folder = made_folder(as_path(folder, "folder"))
     for stem, lines in zip(_STEMS, (cameras, images, ()), strict=True):
         write_text(folder / f"{stem}.txt", "".join(lines))
+
+
+def require_name(name: str, where: str) -> None:
+    """Raise an InputError for the name of an image that COLMAP's text files cannot hold."""
+    if name.split() != [name]:
+        what = f"COLMAP's text files end the name {quote(name)} at its white space"
+        raise InputError(what, where=where, fix="rename the photo")
 
 
 def _written(values: Sequence[float]) -> str:

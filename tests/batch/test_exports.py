@@ -171,6 +171,26 @@ def test_photos_of_one_name_are_told_apart(run: Path, tmp_path: Path) -> None:
     assert [frame["file_path"] for frame in frames] == [f"../{name}" for name in names]
 
 
+def test_a_camera_that_a_format_cannot_hold_is_left_out(run: Path, tmp_path: Path) -> None:
+    names = ["a.jpg", "my photo.jpg", "c.jpg"]
+    seen = []
+    for number, name in enumerate(names):
+        Image.new("RGB", (640, 480)).save(tmp_path / name)
+        seen.append(box_in(tmp_path / name, number, run.parent / "box.obj"))
+    eight = replace(CAMERA, distortion=(0, 0, 0, 0, 0, 1e-3, 0, 0))
+    seen[2] = replace(seen[2], camera=eight)
+    cadalign.fit_many(seen, out=tmp_path / "run")
+    for form, name, said in (
+        ("colmap", "my photo.jpg", "end the name 'my photo.jpg' at its white space; rename"),
+        ("nerfstudio", "c.jpg", "has no place for more than k1, k2, p1, p2"),
+    ):
+        found = export_run(tmp_path / "run", tmp_path / form, format=form)
+        (error,) = found.left_out
+        assert (found.objects, error.where) == (2, str(tmp_path / name))
+        assert said in str(error)
+    assert {image.id for image in Colmap(tmp_path / "colmap")} == {"a.jpg", "c.jpg"}
+
+
 def test_what_cannot_be_written_is_said(run: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format: the format 'usd' holds one fit; of a run, give"):
         export_run(run, tmp_path / "out.usdz")

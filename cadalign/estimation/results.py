@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, overload
@@ -363,13 +363,15 @@ def _solved(
     return result if symmetry is None else canonical_result(result, symmetry)
 
 
-def to_dataframe(results: Sequence[Result | CadalignError]) -> pd.DataFrame:
+def to_dataframe(
+    results: Result | CadalignError | Iterable[Result | CadalignError],
+) -> pd.DataFrame:
     """One row for each view of each result, as a pandas DataFrame.
 
     Parameters
     ----------
-    results : Results or sequence of Result or CadalignError
-        Results of `cadalign.fit_batch`, `cadalign.align_batch`, or of single calls.
+    results : Results or iterable of Result or CadalignError
+        Results of `cadalign.fit_batch`, `cadalign.align_batch`, or of single calls; or one result.
 
     Returns
     -------
@@ -393,12 +395,17 @@ def to_dataframe(results: Sequence[Result | CadalignError]) -> pd.DataFrame:
     [[True, 8], [True, 8]]
     """
     if not isinstance(results, Results):
-        given: Sequence[object] = results
+        single = isinstance(results, Result | CadalignError)
+        given: Any = [results] if single else results
+        if not isinstance(given, Iterable):
+            what = f"expected results, got {type(given).__name__}"
+            raise InputError(what, where="results", fix="give a list of them, or one result")
+        given = list(given)
         for number, result in enumerate(given):
             if not isinstance(result, Result | CadalignError):
                 what = f"expected a result or an error, got {type(result).__name__}"
                 raise InputError(what, where=f"results[{number}]")
-        results = Results.of(results)
+        results = Results.of(given)
     return results.to_dataframe()
 
 

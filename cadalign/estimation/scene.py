@@ -227,8 +227,10 @@ def align_scene(
     for member in members:
         found[member.number] = member.result
     for number, each in enumerate(objects):
-        # As of a mask alone, which does not tell the focal length.
-        if isinstance(found[number], CadalignError):
+        # A mask does not tell the focal length, and points on one line no rotation but for gravity;
+        # keypoints that fail without the focal length fail with it.
+        can_gain = "gravity" in wanted or each.view.mask is not None
+        if isinstance(found[number], CadalignError) and can_gain:
             with suppress(CadalignError):
                 found[number] = aligned(each, shared.tilted(tilt))
     scene = AlignedScene(Results.of(found), camera, warnings=(*warnings, *contradictions))

@@ -163,6 +163,11 @@ def test_results_of_both_batches_have_the_same_columns() -> None:
     np.testing.assert_allclose(single.loc[0, numbers].to_numpy(dtype=float), expected, atol=1e-6)
     with pytest.raises(InputError, match=r"results\[0\]: expected a result"):
         cadalign.to_dataframe([CORNERS])
+    one = cadalign.fit(CORNERS, SEEN, CAMERA)
+    for given in (one, iter([one])):
+        assert cadalign.to_dataframe(given).equals(single)
+    with pytest.raises(InputError, match="results: expected results, got int; give a"):
+        cadalign.to_dataframe(3)
 
 
 def test_every_view_has_a_row() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,6 +17,7 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.result import Result
 from cadalign.estimation.tracks.motion import Trajectory
 from cadalign.estimation.view import View
+from cadalign.evaluation.runs.tables import read_groups
 from cadalign.evaluation.runs.work import Columns, Row
 from cadalign.export.glb import MovingObject
 from cadalign.geometry.box import Box
@@ -208,6 +210,17 @@ def rows_of(found: FoundTrack) -> Iterator[Row]:
             "inliers": int(view.inliers.sum()),
             "rms_px": view.rms,
         }
+
+
+def tracks_in(table: Path) -> list[str]:
+    """The names of the tracks in a table of poses; none where there is no such table."""
+    names = dict[str, None]()
+    with suppress(DataError):
+        for rows in read_groups(table, fix=""):
+            if rows.column_names != [name for name, _ in COLUMNS]:
+                return []
+            names |= dict.fromkeys(rows["track"].to_pylist())
+    return list(names)
 
 
 # Pictures -----------------------------------------------------------------------------------------

@@ -15,13 +15,14 @@ from cadalign.cli.common import (
     answer,
     beside,
     exit_code,
+    file_stem,
     file_stems,
     make_folder,
     print_json,
     say,
     waiting,
 )
-from cadalign.cli.fitted import FittedFile, overlay_style
+from cadalign.cli.fitted import FittedFile, list_in, overlay_style, written_files
 from cadalign.cli.options import (
     CameraOptions,
     EvidenceOptions,
@@ -36,7 +37,7 @@ from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import read_json
-from cadalign.io.files import keeping, write_json
+from cadalign.io.files import keeping, remove_earlier, write_json
 from cadalign.io.observation import (
     Observation,
     ObservationChanges,
@@ -321,10 +322,18 @@ def _write_scene(
     objects: list[SceneObject],
     observations: list[Observation],
 ) -> tuple[list[str], list[dict[str, Any]]]:
-    """Write the files of the scene; returns the texts and documents of its objects."""
+    """Write the files of the scene; returns the texts and documents of its objects.
+
+    What an earlier one wrote of objects that have no fit now is removed.
+    """
     make_folder(folder)
     texts, documents = [], list[dict[str, Any]]()
     stems = file_stems(["scene.json", *(each.name for each in objects)], "object")[1:]
+    results = zip(stems, scene.results, strict=True)
+    fitted = {stem for stem, result in results if not isinstance(result, CadalignError)}
+    for own in _earlier_objects(folder):
+        if own.name not in fitted:
+            remove_earlier(folder, [own / "observation.json", *written_files(own)])
     for each, seen, result, stem in zip(objects, observations, scene.results, stems, strict=True):
         if isinstance(result, CadalignError):
             texts.append(f"{each.name}: {result}")
@@ -333,11 +342,21 @@ def _write_scene(
         own = folder / stem
         make_folder(own)
         seen.save(own / "observation.json")
-        fitted = command.fitted(own / "observation.json", seen, result, (each.view,))
-        fitted.write(own)
+        file = command.fitted(own / "observation.json", seen, result, (each.view,))
+        file.write(own)
         texts.append(f"{each.name}: {result}")
-        documents.append({"name": each.name, "folder": own.name, "fit": fitted.document(own)})
+        documents.append({"name": each.name, "folder": own.name, "fit": file.document(own)})
     # Their folders have the fits.
     entries = [{key: each[key] for key in each if key != "fit"} for each in documents]
     write_json(folder / "scene.json", scene.to_dict() | {"objects": entries})
     return texts, documents
+
+
+def _earlier_objects(folder: Path) -> list[Path]:
+    """The folders of the objects that the folder's scene.json lists."""
+    listed = list_in(folder / "scene.json", "objects")
+    names = [each.get("folder") for each in listed if isinstance(each, dict)]
+    # As `file_stems` makes them: no file of other text is to lead out of the folder.
+    return [
+        folder / name for name in names if isinstance(name, str) and name == file_stem(name, "")
+    ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from cadalign.cli.common import make_folder
-from cadalign.errors import InputError
-from cadalign.io.documents import written_path
-from cadalign.io.files import finite, keeping, write_text
+from cadalign.errors import DataError, InputError
+from cadalign.io.documents import read_json, written_path
+from cadalign.io.files import finite, keeping, remove_earlier, write_text
 
 if TYPE_CHECKING:
     from cadalign.arrays import BoolArray, FloatArray
@@ -64,14 +65,19 @@ class FittedFile:
     def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
         """Write fit.json and the pictures to a folder; returns the pictures' paths.
 
-        The ``overlays`` go to ``overlay``, those of further views beside it.
+        The ``overlays`` go to ``overlay``, those of further views beside it. Pictures of an earlier
+        fit are removed.
         """
         make_folder(out)
+        earlier = {path.absolute() for path in written_files(out)}
         with keeping(self.inputs):
             # First what somebody names, which may be refused.
             further = [] if overlay is None else _write_pictures(overlay, self.overlays)
             write_text(out / "fit.json", self.text(out))
-            return _write_pictures(out / "overlay.png", self.pictures) + further
+            written = _write_pictures(out / "overlay.png", self.pictures) + further
+            paths = (*written, out / "fit.json")
+            remove_earlier(out, earlier.difference(path.absolute() for path in paths))
+            return written
 
     def drawn(
         self,
@@ -127,16 +133,35 @@ class FittedFile:
         return replace(found, overlays=tuple(overlays))
 
 
+def written_files(folder: Path) -> list[Path]:
+    """The files that a fit wrote to a folder, by its fit.json: this, and the pictures."""
+    path = folder / "fit.json"
+    count = len(list_in(path, "views"))
+    return [path, *_picture_paths(folder / "overlay.png", count)] if count else []
+
+
+def list_in(path: Path, key: str) -> list[Any]:
+    """The list in an earlier JSON file; empty where there is none."""
+    found: Any = None
+    with suppress(DataError):
+        found = read_json(path)
+    value = found.get(key) if isinstance(found, dict) else None
+    return value if isinstance(value, list) else []
+
+
+def _picture_paths(path: Path, count: int) -> list[Path]:
+    """A path for the first picture, NAME_1 and so on for further ones."""
+    further = (path.with_name(f"{path.stem}_{row}{path.suffix}") for row in range(1, count))
+    return [path, *further][:count]
+
+
 def _write_pictures(path: Path, pictures: tuple[ByteImage, ...]) -> list[Path]:
     """Write the first picture to a path, further ones to NAME_1 and so on; returns their paths."""
     if not pictures:
         return []
     from cadalign.io.images import write_image
 
-    paths = [
-        path.with_name(f"{path.stem}_{row}{path.suffix}") if row else path
-        for row in range(len(pictures))
-    ]
+    paths = _picture_paths(path, len(pictures))
     for each, picture in zip(paths, pictures, strict=True):
         write_image(each, picture)
     return paths

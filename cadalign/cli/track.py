@@ -14,6 +14,7 @@ from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.errors import CadalignError, InputError, refuse_unused
 from cadalign.estimation.options import RansacOptions
 from cadalign.geometry.camera import Camera
+from cadalign.io.files import keeping, remove_earlier
 from cadalign.io.observation import with_lens
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from cadalign.io.images import Video
     from cadalign.shapes.model import ShapeModel
 
+_ENDINGS = (".tum", ".txt")
 _RATE = 30.0
 _KITTI_RATE = 10.0  # Geiger et al., "Vision meets Robotics: The KITTI Dataset", 2013
 
@@ -113,7 +115,8 @@ class TrackCommand(CameraOptions):
         make_folder(folder)
         found, failures = self._estimate(tracks, shape, motion)
         if found:
-            self._write(folder, found, failures, video)
+            with keeping([self.detections, self.shape, self.video, self.camera]):
+                self._write(folder, found, failures, video)
             say(f"Trajectories: {folder}")
         return exit_code(len(failures), len(tracks))
 
@@ -182,7 +185,8 @@ class TrackCommand(CameraOptions):
         failures: Mapping[str, str],
         video: Video | None,
     ) -> None:
-        from cadalign.batch.tracks import COLUMNS, draw_video, moving_object, rows_of
+        """Write the folder; what an earlier run wrote of other tracks is removed."""
+        from cadalign.batch.tracks import COLUMNS, draw_video, moving_object, rows_of, tracks_in
         from cadalign.evaluation.runs.tables import write_rows
         from cadalign.export.camera_files import write_kitti, write_tum
         from cadalign.export.glb import write_moving_glb
@@ -190,6 +194,11 @@ class TrackCommand(CameraOptions):
         from cadalign.report.track_page import write_track_page
 
         stems = file_stems((each.track.name for each in found), "track")
+        earlier = file_stems(tracks_in(folder / "results.parquet"), "track")
+        stale = [folder / f"{each}{end}" for each in set(earlier) - set(stems) for end in _ENDINGS]
+        if earlier and video is None:
+            stale.append(folder / "overlay.mp4")
+        remove_earlier(folder, stale)
         for each, stem in zip(found, stems, strict=True):
             write_tum(folder / f"{stem}.tum", each.path.times, each.path.poses)
             write_kitti(folder / f"{stem}.txt", each.path.poses)

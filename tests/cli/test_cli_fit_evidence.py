@@ -122,6 +122,13 @@ def test_views_of_a_rig_share_the_model(tmp_path: Path, capsys: pytest.CaptureFi
     captured = capsys.readouterr()
     assert "without keypoints of views[2]" in captured.out
     assert f"Pictures: {tmp_path / 'a_fit' / 'overlay.png'}, " in captured.err
+    # Pictures of an earlier fit do not stay.
+    write(tmp_path, *images[:2])
+    (tmp_path / "a_fit" / "overlay_2.jpg").touch()
+    for options, left in (([], names[:2]), (["--no-picture"], [])):
+        assert main(["fit", str(path), *options]) == 0
+        there = {each.name for each in (tmp_path / "a_fit").iterdir()}
+        assert there == {"fit.json", "overlay_2.jpg", *left}
 
 
 def test_keypoints_without_ids_are_the_same_at_the_same_point(tmp_path: Path) -> None:

@@ -190,6 +190,26 @@ def test_images_of_another_size_than_the_cameras_are_refused(
     assert "the image has 320 x 240 pixels, that of the camera 640 x 480" in capsys.readouterr().err
 
 
+def test_tracks_of_an_earlier_run_do_not_stay(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = video[0], tmp_path / "out"
+    out.mkdir()
+    (out / "7.tum").write_text("mine")
+    found = json.loads((folder / "found.json").read_text())
+    found["annotations"] = [each for each in found["annotations"] if each["track_id"] == 3]
+    (tmp_path / "one.json").write_text(json.dumps(found))
+    one = ["track", str(tmp_path / "one.json"), *command(folder, "--out", str(out))[2:]]
+    assert main(one) == 0
+    assert (out / "7.tum").read_text() == "mine"  # which no run wrote
+    assert main(command(folder, "--out", str(out))) == 0
+    (out / "overlay.mp4").touch()
+    (out / "notes.txt").touch()
+    assert main(one) == 0
+    own = ["3.tum", "3.txt", "index.html", "results.parquet", "tracks.glb"]
+    assert sorted(path.name for path in out.iterdir()) == sorted([*own, "notes.txt"])
+
+
 def test_a_run_that_estimates_no_track_names_no_trajectories(
     video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -27,7 +27,7 @@ from cadalign import (
     align_scene,
 )
 from cadalign.cli import main
-from cadalign.errors import InputError
+from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.result_parts import Stated
 from cadalign.evaluation.simulation import UNIT_BOUNDS, simulate_standing_boxes
 from cadalign.geometry.metrics import rotation_error
@@ -260,6 +260,25 @@ def test_bad_object_stops_no_other() -> None:
     assert isinstance(scene.results[2], Result)
 
 
+def test_only_objects_that_can_gain_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keypoints on one line gain by gravity, nothing by the focal length."""
+    objects = Simulated(6, 3).objects(UNKNOWN)
+    line = np.linspace(0, 1, 10)[:, None] * np.ones(3)
+    objects[1] = replace(objects[1], model=replace(objects[1].model, points_3d=line))
+    tried: list[object] = []
+
+    def counted(model: Model, *given: Any, **options: Any) -> Result:
+        tried.append(model)
+        return align(model, *given, **options)
+
+    monkeypatch.setattr("cadalign.estimation.scene.align", counted)
+    for share, count, kind in (("focal", 1, DegenerateError), ("gravity", 2, Result)):
+        tried.clear()
+        scene = align_scene(objects, share=("focal", share))
+        assert sum(model is objects[1].model for model in tried) == count
+        assert isinstance(scene.results[1], kind)
+
+
 @pytest.mark.long
 def test_mask_alone_takes_the_focal_length_of_the_others() -> None:
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
@@ -434,6 +453,24 @@ def test_every_object_has_a_folder_of_its_own(tmp_path: Path) -> None:
     for name, folder in folders.items():
         seen = Observation.load(tmp_path / "scene_fit" / folder / "observation.json")
         assert seen.object_name == name
+
+
+def test_objects_of_an_earlier_fit_do_not_stay(tmp_path: Path) -> None:
+    folder = tmp_path / "scene_fit"
+    path = write_scene(tmp_path)
+    assert main(["fit", str(path)]) == 0
+    (folder / "right" / "notes.txt").touch()
+    data = json.loads(path.read_text())
+    data["objects"][0]["object"] = "front"
+    data["objects"][1]["keypoints"] = data["objects"][1]["keypoints"][:2]  # fails
+    path.write_text(json.dumps(data))
+    assert main(["fit", str(path)]) == 3
+    assert sorted(each.name for each in folder.iterdir()) == ["front", "right", "scene.json"]
+    assert [each.name for each in (folder / "right").iterdir()] == ["notes.txt"]
+    (tmp_path / "observation.json").touch()
+    (folder / "scene.json").write_text('{"objects": [{"folder": ".."}, {"folder": 3}, 4]}')
+    assert main(["fit", str(path)]) == 3
+    assert (tmp_path / "observation.json").exists()
 
 
 def test_no_object_is_written_outside_of_the_folder(tmp_path: Path) -> None:

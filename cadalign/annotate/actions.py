@@ -240,7 +240,7 @@ def mark(state: PhotoState, *, mark: Mark | None = None) -> None:
     session.before_saving()
     # As the file is by now, which others may have changed.
     kept = WorkList.open(session.worklist.path.parent)
-    session.worklist = kept.marked(state.photo.path.name, mark)
+    session.worklist = kept.marked(state.photo.path, mark)
 
 
 def undo(state: PhotoState) -> ActionOutcome:

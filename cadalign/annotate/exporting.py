@@ -19,7 +19,7 @@ from cadalign.datasets.photos.photo import Photo
 from cadalign.errors import InputError
 from cadalign.estimation.outputs import object_of
 from cadalign.export import AlignedObject, export_object
-from cadalign.export.aligned_object import photos_of, write_photo_set
+from cadalign.export.aligned_object import names_of, photos_of, write_photo_set
 from cadalign.io.files import write_text
 
 _MARKED = 2  # COCO's flag of a keypoint that is labelled and visible
@@ -56,8 +56,9 @@ def coco_of(session: Session) -> dict[str, Any]:
                 track = _FIRST_TRACK if session.times and not slot else None
                 annotations.append(CocoObject(row, category, uv, flags, rectangle, track=track))
         files = [objects[0].photo for objects in kept]
+        names = names_of(photo.path for photo in files)  # of photos in several folders their paths
         return coco_document(
-            [(photo.path.name, photo.width, photo.height) for photo in files],
+            [(names[photo.path], photo.width, photo.height) for photo in files],
             [
                 (model.path.stem, [model.registry[number].name for number in own])
                 for model, own in zip(models, numbers, strict=True)

@@ -92,17 +92,18 @@ def object_files(observation: Path, photo: Path) -> list[Path]:
     return sorted(found, key=object_number)
 
 
-def observation_file(photo: Path, folder: Path) -> Path:
+def observation_file(photo: Path, folder: Path, others: Iterable[Path] = ()) -> Path:
     """Path of a photo's observation in a folder: that of an earlier session, or a new one.
 
-    Raises DataError if the files of these names belong to other photos.
+    ``others`` are files of other photos that may not be there yet. Raises DataError if the files of
+    these names belong to other photos.
     """
     short, full = (folder / file_name(name, ".json") for name in (photo.stem, photo.name))
     named = {path: _named_photos(path) for path in (short, full)}
-    for path, others in named.items():
-        if any(other.samefile(photo) for other in others):
+    for path, found in named.items():
+        if any(other.samefile(photo) for other in found):
             return path
-    taken = {path for path, others in named.items() if others}
+    taken = {path for path, found in named.items() if found} | set(others)
     if not _has_namesake(photo) and short not in taken:
         stem = _folded(photo.stem)
         is_plain = not stem.endswith(_AMBIGUOUS) and _OBJECT.search(stem) is None
@@ -110,9 +111,8 @@ def observation_file(photo: Path, folder: Path) -> Path:
             return short
     if full not in taken:
         return full
-    raise DataError(
-        f"belongs to the photo {named[full][0]}, not {photo}", where=str(full), fix=_OTHER_FOLDER
-    )
+    owner = f"the photo {named[full][0]}" if named[full] else "another photo of its name"
+    raise DataError(f"belongs to {owner}, not {photo}", where=str(full), fix=_OTHER_FOLDER)
 
 
 def refuse_collisions(written: Iterable[Path], read: Iterable[Path]) -> None:

@@ -83,7 +83,8 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
     photos[0].encoded()  # refuses a damaged photo now, not when the page asks for it
     out = options.out or paths[0].parent if given is None else given.parent
     observations = [] if given is None else [given]
-    observations += [observation_file(photo.path, out) for photo in photos[len(observations) :]]
+    for photo in photos[len(observations) :]:
+        observations.append(observation_file(photo.path, out, observations))
     keypoints = keypoints_file(options.model, out)
     files = SessionFiles(tuple(photos), tuple(observations), keypoints)
     read = [options.model, options.camera, options.mask, options.detections, options.library]

@@ -20,7 +20,7 @@ from cadalign.estimation.focal import FocalPrior
 from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
-from cadalign.io.documents import Document, in_file, read_document
+from cadalign.io.documents import Document, in_file, read_document, written_path
 from cadalign.io.files import listed, read_bytes, reading, require_utf8, write_json
 from cadalign.io.images import PHOTO_ENDINGS, open_photo, photo_size, upright_pixels
 
@@ -222,7 +222,11 @@ class _File(Document):
 
 @dataclass(frozen=True)
 class WorkList:
-    """Photos that are marked as done or skipped, by their file names, and the file of the list."""
+    """Photos that are marked as done or skipped, and the file of the list.
+
+    A photo goes by its path relative to the list's folder, which of those in it is their name.
+    Earlier versions wrote the name of every photo.
+    """
 
     path: Path
     marks: Mapping[str, Mark] = field(default_factory=dict)
@@ -238,17 +242,26 @@ class WorkList:
             raise DataError(f"not a {_FORMAT}", where=str(path), fix="rename it")
         return cls(path, read.photos)
 
-    def state(self, photo: str, *, pairs: int) -> State:
+    def state(self, photo: Path, *, pairs: int) -> State:
         """The state of a photo of so many pairs."""
-        return self.marks.get(photo) or ("begun" if pairs else "to do")
+        found = next((self.marks[key] for key in self._keys(photo) if key in self.marks), None)
+        return found or ("begun" if pairs else "to do")
 
-    def marked(self, photo: str, mark: Mark | None) -> WorkList:
+    def marked(self, photo: Path, mark: Mark | None) -> WorkList:
         """The list with a photo marked, or without its mark; its file is written."""
-        marks = {name: kept for name, kept in self.marks.items() if name != photo}
+        keys = self._keys(photo)
+        marks = {name: kept for name, kept in self.marks.items() if name not in keys}
         if mark is not None:
-            marks[photo] = mark
+            marks[keys[0]] = mark
         write_json(self.path, {"format": _FORMAT, "photos": dict(sorted(marks.items()))})
         return WorkList(self.path, marks)
+
+    def _keys(self, photo: Path) -> tuple[str, ...]:
+        """What a photo goes by in the list, and in those of earlier versions."""
+        folder = self.path.parent
+        own = written_path(photo.absolute(), folder=folder.absolute())
+        is_earlier = not (folder / photo.name).exists()  # or the name is that photo's
+        return (own, photo.name) if is_earlier else (own,)
 
 
 def nearest_corner(image: npt.NDArray[np.uint8], uv: Pixel, *, reach: float) -> Pixel | None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -73,18 +75,27 @@ def read_proposals(
 ) -> list[tuple[Proposal, ...]]:
     """Read COCO's keypoints or a detector's for each photo, by its file name.
 
-    Where a photo has several objects, the surest counts. Keypoints are found by name, else by their
-    semantic id; in a file with neither by their order, if there are as many as the model has.
+    Of photos of one name an image's are those whose folders agree most with its own. Where a photo
+    has several objects, the surest counts. Keypoints are found by name, else by their semantic id;
+    in a file with neither by their order, if there are as many as the model has.
 
     Raises DataError if no photo or no keypoint of the model is in the file.
     """
     found = read_image_keypoints(path)
+    called = defaultdict[str, list[PhotoFile]](list)
+    for photo in photos:
+        for name in {photo.path.name, photo.path.stem}:
+            called[name].append(photo)
+    objects = defaultdict[PhotoFile, list[ImageKeypoints]](list)
+    for each in found:
+        namesakes = called.get(Path(each.image or "").name, [])
+        alike = [_folders_alike(each.image or "", photo.path) for photo in namesakes]
+        for photo, count in zip(namesakes, alike, strict=True):
+            if count == max(alike):
+                objects[photo].append(each)
     by_photo = []
     for photo in photos:
-        names = (photo.path.name, photo.path.stem)
-        own = [each for each in found if each.image and Path(each.image).name in names]
-        if not own and len(photos) == 1:
-            own = found
+        own = objects[photo] or (list(found) if len(photos) == 1 else [])
         own.sort(key=lambda each: -(each.score or 0.0))
         by_photo.append(_proposals(own[0], photo, registry) if own else ())
     if not any(by_photo):
@@ -94,6 +105,12 @@ def read_proposals(
             fix="its images and keypoints must be called as the photos and the model's keypoints",
         )
     return by_photo
+
+
+def _folders_alike(image: str, photo: Path) -> int:
+    """How many of the last folders of two paths are the same."""
+    pairs = zip(Path(image).parts[-2::-1], photo.absolute().parts[-2::-1], strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _proposals(

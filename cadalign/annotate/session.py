@@ -122,7 +122,7 @@ class Session:
         """State of the annotation of a photo."""
         shown = shown_objects(self.objects[state.place[0]])
         pairs = sum(len(each.document.pairs) for each in shown)
-        return self.worklist.state(state.photo.path.name, pairs=pairs)
+        return self.worklist.state(state.photo.path, pairs=pairs)
 
     def pixels(self, state: PhotoState) -> npt.NDArray[np.uint8]:
         """The upright photo (h, w, 3); the last one asked for is kept."""

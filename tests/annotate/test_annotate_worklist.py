@@ -125,6 +125,37 @@ def test_detections_are_proposed_and_taken(case: Case) -> None:
         case.open(image=case.folder, detections=file)
 
 
+def test_photos_of_one_name_in_two_folders_are_told_apart(case: Case) -> None:
+    photos = [case.folder / side / "img.png" for side in ("left", "right")]
+    for photo in photos:
+        photo.parent.mkdir()
+        shutil.copy(case.photo, photo)
+    out = case.folder / "out"
+    out.mkdir()
+    earlier = {"format": "cadalign work list", "photos": {"img.png": "skipped"}}
+    (out / FILE).write_text(json.dumps(earlier))  # as it was written once
+    options: dict[str, Any] = {"image": photos[0], "further_photos": (photos[1],), "out": out}
+    session = case.open(**options)
+    assert [each["state"] for each in worklist_state(session)] == ["skipped"] * 2
+    perform(session, 0, {"do": "mark", "mark": "done"})
+    for number in (0, 1):
+        for keypoint, uv in case.clicks[number : 5 + number]:
+            place(session, keypoint, uv, image=number)
+    again = case.open(**options)
+    assert [each["state"] for each in worklist_state(again)] == ["done", "begun"]
+    assert [each["state"] for each in worklist_state(case.open(image=photos[1], out=out))] == [
+        "begun"
+    ]
+    assert WorkList.open(out).marks == {"../left/img.png": "done"}
+    data = coco_of(again)
+    assert [image["file_name"] for image in data["images"]] == ["left/img.png", "right/img.png"]
+    (out / "found.json").write_text(json.dumps(data))
+    fresh = case.open(**options | {"out": case.folder, "detections": out / "found.json"})
+    expected = [{keypoint for keypoint, _ in case.clicks[n : 5 + n]} for n in (0, 1)]
+    found = [{each.keypoint for each in photo.proposals} for photo in fresh.photos]
+    assert found == expected
+
+
 def test_annotations_are_exported_as_coco_and_glb(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -193,6 +224,6 @@ def test_why_a_photo_cannot_be_shown_is_said(browser: Browser, case: Case) -> No
 
 def test_marks_of_others_in_the_work_list_are_kept(case: Case) -> None:
     session = case.open(image=case.folder, prepared=False)
-    marks = WorkList.open(case.folder).marked("other.png", "done")
+    marks = WorkList.open(case.folder).marked(case.folder / "other.png", "done")
     perform(session, 0, {"do": "mark", "mark": "skipped"})
     assert WorkList.open(case.folder).marks == {**marks.marks, "photo.png": "skipped"}

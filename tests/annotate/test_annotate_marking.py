@@ -241,6 +241,18 @@ def test_masks_that_cannot_be_the_photos_are_refused(case: Case) -> None:
     assert session.photos[0].document.evidence.mask is None
 
 
+def test_a_mask_of_noise_keeps_no_server_busy(case: Case) -> None:
+    session = case.open()
+    place_all(session, case, count=6)
+    noise = np.random.default_rng(0).uniform(size=(480, 640)) < 0.5
+    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(noise))})
+    shown = page_state(session, 0)["alignment"]
+    assert shown["status"] == "none"
+    assert "photo.png.mask: has a contour of 56," in shown["message"]
+    perform(session, 0, {"do": "undo"})
+    assert page_state(session, 0)["alignment"]["status"] == "done"
+
+
 def test_a_mask_of_others_is_not_painted_over(case: Case) -> None:
     theirs = case.folder / "photo.mask.png"
     write_image(theirs, np.full((480, 640), 7, dtype=np.uint8))

@@ -99,6 +99,10 @@ def test_small_pieces_and_holes_are_dropped() -> None:
         (np.ones((HEIGHT, WIDTH)), "covers all of the image"),
         (disc((80, 60), 1.0), "larger than a few pixels"),
         (distances((80, 60)) >= 0, "covers all"),
+        (
+            np.random.default_rng(0).uniform(size=(480, 640)) < 0.5,  # of which a fit takes minutes
+            r"has a contour of 56,\d\d\d px, longer than any object's, as of noise; clear it",
+        ),
     ],
 )
 def test_masks_without_a_contour_are_refused(mask: np.ndarray, words: str) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
 from playwright.sync_api import Browser
-from support.annotating import Case, make_case, served
+from support.annotating import Case, make_case, opened_page, place_all, served
 from support.panels import AXE, WATCH_SHIFTS, Keyboard, open_page, prepare, shifts
 from support.web import axe_script
 
@@ -90,3 +91,20 @@ def test_nothing_moves_in_a_session_of_keys_alone(used: Used) -> None:
 @pytest.mark.long
 def test_axe_finds_nothing_serious_in_any_panel(used: Used) -> None:
     assert used.found == {}
+
+
+@pytest.mark.parametrize("width", [DESKTOP[0], 1024, 901, PHONE[0]])
+def test_pairs_show_whole_names_and_all_buttons(
+    browser: Browser, original: Case, tmp_path: Path, width: int
+) -> None:
+    session = original.copied_to(tmp_path / "photos").open()
+    place_all(session, original, count=6)
+
+    with opened_page(browser, session, width=width, height=800) as page:
+        names = page.locator("td.name input")
+        assert names.count() == 6
+        widths = "all => all.map((each) => [each.value, each.clientWidth, each.scrollWidth])"
+        assert [each for each in names.evaluate_all(widths) if each[1] < each[2]] == []
+        beyond = """all => all.map((each) => each.getBoundingClientRect().right
+            - each.closest(".scroll").getBoundingClientRect().right)"""
+        assert max(page.locator("td.actions button").evaluate_all(beyond)) <= 0

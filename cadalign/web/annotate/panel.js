@@ -279,7 +279,7 @@ export class Panel {
       h("td", {}, number),
       h("td", { class: "name" }, this.name(pair)),
       h("td", { class: "number place" }, pair.uv ? pair.uv.map((value) => value.toFixed(1)).join(", ") : h("em", {}, "click the photo")),
-      h("td", { class: "number" }, pair.residual ? `${Math.hypot(...pair.residual).toFixed(1)} px` : "–"),
+      h("td", { class: "number residual" }, pair.residual ? `${Math.hypot(...pair.residual).toFixed(1)} px` : "–"),
       h(
         "td",
         { class: "actions" },

@@ -210,6 +210,19 @@ def test_tracks_of_an_earlier_run_do_not_stay(
     assert sorted(path.name for path in out.iterdir()) == sorted([*own, "notes.txt"])
 
 
+def test_inputs_are_not_written_over(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = tmp_path / "3.txt"  # which the trajectory would be called
+    shape.write_bytes((video[0] / "thing.shape").read_bytes())
+    before = shape.read_bytes()
+    given = command(video[0], "--out", str(tmp_path))
+    given[given.index("--shape") + 1] = str(shape)
+    assert main(given) == 1
+    assert f"{shape}: what is to be written is made from this file" in capsys.readouterr().err
+    assert shape.read_bytes() == before
+
+
 def test_a_run_that_estimates_no_track_names_no_trajectories(
     video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

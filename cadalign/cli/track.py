@@ -13,6 +13,7 @@ from cadalign.cli.common import answer, beside, exit_code, file_stems, make_fold
 from cadalign.cli.options import CameraOptions, named_as_flags
 from cadalign.errors import CadalignError, InputError, refuse_unused
 from cadalign.estimation.options import RansacOptions
+from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import keeping, remove_earlier
 from cadalign.io.observation import with_lens
@@ -112,6 +113,7 @@ class TrackCommand(CameraOptions):
                 raise InputError("pictures as evidence need the video", where="--image", fix=fix)
             tracks = with_pictures(tracks, video, first=self.first_frame)
         folder = self.out or beside(self.detections, "_tracks")
+        RunFolder(folder).refuse_run()
         make_folder(folder)
         found, failures = self._estimate(tracks, shape, motion)
         if found:

@@ -15,6 +15,7 @@ from support.refusals import refusal_line
 from cadalign import Camera, ShapeModel
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet, write_sample_dataset
+from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.simulated_tracks import TRACK_CAMERA, SimulatedTrack, simulate_track
 from cadalign.geometry.rotations import angle_between
 from cadalign.io.images import Video, write_image
@@ -221,6 +222,17 @@ def test_inputs_are_not_written_over(
     assert main(given) == 1
     assert f"{shape}: what is to be written is made from this file" in capsys.readouterr().err
     assert shape.read_bytes() == before
+
+
+def test_the_table_of_a_run_is_not_written_over(
+    video: tuple[Path, list[SimulatedTrack]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = RunFolder(tmp_path)
+    run.config_file.write_text("{}")
+    run.results.write_bytes(b"a table")
+    assert main(command(video[0], "--out", str(tmp_path))) == 1
+    assert "holds a run, whose results.parquet would be written over" in capsys.readouterr().err
+    assert run.results.read_bytes() == b"a table"
 
 
 def test_a_run_that_estimates_no_track_names_no_trajectories(

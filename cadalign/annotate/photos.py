@@ -257,7 +257,7 @@ class WorkList:
         return WorkList(self.path, marks)
 
     def _keys(self, photo: Path) -> tuple[str, ...]:
-        """What a photo goes by in the list, and in those of earlier versions."""
+        """Names of a photo in the list, and in those of earlier versions."""
         folder = self.path.parent
         own = written_path(photo.absolute(), folder=folder.absolute())
         is_earlier = not (folder / photo.name).exists()  # or the name is that photo's

@@ -108,7 +108,7 @@ def read_proposals(
 
 
 def _folders_alike(image: str, photo: Path) -> int:
-    """How many of the last folders of two paths are the same."""
+    """Number of the last folders of two paths that are the same."""
     pairs = zip(Path(image).parts[-2::-1], photo.absolute().parts[-2::-1], strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 

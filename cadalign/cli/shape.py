@@ -14,8 +14,8 @@ from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import progress_bar
 from cadalign.datasets import KeypointNet
 from cadalign.io.files import keeping, refuse_input
-from cadalign.render.drawing.shape_picture import draw_shape
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.outputs import draw_shape
 
 _MODES = 5  # whose share of the variance is listed
 

@@ -1,13 +1,14 @@
-"""Outputs of shape models: their file, a sealed MessagePack document, and cards in notebooks.
+"""Outputs of shape models: their file, a picture of mean and modes, and cards in notebooks.
 
-See `cadalign.io.files` for the header. The document holds the fields of `cadalign.ShapeModel` and
-of its parts, arrays as little-endian numbers with their shape.
+The file is a sealed MessagePack document; see `cadalign.io.files` for the header. It holds the
+fields of `cadalign.ShapeModel` and of its parts, arrays as little-endian numbers with their shape.
 """
 
 from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
@@ -16,11 +17,13 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from cadalign.errors import InputError
+from cadalign.arrays import BoolArray, FloatArray
+from cadalign.errors import DataError, InputError
+from cadalign.geometry.box import BOX_EDGES, bounds_corners
 from cadalign.io.documents import Count, Document, PathText, in_file
-from cadalign.io.files import Seal, as_path, read_bytes
+from cadalign.io.files import Seal, as_path, printable, read_bytes, refuse_input, write_whole
 from cadalign.notebook import card, draw_picture
-from cadalign.shapes.parts import BOX_ROWS
+from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,6 +39,14 @@ SEAL = Seal(
     fix="learn it with: cadalign shape learn",
 )
 _MAX_BYTES = 1 << 30  # of thousands of models with hundreds of keypoints each
+_SHOWN_MODES = 5  # of a card's table
+_MODES = 4  # of a picture
+_DEVIATIONS = 2.0
+_CELL = 2.9  # inches
+_AZIMUTH, _ELEVATION = np.radians(32.0), np.radians(18.0)
+_GREY, _LESS, _MORE, _BOX = "#8a8f98", "#2a6fbb", "#d9622b", "#c3c7cd"
+_COMMON = 0.25  # share of the training models whose keypoints are joined by lines
+_LABELLED = 40  # keypoints, above which their ids would cover one another
 
 
 class _Array(Document):
@@ -109,12 +120,6 @@ def _check_known(document: Any, made: Any) -> None:
             _check_known(entry, getattr(made, name))
 
 
-_SHOWN_MODES = 5
-# Rows are the picture's right and up for each up axis, seen obliquely.
-_OBLIQUE = {"x": ((0, 1, 0.4), (1, 0, 0.3)), "y": ((1, 0, 0.4), (0, 1, 0.3)),
-            "z": ((1, 0.4, 0), (0, 0.3, 1))}  # fmt: skip
-
-
 def shape_html(model: ShapeModel) -> str:
     """HTML of a shape model: its mean keypoints and their standard deviations, and a table."""
     largest = max(model.components, key=lambda component: component.weight)
@@ -134,9 +139,9 @@ def shape_html(model: ShapeModel) -> str:
 
 def _draw(axes: Axes, model: ShapeModel) -> None:
     largest = max(model.components, key=lambda component: component.weight)
-    view = np.array(_OBLIQUE[model.up_axis or "y"], dtype=float)
-    keypoints = largest.mean[:-BOX_ROWS] @ view.T
-    moved = largest.modes[:, :-BOX_ROWS] @ view.T
+    view = _view(model.up_axis)
+    keypoints = largest.mean[:-BOX_ROWS] @ view
+    moved = largest.modes[:, :-BOX_ROWS] @ view
     spread = np.sqrt((moved**2).sum(axis=0) + largest.residual_sigma**2)
     x, y = keypoints.T
     x_std, y_std = spread.T
@@ -146,3 +151,142 @@ def _draw(axes: Axes, model: ShapeModel) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.15)
     axes.set_axis_off()
+
+
+def draw_shape(path: Path, model: ShapeModel) -> None:
+    """Draw a row for each component: the mean with its box and ids, then the first modes.
+
+    A mode is drawn at -2 (blue) and +2 (orange) standard deviations from the mean (grey). Raises
+    DataError if no picture has the path's ending, or the file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    modes = max(1, min(_MODES, max(len(each.modes) for each in model.components)))
+    rows, columns = len(model.components), modes + 1
+    figure = Figure(figsize=(columns * _CELL, rows * _CELL + 0.45), layout="constrained")
+    refuse_input(path)
+    if path.suffix[1:].lower() not in figure.canvas.get_supported_filetypes():
+        what, fix = "is no picture's name", "end it in .png, .jpg, .svg or .pdf"
+        raise DataError(what, where=printable(path), fix=fix)
+    figure.suptitle(
+        f"{model.category}: mean, and -{_DEVIATIONS:g} (blue) to +{_DEVIATIONS:g} (orange) "
+        f"standard deviations along its first modes",
+        fontsize=10,
+    )
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for row, component in zip(axes, model.components, strict=True):
+        _draw_component(row, model, component)
+    write_whole(path, lambda unfinished: figure.savefig(unfinished, dpi=110))
+
+
+def neighbour_pairs(points: FloatArray) -> list[tuple[int, int]]:
+    """Pairs of points that have no third point nearer to both: a skeleton of the shape.
+
+    The relative neighbourhood graph, which holds the minimum spanning tree: Toussaint, "The
+    relative neighbourhood graph of a finite planar set", 1980.
+
+    Examples
+    --------
+    >>> neighbour_pairs(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]))
+    [(0, 1), (1, 2)]
+    """
+    gaps = np.linalg.norm(points[:, None] - points, axis=2)
+    blocked = (np.maximum(gaps[:, None, :], gaps[None, :, :]) < gaps[..., None]).any(axis=2)
+    return [
+        (first, second)
+        for first in range(len(points))
+        for second in range(first + 1, len(points))
+        if not blocked[first, second]
+    ]
+
+
+def _draw_component(row: Sequence[Axes], model: ShapeModel, component: ShapeComponent) -> None:
+    view = _view(model.up_axis)
+    points = component.mean[:-BOX_ROWS]
+    common = _common(model)
+    chosen = np.flatnonzero(common)
+    pairs = [(int(chosen[a]), int(chosen[b])) for a, b in neighbour_pairs(points[chosen])]
+    for axes in row:
+        axes.set_aspect("equal")
+        axes.set_axis_off()
+    _draw_mean(row[0], model, component, view, pairs, common)
+    total = float(np.trace(component.covariance))
+    for number, axes in enumerate(row[1:]):
+        if number >= len(component.modes):
+            continue
+        mode = component.modes[number]
+        share = 100 * float((mode**2).sum()) / total if total else 0.0
+        axes.set_title(f"mode {number + 1}: {share:.0f} % of the variance", fontsize=8)
+        shapes = [(0.0, _GREY), (-_DEVIATIONS, _LESS), (_DEVIATIONS, _MORE)]
+        for deviations, color in shapes:
+            moved = (component.mean + deviations * mode) @ view
+            _draw_skeleton(axes, moved[:-BOX_ROWS], pairs, common, color)
+        ends = [(component.mean + side * mode)[:-BOX_ROWS] @ view for side in (-2.0, 2.0)]
+        for start, end in zip(*ends, strict=True):
+            axes.plot(*np.transpose([start, end]), color=_GREY, lw=0.5, alpha=0.5, zorder=1)
+
+
+def _draw_mean(
+    axes: Axes,
+    model: ShapeModel,
+    component: ShapeComponent,
+    view: FloatArray,
+    pairs: list[tuple[int, int]],
+    common: BoolArray,
+) -> None:
+    title = (
+        "mean" if len(model.components) == 1 else f"{100 * component.weight:.0f} % of the models"
+    )
+    axes.set_title(title, fontsize=8)
+    low, high = component.mean[-BOX_ROWS:]
+    seen = bounds_corners(low, high) @ view
+    for first, second in BOX_EDGES:
+        axes.plot(*seen[[first, second]].T, color=_BOX, lw=0.7, zorder=0)
+    flat = component.mean[:-BOX_ROWS] @ view
+    _draw_skeleton(axes, flat, pairs, common, "#30343b")
+    if len(flat) > _LABELLED:
+        return
+    for label, place in zip(model.ids, flat, strict=True):
+        axes.annotate(
+            str(label),
+            place,
+            xytext=(3, 3),
+            textcoords="offset points",
+            fontsize=6,
+            color="#5b616b",
+        )
+
+
+def _draw_skeleton(
+    axes: Axes, flat: FloatArray, pairs: list[tuple[int, int]], common: BoolArray, color: str
+) -> None:
+    for first, second in pairs:
+        axes.plot(*flat[[first, second]].T, color=color, lw=1.3, solid_capstyle="round", zorder=2)
+    for chosen, size in ((common, 14), (~common, 5)):
+        x, y = flat[chosen].T
+        axes.scatter(x, y, s=size, color=color, zorder=3, linewidths=0)
+
+
+def _common(model: ShapeModel) -> BoolArray:
+    """The keypoints that a good part of the training models have; all if there are none."""
+    if model.training is None:
+        return np.ones(len(model.ids), dtype=bool)
+    shares = np.isfinite(model.training.points_3d[..., 0]).mean(axis=0)
+    common = np.asarray(shares >= _COMMON)
+    return common if common.sum() > 1 else np.ones(len(model.ids), dtype=bool)
+
+
+def _view(up_axis: str | None) -> FloatArray:
+    """Projection to the picture's plane, (3, 2) float: slightly from the right and from above."""
+    right, up, towards = {
+        "x": ([0, 1, 0], [1, 0, 0], [0, 0, -1]),
+        "z": ([1, 0, 0], [0, 0, 1], [0, -1, 0]),
+    }.get(up_axis or "y", ([1, 0, 0], [0, 1, 0], [0, 0, 1]))
+    frame = np.array([right, up, towards], dtype=float).T
+    horizontal = [np.cos(_AZIMUTH), 0, -np.sin(_AZIMUTH)]
+    vertical = [
+        -np.sin(_ELEVATION) * np.sin(_AZIMUTH),
+        np.cos(_ELEVATION),
+        -np.sin(_ELEVATION) * np.cos(_AZIMUTH),
+    ]
+    return np.asarray(frame @ np.array([horizontal, vertical]).T)

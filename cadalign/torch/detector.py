@@ -131,7 +131,7 @@ class KeypointDetector:
 
 
 def _beside(_: Any, given: tuple[Tensor], made: Tensor) -> Tensor:
-    """What layers were given, and beside it what they made of it, at its resolution."""
+    """Join the input of layers with what they made of it, at its resolution."""
     size = given[0].shape[2:]
     large = torch.nn.functional.interpolate(made, size=size, mode="bilinear")
     return torch.cat([given[0], large], dim=1)

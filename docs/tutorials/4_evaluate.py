@@ -1,6 +1,6 @@
 """
-Evaluate on a data set, and as the paper
-========================================
+Evaluate on a data set, and the paper's simulation
+==================================================
 
 How accurate is it on models like yours, in views like yours, with keypoints as noisy as your
 detector's? `cadalign.evaluate` runs methods on a whole data set and returns a DataFrame.

@@ -12,8 +12,8 @@ from PIL import Image
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from cadalign.errors import DataError
-from cadalign.render.drawing.shape_picture import draw_shape, neighbour_pairs
 from cadalign.shapes.model import ShapeModel
+from cadalign.shapes.outputs import draw_shape, neighbour_pairs
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 25))

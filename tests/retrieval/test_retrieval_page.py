@@ -364,7 +364,7 @@ def test_what_is_shown_of_a_mask_alone_does_not_speak_of_keypoints(
     )
     seen.save(tmp_path / "seen.json")
     arguments = [str(tmp_path / "seen.json"), *case.arguments[1:], "--out", str(tmp_path / "out")]
-    assert main(["retrieve", *arguments, "--top", "1"]) == 0
+    assert main(["retrieve", *arguments, "--category", "chair", "--top", "1"]) == 0
     first = capsys.readouterr().out.splitlines()[2].split()
     assert first[2] == case.model_id
     assert first[-4] == "-"  # keypoints

@@ -60,7 +60,7 @@ def write_retrieval(
         "retrieval.html",
         title=escape(title),
         style=asset("retrieval.css"),
-        count=len(matches),
+        models="most likely model" if len(matches) == 1 else f"{len(matches)} most likely models",
         library=escape(library),
         evidence="keypoints" if any(match.observed for match in matches) else "mask",
         none="" if none is None else f'<p class="lead"><strong>{escape(none)}</strong></p>',
@@ -93,13 +93,14 @@ def overlay_name(rank: int) -> str:
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
     """Draw a match over its photo: box, keypoints and, where there is a mesh, the model."""
+    observed = match.points_2d if match.observed else None
     return draw_overlay(
         image,
         camera,
         est_box=match.box,
         est_frame=cast_match(match, camera),  # without a mesh, keypoints and box are drawn
-        observed=match.points_2d,
-        reprojected=match.points_2d + match.residuals,
+        observed=observed,
+        reprojected=None if observed is None else observed + match.residuals,
     )
 
 

@@ -369,6 +369,7 @@ def test_what_is_shown_of_a_mask_alone_does_not_speak_of_keypoints(
     assert first[2] == case.model_id
     assert first[-4] == "-"  # keypoints
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "The most likely model of " in page
     assert "to explain the mask." in page
     assert "residuals of the contour" in page
     assert "keypoints" not in page

@@ -63,8 +63,12 @@ print("rotation per millimetre [deg]:", np.degrees(by_model).round(3))
 # derivatives; each keypoint has its share of it.
 
 shares = (sensitivity.by_points_2d[:3] ** 2).sum(axis=(0, 2))
-for keypoint, share in enumerate(shares / shares.sum()):
-    print(f"keypoint {keypoint}: {share:4.0%} of the rotation's variance")
+shares /= shares.sum()
+axes = result.plot()
+axes.scatter(*photo.T, s=10_000 * shares, color="tab:orange", alpha=0.4)
+for place, share in zip(photo, shares, strict=True):
+    axes.annotate(f"{share:.0%}", place, xytext=(8, -12), textcoords="offset points")
+axes.set_title("Shares of the rotation's variance")
 
 # %%
 # In a training loop, `cadalign.torch.fit` has the same derivatives as gradients of tensors: see

@@ -49,6 +49,7 @@ __all__ = [
     "checked",
     "expanded",
     "reprojection_loss",
+    "require_same_count",
     "rotation_loss",
     "torch",
 ]
@@ -250,7 +251,7 @@ def rotation_loss(
     >>> abs(round(rotation_loss(found, truth, symmetry=quarter).item(), 6))
     0.0
     """
-    _require_same_count(found, truth)
+    require_same_count(found, truth)
     if symmetry is None:
         symmetry = Symmetry.none()
     require_kind(symmetry, Symmetry, "symmetry")
@@ -308,7 +309,7 @@ def reprojection_loss(
     >>> reprojection_loss(found, truth, points, camera).tolist()
     [9.5]
     """
-    _require_same_count(found, truth)
+    require_same_count(found, truth)
     own, true = _points(found, points_3d), _points(truth, points_3d)
 
     def distances(points: Tensor) -> Tensor:
@@ -352,7 +353,7 @@ def box_loss(
     >>> round(box_loss(found, truth, bounds).item(), 3)
     0.1
     """
-    _require_same_count(found, truth)
+    require_same_count(found, truth)
     if bounds.shape[-2:] != (2, 3):
         what = f"shape {tuple(bounds.shape)}, expected (2, 3) or (B, 2, 3)"
         raise InputError(what, where="bounds")
@@ -365,7 +366,8 @@ def box_loss(
     return _of_valid(least / extents.norm(dim=-1), found)
 
 
-def _require_same_count(found: PoseBatch, truth: PoseBatch) -> None:
+def require_same_count(found: PoseBatch, truth: PoseBatch) -> None:
+    """Raise an InputError where there are neither as many truths as estimates nor one."""
     count, true = len(found.rotation), len(truth.rotation)
     if true not in (1, count):
         what = f"{true} alignments, but {count} are compared with it"

@@ -21,7 +21,14 @@ from cadalign.arrays import is_whole
 from cadalign.errors import InputError, quote
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
-from cadalign.torch.poses import PoseBatch, calibrations, checked, expanded, torch
+from cadalign.torch.poses import (
+    PoseBatch,
+    calibrations,
+    checked,
+    expanded,
+    require_same_count,
+    torch,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -77,7 +84,7 @@ def posterior_loss(
     ------
     InputError
         If ``found`` has no covariance, as poses of `cadalign.torch.align` have none, or focal
-        lengths of its own, or an option is wrong.
+        lengths of its own, there are neither as many truths nor one, or an option is wrong.
 
     Examples
     --------
@@ -103,6 +110,7 @@ def posterior_loss(
     for name, count in (("samples", samples), ("rounds", rounds)):
         if not is_whole(count) or count < 1:
             raise InputError(f"{quote(count)} is not a whole number from 1", where=name)
+    require_same_count(found, truth)
     options = FitOptions(loss=loss, loss_scale=loss_scale, stretch_sigma=stretch_sigma)
     sigmas, present, _ = checked(points_2d, camera, sigma, mask)
     points = expanded(points_3d, (*points_2d.shape[:2], 3), "points_3d")

@@ -77,10 +77,13 @@ def test_one_truth_is_that_of_all_and_other_numbers_are_refused() -> None:
     one = PoseBatch(truth.rotation[:1], truth.translation[:1], truth.scale[:1])
     for loss in losses(found, one, None):
         assert loss.shape == (4,)
+    pixels = found.project(CORNERS, CAMERA)
+    seen = fit(CORNERS, pixels, CAMERA)
     for call in (
         lambda: rotation_loss(found, truth),
         lambda: reprojection_loss(found, truth, CORNERS, CAMERA),
         lambda: box_loss(found, truth, BOUNDS),
+        lambda: posterior_loss(seen, truth, CORNERS, pixels, CAMERA),
     ):
         with pytest.raises(InputError, match="truth: 3 alignments, but 4 are compared with it"):
             call()

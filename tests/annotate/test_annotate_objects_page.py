@@ -112,6 +112,7 @@ def test_objects_and_photos_by_keyboard_alone(page: Page, session: Session, case
     dialog.get_by_label("Name of the new object").focus()
     page.keyboard.type("lamp")
     press(page, "Enter")
+    expect(dialog).to_be_hidden()  # it is closed two frames later, and takes all keys until then
     assert shown(page) == (0, 1)
     press(page, "e")
     wait(page, IDLE + " && annotator.state.image.object === 0")
@@ -125,6 +126,7 @@ def test_objects_and_photos_by_keyboard_alone(page: Page, session: Session, case
     dialog.get_by_label("Photo to add").focus()
     press(page, "Tab")
     press(page, "Enter")
+    expect(dialog).to_be_hidden()
     wait(page, IDLE + " && annotator.state.image.number === 1")
     assert page.url.endswith("#2.2")
     for keypoint, uv in case.clicks[:5]:

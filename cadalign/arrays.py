@@ -105,6 +105,13 @@ def is_whole(value: Any) -> bool:
     return is_number(value) and isinstance(value, int | np.integer)
 
 
+def require_counts(**given: Any) -> None:
+    """Raise an InputError for a named value that is no whole number from 1."""
+    for name, value in given.items():
+        if not is_whole(value) or value < 1:
+            raise InputError(f"{value!r} is not a whole number >= 1", where=name)
+
+
 def as_positive(value: Any, *, name: str) -> float:
     """Convert a positive number of any type to a float: kernels take no other.
 

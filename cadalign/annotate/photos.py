@@ -260,7 +260,8 @@ class WorkList:
         """Names of a photo in the list, and in those of earlier versions."""
         folder = self.path.parent
         own = written_path(photo.absolute(), folder=folder.absolute())
-        is_earlier = not (folder / photo.name).exists()  # or the name is that photo's
+        # The name is that of a photo in the folder if there is one.
+        is_earlier = own != photo.name and not (folder / photo.name).exists()
         return (own, photo.name) if is_earlier else (own,)
 
 

@@ -34,13 +34,15 @@ _LEAST_TO_TURN = 5  # keypoints; the turn of fewer may be their own
 _TURNED_RATIO = 0.4  # of distances from the others' keypoints, turned over as it is
 _ALIKE = 0.1  # such a distance as it is, over the radius, of models that need no turn
 # All ways to exchange and reverse three axes, (48, 3, 3), the identity first.
-_AXES = sorted(
-    (
-        np.eye(3)[list(rows)] * signs
-        for rows in permutations(range(3))
-        for signs in product((1, -1), repeat=3)
-    ),
-    key=lambda turn: -float(np.trace(turn)),
+_AXES = np.array(
+    sorted(
+        (
+            np.eye(3)[list(rows)] * signs
+            for rows in permutations(range(3))
+            for signs in product((1, -1), repeat=3)
+        ),
+        key=lambda turn: -float(np.trace(turn)),
+    )
 )
 _FARTHEST = 0.1  # gap between all keypoints and the box, over its diagonal: thin parts, rounding
 
@@ -237,8 +239,8 @@ def _warn_of_axes(examples: Sequence[Example], rows: FloatArray) -> None:
     place[is_seen.any(axis=0)] = np.nanmedian(normal[:, is_seen.any(axis=0)], axis=0)
     turned: dict[int, FloatArray] = {}
     for row, points, has in zip(some, normal, is_seen, strict=True):
-        own, others = _unit(points[has]), _unit(place[has])
-        distances = np.sqrt(((own @ np.array(_AXES) - others) ** 2).sum(axis=2).mean(axis=1))
+        own, others = points[has], _unit(place[has])
+        distances = np.sqrt(((own @ _AXES - others) ** 2).sum(axis=2).mean(axis=1))
         best = int(distances.argmin())
         if distances[0] > _ALIKE and distances[best] < _TURNED_RATIO * distances[0]:
             turned[int(row)] = _AXES[best].T

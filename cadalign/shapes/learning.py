@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray, is_whole
+from cadalign.arrays import BoolArray, FloatArray, IntArray, require_counts
 from cadalign.errors import InputError
 from cadalign.shapes.basis import component_of_covariance, find_reflection, mirrored_rows
 from cadalign.shapes.calibration import ShapeCalibration, calibrate, excesses_of, learn_margins
@@ -239,9 +239,8 @@ def learn_parts(
     reflection: bool,
 ) -> dict[str, Any]:
     """Learn the fields of a `cadalign.ShapeModel`, but for its names; see `ShapeModel.learn`."""
-    for name, count in (("components", components), ("modes", modes)):
-        if count is not None and (not is_whole(count) or count < 1):
-            raise InputError(f"{count!r} is not a whole number >= 1", where=name)
+    wanted = {"components": components, "modes": modes}
+    require_counts(**{name: count for name, count in wanted.items() if count is not None})
     ids, rows, training = tabulated(examples)
     if (components or 1) > len(rows):
         what = f"{components} are more than the {len(rows)} models"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.arrays import BoolArray, FloatArray, instance_rng, is_whole
+from cadalign.arrays import BoolArray, FloatArray, instance_rng, require_counts
 from cadalign.datasets.sample.model import SampleModel
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
@@ -66,7 +66,7 @@ class KeypointDetector:
 
         Raises InputError if a number is below 1 or ``width`` not a multiple of 8.
         """
-        _require_counts(keypoints=keypoints, width=width)
+        require_counts(keypoints=keypoints, width=width)
         if width % _GROUPS:
             raise InputError(f"{width} is not a multiple of {_GROUPS}", where="width")
         nn = torch.nn
@@ -187,7 +187,7 @@ def train(
     InputError
         If a number of steps or views is below 1.
     """
-    _require_counts(steps=steps, batch=batch)
+    require_counts(steps=steps, batch=batch)
     detector.network.train()
     optimizer = torch.optim.AdamW(detector.network.parameters(), lr=rate, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
@@ -293,7 +293,7 @@ def render_views(
     InputError
         If there is no model, a model lacks a keypoint, or a number is below 1.
     """
-    _require_counts(count=count, size=size)
+    require_counts(count=count, size=size)
     if not models:
         raise InputError("there is none", where="models", fix="give at least one")
     camera = Camera.from_fov(size, size, fov_x=40.0)
@@ -322,12 +322,6 @@ def render_views(
         )
     columns: list[Any] = [np.array(each) for each in zip(*rows, strict=True)]
     return RenderedViews(*[*columns, camera, tuple(ids)])
-
-
-def _require_counts(**given: int) -> None:
-    for name, value in given.items():
-        if not is_whole(value) or value < 1:
-            raise InputError(f"{value!r} is not a whole number >= 1", where=name)
 
 
 def _points(model: SampleModel, ids: Sequence[int]) -> FloatArray:

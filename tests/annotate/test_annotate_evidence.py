@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, flat, place, place_all
+from support.annotating import Case, fitted, flat, place, place_all
 
 from cadalign import Size, Symmetry, View, align
 from cadalign.annotate.actions import perform
 from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.problem import LIKELY_STRETCH
-from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import ImageEvidence
@@ -106,20 +105,7 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
     live, _ = session.live(state)
     assert isinstance(live, LiveAlignment)
     assert live.result is not None
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    command = json.loads(capsys.readouterr().out)
+    command = fitted(case, capsys)
     page = live.result.to_dict()
     for name in ("alignment", "covariance", "std", "stretch", "points_3d"):
         np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, flat, place_all
+from support.annotating import Case, fitted, flat, place_all
 from support.refusals import refusal_text
 
 from cadalign import Camera
@@ -22,7 +22,6 @@ from cadalign.annotate.evidence import (
 )
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.cli import main
 from cadalign.errors import CadalignError
 from cadalign.io.images import read_grey, write_image
 from cadalign.render import cast_geometry
@@ -60,20 +59,7 @@ def agree_with_fit(
     """The page's alignment, which `cadalign fit` must find in the saved file."""
     live, _ = session.live(session.photos[0])
     assert live.result is not None, live.message
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    command, page = json.loads(capsys.readouterr().out), live.result.to_dict()
+    command, page = fitted(case, capsys), live.result.to_dict()
     for name in ("alignment", "covariance", "std", "stretch"):
         np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
     return dict(page_state(session, 0)["alignment"])

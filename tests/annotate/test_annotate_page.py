@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, expect
-from support.annotating import IDLE, Case, place_all, place_of_pixel, place_twenty, served, wait
+from support.annotating import (
+    IDLE,
+    Case,
+    fitted,
+    place_all,
+    place_of_pixel,
+    place_twenty,
+    served,
+    wait,
+)
 from support.timing import Yardstick, reference_seconds
 
 from cadalign import ShapeModel
@@ -22,7 +31,6 @@ from cadalign.annotate.guard import Access
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.ranking import advice_state
 from cadalign.annotate.session import Session
-from cadalign.cli import main
 from cadalign.datasets import ModelKeypoints
 from cadalign.shapes.examples import Example
 
@@ -186,20 +194,7 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
     # It is saved, and the file gives the alignment that the page shows.
     saved = re.compile("^Saved to photo.json at ")
     expect(page.locator("[role=status]")).to_have_text(saved, use_inner_text=True)
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    data = json.loads(capsys.readouterr().out)
+    data = fitted(case, capsys)
     assert data["alignment"] == undone["alignment"]["alignment"]
 
 

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.annotating import Case, flat, masks_searched_once, place_all
+from support.annotating import Case, fitted, flat, masks_searched_once, place_all
 
 from cadalign import ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.evidence import encode_runs
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
-from cadalign.cli import main
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
 from cadalign.metrics import rotation_error
@@ -41,20 +40,7 @@ def draw_true_mask(session: Session, case: Case) -> None:
 def agree_with_fit(session: Session, case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     live, _ = session.live(session.photos[0])
     assert live.result is not None, live.message
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    command, page = json.loads(capsys.readouterr().out), live.result.to_dict()
+    command, page = fitted(case, capsys), live.result.to_dict()
     for name in ("alignment", "covariance"):
         np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-6, atol=1e-9)
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
-from support.annotating import Case, fitted, place_all
+from support.annotating import Case, fitted, flat, place_all
 
 from cadalign import Result
 from cadalign.annotate.actions import perform
 from cadalign.annotate.page_state import page_state
-from cadalign.cli import main
 from cadalign.io.observation import Observation
 
 pytestmark = pytest.mark.long
@@ -63,20 +61,7 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     assert page is not None
     assert (live.sigma > 1) == (noise > 1)
 
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    command = json.loads(capsys.readouterr().out)
+    command = fitted(case, capsys)
     saved = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
     assert page.std is not None
     np.testing.assert_allclose(flat(command["std"]), flat(asdict(page.std)), rtol=1e-9)
@@ -90,15 +75,6 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     shown = page_state(session, 0)["alignment"]
     assert flat(shown["alignment"]) == flat(page.alignment.to_dict())
     assert shown["rms"] == page.rms
-
-
-def flat(value: Any) -> list[float]:
-    """All numbers of nested lists and objects."""
-    if isinstance(value, dict):
-        return flat(list(value.values()))
-    if isinstance(value, list | tuple):
-        return [number for item in value for number in flat(item)]
-    return [] if isinstance(value, str) else [value]
 
 
 def test_stored_options_that_the_page_does_not_use_are_named(
@@ -145,20 +121,7 @@ def test_a_stored_sigma_counts_and_is_kept(
     live, _ = session.live(session.photos[0])
     assert live.result is not None
     assert live.sigma == 3.0
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    command = Result.from_json(capsys.readouterr().out)
+    command = Result.from_dict(fitted(case, capsys))
     np.testing.assert_allclose(command.covariance, live.result.covariance, rtol=1e-9, atol=1e-15)
 
 

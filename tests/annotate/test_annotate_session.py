@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from support.annotating import Case, place, place_all, place_twenty
+from support.annotating import Case, fitted, place, place_all, place_twenty
 from support.refusals import refusal_text
 
 from cadalign import Camera, Result, fit
@@ -55,20 +55,7 @@ def test_file_gives_the_same_alignment_as_the_page(
     case: Case, capsys: pytest.CaptureFixture[str]
 ) -> None:
     state = place_all(case.open(), case)
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    data = json.loads(capsys.readouterr().out)
+    data = fitted(case, capsys)
     assert data["alignment"] == state["alignment"]["alignment"]
     written = Result.from_json((case.folder / "photo_fit" / "fit.json").read_text())
     assert written.alignment.to_dict() == state["alignment"]["alignment"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.annotating import Case, place, place_all
+from support.annotating import Case, fitted, flat, place, place_all
 
 from cadalign import CadalignError, Result, ShapeModel
 from cadalign.annotate.actions import perform
@@ -46,15 +46,6 @@ def shape_file(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     path = tmp_path_factory.mktemp("shapes") / "chair.shape"
     learn(points, ids).save(path)
     return path
-
-
-def numbers(value: Any) -> list[float]:
-    """All numbers of nested lists and objects."""
-    if isinstance(value, dict):
-        return numbers(list(value.values()))
-    if isinstance(value, list | tuple):
-        return [number for item in value for number in numbers(item)]
-    return [] if isinstance(value, str) else [value]
 
 
 def live_shape(session: Session) -> LiveAlignment:
@@ -93,35 +84,22 @@ def test_fit_of_the_observation_gives_the_pages_numbers(
     perform(session, 0, {"do": "move", "pair": 2, "uv": instance.points_2d[1].tolist()})
     page = live_shape(session).result
     assert page is not None
-    assert (
-        main(
-            [
-                "fit",
-                str(case.observation),
-                "--json",
-                "--no-picture",
-                "--out",
-                str(case.folder / "x"),
-            ]
-        )
-        == 0
-    )
-    command = Result.from_dict(json.loads(capsys.readouterr().out))
+    command = Result.from_dict(fitted(case, capsys))
     saved = Result.from_dict(json.loads((case.folder / "photo_fit/fit.json").read_text()))
-    for fitted in (command, saved):
-        np.testing.assert_allclose(fitted.covariance, page.covariance, rtol=1e-9, atol=1e-15)
-        ours, theirs = numbers(page.alignment.to_dict()), numbers(fitted.alignment.to_dict())
+    for read in (command, saved):
+        np.testing.assert_allclose(read.covariance, page.covariance, rtol=1e-9, atol=1e-15)
+        ours, theirs = flat(page.alignment.to_dict()), flat(read.alignment.to_dict())
         np.testing.assert_allclose(theirs, ours, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(fitted.bounds, page.bounds, atol=1e-9)
-        np.testing.assert_allclose(fitted.stretch, page.stretch, rtol=1e-9)
-        assert fitted.warnings == page.warnings
-        rows = [page.ids.index(label) for label in fitted.ids]
-        np.testing.assert_allclose(fitted.points_3d, page.points_3d[rows], atol=1e-9)
+        np.testing.assert_allclose(read.bounds, page.bounds, atol=1e-9)
+        np.testing.assert_allclose(read.stretch, page.stretch, rtol=1e-9)
+        assert read.warnings == page.warnings
+        rows = [page.ids.index(label) for label in read.ids]
+        np.testing.assert_allclose(read.points_3d, page.points_3d[rows], atol=1e-9)
         np.testing.assert_allclose(
-            fitted.points_cam_covariance, page.points_cam_covariance[rows], rtol=1e-9, atol=1e-15
+            read.points_cam_covariance, page.points_cam_covariance[rows], rtol=1e-9, atol=1e-15
         )
     shown = page_state(session, 0)["alignment"]
-    assert numbers(shown["alignment"]) == numbers(page.alignment.to_dict())
+    assert flat(shown["alignment"]) == flat(page.alignment.to_dict())
     assert shown["rms"] == page.rms
 
 

@@ -271,4 +271,4 @@ def flat(value: Any) -> list[float]:
         return flat(list(value.values()))
     if isinstance(value, list | tuple):
         return [number for item in value for number in flat(item)]
-    return [value]
+    return [] if isinstance(value, str) else [value]

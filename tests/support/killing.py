@@ -22,7 +22,7 @@ from cadalign.errors import CadalignError
 from support.annotating import Case
 from support.forked import MAIN, Program
 
-_LATEST = 1.2  # after the first action that an annotator is killed [s]
+_LATEST = 2.5  # after the first action that an annotator is killed [s]
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from cadalign.estimation.model import Model
     from cadalign.estimation.observed import views_from
     from cadalign.estimation.options import RansacOptions
-    from cadalign.estimation.result import AlignResult, FitResult, Result
-    from cadalign.estimation.results import BatchResult, Results, to_dataframe
+    from cadalign.estimation.result import Result
+    from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.scene import AlignedScene, align_scene
     from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.tracks.motion import Motion, Trajectory
@@ -40,10 +40,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "AlignResult",
     "AlignedScene",
     "Alignment",
-    "BatchResult",
     "Box",
     "CadalignError",
     "Camera",
@@ -51,7 +49,6 @@ __all__ = [
     "DetectorNoise",
     "EvidenceSummary",
     "Example",
-    "FitResult",
     "FocalPrior",
     "Library",
     "Match",

@@ -17,7 +17,6 @@ from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.layers import BatchMinima, FitTask, FitValues, fits_of
 from cadalign.estimation.options import FitOptions
 from cadalign.geometry.camera import Camera
-from cadalign.names import renamed
 from cadalign.torch.poses import cameras_of
 
 if TYPE_CHECKING:
@@ -55,7 +54,6 @@ class FitArrays(NamedTuple):
     valid: Array
 
 
-@renamed(scale_prior_sigma="stretch_sigma")
 def fit(
     points_3d: ArrayLike,
     points_2d: ArrayLike,

@@ -1,24 +1,18 @@
-"""Public names: imported when they are first asked for (PEP 562), and earlier ones that go on."""
+"""Public names: imported when they are first asked for (PEP 562)."""
 
 from __future__ import annotations
 
-import functools
 import re
 import sys
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, TypeVar
-
-from cadalign.errors import InputError
+from typing import Any
 
 # An import in the block `if TYPE_CHECKING:` at the top of a package, as the formatter writes it.
 _IMPORT = re.compile(r"^    from (cadalign[\w.]*) import (?:\(([^)]*)\)|(.*))", re.M)
 _NAME = re.compile(r"(\w+)(?: as (\w+))?")
-
-Renamed = TypeVar("Renamed", bound=Callable[..., Any])
 
 
 def lazy_names(package: str) -> Callable[[str], Any]:
@@ -57,65 +51,3 @@ def lazy_names(package: str) -> Callable[[str], Any]:
         return value
 
     return load
-
-
-def renamed(**earlier: str) -> Callable[[Renamed], Renamed]:
-    """Accept earlier names of a function's keywords, or of a class's keywords and attributes.
-
-    Each use of one raises a `DeprecationWarning` that names the present one.
-
-    Parameters
-    ----------
-    **earlier : str
-        The present name of each earlier one.
-
-    Raises
-    ------
-    InputError
-        By a call that gives both.
-
-    Examples
-    --------
-    >>> @renamed(confidences="scores")
-    ... def best(*, scores: list[float]) -> float:
-    ...     return max(scores)
-    >>> best(scores=[0.2, 0.9])
-    0.9
-    """
-
-    def accepting(target: Renamed) -> Renamed:
-        if not isinstance(target, type):
-            return _accepting(target, target.__name__, earlier)
-        target.__init__ = _accepting(target.__init__, target.__name__, earlier)  # type: ignore[misc]
-        for name, present in earlier.items():
-            setattr(target, name, _earlier_attribute(name, present))
-        return target
-
-    return accepting
-
-
-def _accepting(function: Renamed, caller: str, earlier: Mapping[str, str]) -> Renamed:
-    @functools.wraps(function)
-    def accepting(*args: Any, **given: Any) -> Any:
-        for name in earlier.keys() & given.keys():
-            present = earlier[name]
-            if present in given:
-                raise InputError(f"given beside {present}, its present name", where=name)
-            _note(f"{caller}({name}=)", f"{present}=")
-            given[present] = given.pop(name)
-        return function(*args, **given)
-
-    return accepting  # type: ignore[return-value]
-
-
-def _earlier_attribute(name: str, present: str) -> property:
-    def attribute(owner: object) -> Any:
-        _note(f"{type(owner).__name__}.{name}", present)
-        return getattr(owner, present)
-
-    return property(attribute, doc=f"The earlier name of ``{present}``.")
-
-
-def _note(name: str, present: str) -> None:
-    what = f"{name} is now called {present}; the earlier name goes with the next version"
-    warnings.warn(what, DeprecationWarning, stacklevel=3)

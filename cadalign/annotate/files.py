@@ -66,7 +66,6 @@ class _Half(SeenKeypoint, kw_only=True):
     uv: Point2 | None = None
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         if self.uv is None and self.semantic_id is None:
             raise InputError("uv and semantic_id are both missing", fix="give one of them")
 

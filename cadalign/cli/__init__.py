@@ -31,10 +31,6 @@ from cadalign.errors import CadalignError
 from cadalign.io.files import keeping
 
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
-_EARLIER_FLAGS = {
-    "--scale-prior-sigma": "--stretch-sigma",
-    "--no-scale-prior": "--no-stretch-prior",
-}
 
 
 def plain_help() -> ConstructorRegistry:
@@ -145,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0 on success, 1 if the input was refused; a wrong command line exits with 2. Runs (evaluate,
         simulate) exit with 3 if they finished with some failed rows.
     """
-    given = [_present(word) for word in (sys.argv[1:] if arguments is None else arguments)]
+    given = list(sys.argv[1:] if arguments is None else arguments)
     if given == ["--version"]:
         sys.stdout.write(f"cadalign {__version__}\n")
         return 0
@@ -166,16 +162,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except BrokenPipeError:  # the reader of the output has closed it
         return 0
-
-
-def _present(word: str) -> str:
-    """A word of the command line with the present name of a flag that was renamed."""
-    flag, equals, value = word.partition("=")
-    if flag not in _EARLIER_FLAGS:
-        return word
-    present = _EARLIER_FLAGS[flag]
-    sys.stderr.write(f"cadalign: {flag} is now called {present}\n")
-    return f"{present}{equals}{value}"
 
 
 def class_of(name: str) -> Any:

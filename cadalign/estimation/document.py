@@ -34,7 +34,7 @@ from cadalign.io.documents import (
 if TYPE_CHECKING:
     from cadalign.estimation.tracks.motion import Trajectory
 
-VERSION = 2
+VERSION = 1
 Matrix = list[list[Finite]]
 Kind = TypeVar("Kind", bound=ResultData)
 Read = TypeVar("Read")
@@ -74,7 +74,6 @@ class _Options(ForeignDocument):
     focal: str
     focal_prior: FocalPrior | Literal["usual"] | None
     stretch_sigma: Positive | None = None
-    scale_prior_sigma: Positive | None = None  # its earlier name
     principal_sigma: Positive | None = None  # older files lack it
 
 
@@ -92,7 +91,7 @@ def _check_lengths(
 class _View(ForeignDocument):
     camera: Any
     alignment: Any
-    ids: list[int | str] | None  # older files lack them
+    ids: list[int | str] | None
     points_2d: list[tuple[Finite, Finite] | None]
     residuals: list[tuple[float, float] | None]
     inliers: list[bool]
@@ -173,7 +172,7 @@ class _Trajectory(ForeignDocument):
 class _Result(ForeignDocument):
     """The fields of `cadalign.Result`; ``rms``, ``std`` and ``box`` follow from them."""
 
-    version: Literal[2]
+    version: Literal[1]
     method: str
     ids: list[int | str]
     points_3d: list[Point3]
@@ -201,8 +200,8 @@ class _Result(ForeignDocument):
     symmetry: Any = None  # in the form of `Symmetry.from_dict`
     equal_under_symmetry: str = ""
     rig_from_model: Any = None
-    mask_residuals: tuple[_Mask | None, ...] = ()  # older files lack them
-    trajectory: _Trajectory | None = None  # likewise
+    mask_residuals: tuple[_Mask | None, ...] = ()
+    trajectory: _Trajectory | None = None
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -318,11 +317,6 @@ def read_result(data: Mapping[str, Any], kind: type[Kind]) -> Kind:
     """
     try:
         with np.errstate(over="ignore", invalid="ignore"):
-            if isinstance(data, Mapping) and "version" not in data:
-                from cadalign.estimation.older_document import completed, upgraded
-
-                form = {"version": VERSION, **upgraded(data)}
-                return completed(_result(convert(form, _Result), kind))
             return _result(convert(data, _Result), kind)
     except CadalignError as error:
         place = f"result: {error.where}" if error.where else "result"
@@ -439,9 +433,7 @@ def _options(read: _Options, count: int) -> FitOptions:
             sigma = float(as_floats(sigma, name="sigma", shape=()))
         if sigma is not None:
             pixel_information(sigma, count)  # checks it
-        given = {**msgspec.structs.asdict(read), "sigma": sigma}
-        earlier = given.pop("scale_prior_sigma")
-        return FitOptions(**given | ({} if earlier is None else {"stretch_sigma": earlier}))
+        return FitOptions(**{**msgspec.structs.asdict(read), "sigma": sigma})
 
 
 def _alternative(entry: _Alternative) -> Alternative:

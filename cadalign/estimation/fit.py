@@ -21,13 +21,11 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.solve import solve, solve_one
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.names import renamed
 
 if TYPE_CHECKING:
     from cadalign.estimation.results import Results
 
 
-@renamed(confidences="scores", scale_prior_sigma="stretch_sigma")
 @np.errstate(all="ignore")  # what is not finite is refused
 def fit(
     points_3d: npt.ArrayLike,
@@ -151,7 +149,6 @@ def fit(
     return _fit_one(problems, options, ransac, scores, symmetry, start)
 
 
-@renamed(confidences="scores", scale_prior_sigma="stretch_sigma")
 @np.errstate(all="ignore")
 def fit_batch(
     points_3d: Sequence[npt.ArrayLike] | FloatArray,

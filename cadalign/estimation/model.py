@@ -16,10 +16,8 @@ from cadalign.estimation.symmetry import check_symmetry
 from cadalign.geometry.box import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.symmetry import Symmetry
-from cadalign.names import renamed
 
 
-@renamed(scale_prior_sigma="stretch_sigma")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model:
     """One CAD model: its keypoints, and how far the object may differ from it.
@@ -33,7 +31,7 @@ class Model:
     bounds : (2, 3) float, optional
         Least and greatest coordinates of the model; by default the mesh's, else the keypoints'.
     mesh : Mesh, optional
-        The model's surface, for `AlignResult.mesh`.
+        The model's surface, for `Result.mesh`.
     shape_sigma : float, optional
         Standard deviation of the keypoints' positions about the model's, along each axis, before
         the stretch [model units]: for an object that is only similar. None for the exact,

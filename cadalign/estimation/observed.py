@@ -175,7 +175,7 @@ def views_from(
 ) -> list[View]:
     """Views with the cameras and the known poses of a reconstruction's photos.
 
-    The reconstruction's frame and unit are those of the result: `AlignResult.rig_from_model` is the
+    The reconstruction's frame and unit are those of the result: `Result.rig_from_model` is the
     alignment in its world.
 
     Parameters

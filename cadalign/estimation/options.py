@@ -17,7 +17,6 @@ from cadalign.arrays import FloatArray, IntArray, as_floats, as_positive, is_num
 from cadalign.errors import InputError, quote
 from cadalign.estimation.focal import USUAL, PriorOption, check_prior, prior_of_camera
 from cadalign.geometry.camera import Camera
-from cadalign.names import renamed
 from cadalign.solvers.constants import AEPNP, AP4P, CAUCHY, HUBER, LINEAR, UNKNOWNS, ScalePrior
 
 METHODS = ("optimal", "aepnp", "aepnp-paper", "epnp")
@@ -61,7 +60,6 @@ class AlignmentOptions:
     "none"."""
 
 
-@renamed(scale_prior_sigma="stretch_sigma")
 @dataclass(frozen=True)
 class FitOptions(AlignmentOptions):
     """Options of a fit.

@@ -199,7 +199,7 @@ def object_of(
         raise InputError(what, where="images", fix="give one or None for each")
     views = []
     for view, photo in zip(result.views, photos, strict=True):
-        # Without keypoints behind the camera, and those whose ids an older file lacks.
+        # Without keypoints behind the camera, and those without ids.
         ahead = np.flatnonzero(np.isfinite(view.residuals).all(axis=1))[: len(view.ids)]
         ids = tuple(view.ids[row] for row in ahead.tolist())
         views.append(ExportView(view.camera, view.alignment, photo, view.points_2d[ahead], ids))
@@ -213,7 +213,3 @@ def object_of(
         name,
         metres,
     )
-
-
-object_of_fit = object_of_align = object_of
-"""Names of earlier versions."""

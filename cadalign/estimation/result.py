@@ -242,7 +242,7 @@ class Result(ResultData):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Result:
-        """Read what `to_dict` wrote, in this version or in 0.1.0.
+        """Read what `to_dict` wrote.
 
         Raises
         ------
@@ -272,10 +272,6 @@ class Result(ResultData):
             what = f"not valid JSON: {str(error)[:200]}"
             raise InputError(what, where="result") from None
         return cls.from_dict(data)
-
-
-FitResult = AlignResult = Result
-"""Names of earlier versions."""
 
 
 def _text_of(result: ResultData) -> str:

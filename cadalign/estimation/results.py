@@ -285,10 +285,6 @@ class Results(Sequence[Result | CadalignError]):
         )
 
 
-BatchResult = Results
-"""Name of earlier versions."""
-
-
 def results_of_solutions(
     problems: Problems,
     solutions: Solutions,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 TABLE = "results.parquet"
-_RECORDS = ("exhibits.parquet", "records.parquet")  # of earlier versions, and of this one
+_RECORDS = "records.parquet"
 _FIX = "give a folder that `cadalign fit` or `cadalign.fit_many` has written"
 
 
@@ -40,8 +40,7 @@ class StoredResults:
         """The results in a run's folder; the whole table for a folder that goes away."""
         import pyarrow.parquet as pq
 
-        earlier, path = (folder / name for name in _RECORDS)
-        path = earlier if earlier.exists() else path
+        path = folder / _RECORDS
         with _reading(path):
             if in_memory:
                 return cls(path, [0], 0, pq.read_table(path, use_threads=False))

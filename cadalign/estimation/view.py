@@ -30,7 +30,6 @@ from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import DeclaredEvidence
 from cadalign.io.images import ByteImage, read_grey, read_mask, read_photo
-from cadalign.names import renamed
 
 if TYPE_CHECKING:
     from cadalign.estimation.detector_noise import DetectorNoise
@@ -44,7 +43,6 @@ class _Numbers(tuple[int, ...]):
     """Ids of keypoints that none are given for: so they are known in changed copies of a view."""
 
 
-@renamed(confidences="scores")
 @dataclass(frozen=True, eq=False)
 class View(DeclaredEvidence):
     """Evidence of one image about an object.

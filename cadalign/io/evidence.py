@@ -23,7 +23,6 @@ from cadalign.errors import InputError, require_kind
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import Finite, PathText, Point3, Positive
 from cadalign.io.files import as_path
-from cadalign.names import renamed
 
 _Row4 = tuple[Finite, Finite, Finite, Finite]
 _AXIS = tuple[float, float, float]
@@ -289,7 +288,6 @@ class Size:
         return np.asarray(self.lengths * self.relative)
 
 
-@renamed(semantic_ids="ids", confidences="scores")
 @dataclass(frozen=True, eq=False)
 class ObservedImage:
     """Keypoints of the object in one image, and further evidence of the image.

@@ -29,7 +29,6 @@ from cadalign.io.observation_file import (
     read_size,
     write_image_fields,
 )
-from cadalign.names import renamed
 
 LINES = (".jsonl", ".ndjson")
 """Endings of files with an observation in every line."""
@@ -40,7 +39,6 @@ _MESHES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".off")
 _PHOTOS = (".bmp", ".gif", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 
 
-@renamed(semantic_ids="ids", confidences="scores")
 @dataclass(frozen=True, eq=False)
 class Observation(ObservedImage):
     """An object in one image, or in several: this is the first one.

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType
 
 from cadalign.arrays import FloatArray
-from cadalign.errors import DataError, InputError
+from cadalign.errors import DataError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of
@@ -51,14 +51,7 @@ class SeenKeypoint(Document, kw_only=True):
     semantic_id: Index | None = None
     sigma: Positive | None = None
     score: NotNegative | None = None
-    confidence: NotNegative | None = None  # the earlier name of the score
     depth: Positive | None = None
-
-    def __post_init__(self) -> None:
-        if self.confidence is not None and self.score is not None:
-            raise InputError("given beside score, its present name", where="confidence")
-        if self.confidence is not None:
-            self.score = self.confidence
 
 
 class KeypointFields(SeenKeypoint, kw_only=True):
@@ -86,21 +79,12 @@ class FitFields(Document):
     loss_scale: Positive | UnsetType = UNSET
     stretch: Text | UnsetType | None = UNSET
     stretch_sigma: Positive | UnsetType | None = UNSET
-    scale_prior_sigma: Positive | UnsetType | None = UNSET  # the earlier name
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
     focal_prior: FocalPriorFields | Literal["usual"] | UnsetType | None = UNSET
     principal_sigma: Positive | UnsetType | None = UNSET
     shape_sigma: Positive | UnsetType = UNSET
     image: bool | UnsetType = UNSET
-
-    def __post_init__(self) -> None:
-        if self.scale_prior_sigma is UNSET:
-            return
-        if self.stretch_sigma is not UNSET:
-            what = "given beside stretch_sigma, its present name"
-            raise InputError(what, where="scale_prior_sigma")
-        self.stretch_sigma, self.scale_prior_sigma = self.scale_prior_sigma, UNSET
 
 
 class SizeFields(Document):

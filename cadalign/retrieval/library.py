@@ -16,7 +16,6 @@ from cadalign.errors import DataError, InputError, quote, refuse_unused
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum
-from cadalign.names import renamed
 from cadalign.retrieval.absence import none_probability
 from cadalign.retrieval.by_shape import camera_by_shape, rank_by_shape, shapes_by_category
 from cadalign.retrieval.match import Match
@@ -184,7 +183,6 @@ class Library:
         """Hash of the library's content, as text."""
         return checksum(self._table.payload()).hex()
 
-    @renamed(semantic_ids="ids")
     def retrieve(
         self,
         points_2d: npt.ArrayLike | None = None,

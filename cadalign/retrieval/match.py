@@ -19,7 +19,6 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
-from cadalign.names import renamed
 from cadalign.notebook import card, draw_picture
 
 if TYPE_CHECKING:
@@ -31,7 +30,6 @@ METHOD = "retrieve"
 """Method of a match's result."""
 
 
-@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class Match:
     """A model of the library, posed and stretched to explain an image's keypoints."""

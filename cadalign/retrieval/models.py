@@ -29,7 +29,6 @@ from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.box import extent
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.files import Seal, as_path
-from cadalign.names import renamed
 
 ModelKey = tuple[str, str]
 """Category name and model id."""
@@ -55,7 +54,6 @@ SCHEMA = pa.schema(
 )
 
 
-@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class LibraryModel:
     """One model of a library.

@@ -33,12 +33,10 @@ from dataclasses import dataclass
 
 from cadalign.errors import InputError
 from cadalign.estimation.options import AlignmentOptions, FitOptions
-from cadalign.names import renamed
 
 METHODS = ("optimal", "epnp")
 
 
-@renamed(scale_prior_sigma="stretch_sigma")
 @dataclass(frozen=True)
 class RetrievalOptions(AlignmentOptions):
     """Options of a retrieval."""

@@ -19,7 +19,6 @@ from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.problems import in_threads, whitening_by
 from cadalign.geometry.camera import Camera
-from cadalign.names import renamed
 from cadalign.shapes.model import ShapeModel
 from cadalign.solvers.constants import LEAST_POINTS
 from cadalign.solvers.marginal.equations import POSE, force_of
@@ -35,7 +34,6 @@ _NO_STARTS = np.empty((0, POSE))
 _NO_POSE = np.array([1.0, 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1])
 
 
-@renamed(scale_prior_sigma="stretch_sigma")
 def fit(
     points_3d: Tensor,
     points_2d: Tensor,

@@ -16,14 +16,12 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.io.images import PHOTO_ENDINGS
 from cadalign.io.observation import Observation
-from cadalign.names import renamed
 
 VISIBILITY_SCORES = (0.0, 0.5, 1.0)
 """Scores by COCO's visibility flag: not labelled, labelled but hidden, visible."""
 _COCO_DIGITS = 12
 
 
-@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class ImageKeypoints:
     """The keypoints of one object in one image."""

@@ -29,7 +29,6 @@ from cadalign.io.documents import (
     require_unique,
 )
 from cadalign.io.files import damaged
-from cadalign.names import renamed
 
 _FIX = "repair or remove this model's annotation"
 # Real barycentric coordinates sum to 0.999 ... 1.001.
@@ -45,7 +44,6 @@ _Coordinate = Annotated[float, Meta(ge=-1e30, le=1e30)]
 _Place = tuple[_Coordinate, _Coordinate, _Coordinate]
 
 
-@renamed(semantic_ids="ids")
 @dataclass(frozen=True, eq=False)
 class Keypoints:
     """The annotated points of a model, in the order of the annotation file."""

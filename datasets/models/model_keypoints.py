@@ -33,7 +33,6 @@ from cadalign.io.documents import (
 )
 from cadalign.io.files import as_path, write_json
 from cadalign.io.meshes.files import load_mesh
-from cadalign.names import renamed
 
 FORMAT = "cadalign model keypoints"
 VERSION = 1
@@ -89,7 +88,6 @@ class ModelKeypoint:
     """(3,), where on that face: weights of its corners in file order, of sum 1."""
 
 
-@renamed(semantic_ids="ids")
 @dataclass(frozen=True)
 class ModelKeypoints:
     """The named keypoints of a model.

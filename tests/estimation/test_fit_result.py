@@ -122,9 +122,9 @@ def with_view(**changes: Any) -> str:
     [
         ("{", "result: not valid JSON: "),
         ("[]", "result: [] is not an object"),
-        ("{}", "result: views[0].camera: missing"),
-        ('{"version": 2}', "result: method: missing"),
-        (changed(version=3), "result: version: 3 is not one of 2"),
+        ("{}", "result: version: missing"),
+        ('{"version": 1}', "result: method: missing"),
+        (changed(version=3), "result: version: 3 is not one of 1"),
         (
             with_view(alignment={"scale": [1, 1, 1]}),
             "result: views[0].alignment: missing rotation, translation",

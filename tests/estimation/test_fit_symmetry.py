@@ -196,9 +196,6 @@ def test_results_keep_their_symmetry_in_json():
     result = fit(*observed(1.0, fold=None), CAMERA, stretch="y", symmetry=symmetry)
     read = Result.from_json(result.to_json())
     assert str(read) == str(result)
-    data = result.to_dict()
-    del data["symmetry"]  # as in files of earlier versions
-    assert Result.from_dict(data).symmetry is None
 
 
 @pytest.mark.parametrize("given", ["__SYM_ROTATE_UP_2", 4, {"axis": [0, 1, 0], "fold": 2}])

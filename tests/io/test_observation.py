@@ -142,7 +142,7 @@ def test_load_undoes_save_exactly(tmp_path: Path, extras: bool) -> None:
         (
             changed("keypoints.2.uvw", 3),
             "{path}: keypoints[2]: unknown field 'uvw', did you mean 'uv'?; "
-            "known are confidence, depth, name, score, semantic_id, sigma, uv, xyz",
+            "known are depth, name, score, semantic_id, sigma, uv, xyz",
         ),
         (changed("keypoints.2.xyz", [1, 2]), "{path}: keypoints[2].xyz: [1, 2] is not a list of 3"),
         (

@@ -307,19 +307,10 @@ def test_overlays_that_are_gone_leave_the_page_right(drawn: Path, tmp_path: Path
     assert set(found["tables"]["instances"]["thumb"]) == {-1}
     assert all(e["picture"] is None and e["mesh"] is None for e in found["exhibits"].values())
     assert len(found["exhibits"]) == 8
-    (copy / "records.parquet").unlink()  # as in a run of an older version
+    (copy / "records.parquet").unlink()
     found = report(tmp_path, copy)
     assert set(found["tables"]["instances"]["exhibit"]) == {-1}
     assert len(found["headline"]["rows"]) == 5 * len(METHODS)
-
-
-def test_folders_of_earlier_versions_show_the_same(drawn: Path, tmp_path: Path) -> None:
-    copy = Path(shutil.copytree(drawn, tmp_path / "copy"))
-    (copy / "records.parquet").rename(copy / "exhibits.parquet")
-    (copy / "previews").rename(copy / "sketches")
-    found, expected = report(tmp_path, copy), report(tmp_path, drawn)
-    for part in ("exhibits", "meshes", "pictures"):
-        assert found[part] == expected[part] != {}
 
 
 def test_pictures_of_different_instances_have_different_names() -> None:

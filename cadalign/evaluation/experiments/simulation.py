@@ -263,10 +263,8 @@ VARIED = {metric.key: metric for metric in (metrics.NOISE, metrics.POINTS, metri
 def kind_of(run: Run) -> SweepKind:
     """The sweep that a run makes."""
     given = run.config.get("sweep")
-    # What an older run does not say is as in this sweep.
-    stated = {**asdict(SWEEPS["noise"]), **given} if isinstance(given, dict) else given
     with in_file(run.folder.config_file):
-        found: SweepKind = convert(stated, SweepKind, "sweep")
+        found: SweepKind = convert(given, SweepKind, "sweep")
         if any(abs(value) > sys.float_info.max for value in found.values):
             raise DataError("a value is beyond all numbers", where="sweep.values")
     return found

@@ -19,7 +19,7 @@ from cadalign.errors import DataError
 from cadalign.io.documents import Count, ForeignDocument, convert, in_file
 from cadalign.io.files import made_folder, read_text, reading, refuse_nul, write_json, writing
 
-_FORMAT = 2
+_FORMAT = 1
 _LONGEST_VALUE = 80
 _MOST_DIFFERENCES = 6
 _FIX = "give another folder (--out), or remove this one"
@@ -30,15 +30,13 @@ _WRITTEN = ("results.csv", "summary.csv", "report.html", "records.parquet", "tim
 
 
 class _Inside:
-    """A file or folder inside a run's folder, by the name of earlier versions where it has that."""
+    """A file or folder inside a run's folder."""
 
-    def __init__(self, name: str, earlier: str = "") -> None:
+    def __init__(self, name: str) -> None:
         self._name = name
-        self._earlier = earlier
 
     def __get__(self, folder: RunFolder, owner: type[RunFolder]) -> Path:
-        is_earlier = self._earlier and (folder.path / self._earlier).exists()
-        return folder.path / (self._earlier if is_earlier else self._name)
+        return folder.path / self._name
 
 
 @dataclass(frozen=True)
@@ -50,14 +48,14 @@ class RunFolder:
     config_file = _Inside("run.json")
     results = _Inside("results.parquet")
     timings = _Inside("timings.parquet")
-    records = _Inside("records.parquet", earlier="exhibits.parquet")
+    records = _Inside("records.parquet")
     progress = _Inside("progress.json")
     summary = _Inside("summary.csv")
     figures = _Inside("figures")
     overlays = _Inside("overlays")
     pictures = _Inside("pictures")
     thumbs = _Inside("thumbs")
-    previews = _Inside("previews", earlier="sketches")
+    previews = _Inside("previews")
     report = _Inside("report.html")
     parts = _Inside("parts")
 
@@ -74,9 +72,6 @@ class RunFolder:
     def part(self, table: Path, index: int) -> Path:
         """A chunk's rows of the results, timings or records."""
         kind = "" if table == self.results else f".{table.stem}"
-        earlier = self.parts / f"{index:07d}.exhibits.parquet"
-        if table == self.records and earlier.exists():
-            return earlier
         return self.parts / f"{index:07d}{kind}.parquet"
 
     def make(self) -> None:

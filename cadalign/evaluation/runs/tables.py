@@ -116,17 +116,13 @@ def is_whole(path: Path, columns: Columns) -> bool:
 
 
 def checked(table: pa.Table, columns: Columns, *, path: Path, fix: str) -> pa.Table:
-    """The table of a file, with empty columns for numbers that an older one does not have.
+    """The table of a file.
 
-    Raises DataError if another column is missing, a type is another, or a text is missing.
+    Raises DataError if a column is missing, a type is another, or a text is missing.
     """
     for name, kind in columns:
         what, wanted = "", _TYPES[kind]
         if name not in table.column_names:
-            if kind is float:
-                empty = pa.nulls(len(table), wanted)
-                table = table.append_column(name, empty)
-                continue
             what = f"there is no column {name!r}"
         elif table.schema.field(name).type != wanted:
             found = quote(str(table.schema.field(name).type))

@@ -54,7 +54,7 @@ PHOTO_GROUND = (206, 208, 212)
 LINE = (35, 208, 255)
 # Layers by kind, and the kind's colour.
 KINDS = {
-    "#e8e8ec": "errors names arrays notebook compile",
+    "#e8e8ec": "errors names arrays compile",
     "#d9e8f7": "geometry metrics io solvers shapes export estimation torch jax",
     "#dcf0dc": "datasets render web",
     "#fbe9d0": "retrieval evaluation batch report annotate cli scripts",

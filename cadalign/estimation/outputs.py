@@ -1,4 +1,4 @@
-"""Outputs of results: pictures on axes and in notebooks, and aligned objects for export."""
+"""Outputs of results: pictures on axes, and aligned objects for export."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.io.images import ByteImage, read_photo
-from cadalign.notebook import card, draw_picture, photo_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from cadalign.estimation.result_data import ResultData
-    from cadalign.estimation.uncertainty.summary import Uncertainty
 
 Photo = Path | str | ByteImage | None
 _LONGEST_SIDE = 480  # of the grid of rays through a drawn model
 _MODEL_COLOR = (0.94, 0.2, 0.2)
 _MODEL_OPACITY = 0.45
 _BOX_COLOR = "#f03232"
+_GREY = 0.9
 _LINE_POINTS = 17  # lens distortion bends the edges of a box
 
 
@@ -50,7 +49,7 @@ def plot_result(
     seen = result.views[view]
     if isinstance(image, str | os.PathLike):
         image = read_photo(Path(image))
-    axes = photo_axes(seen.camera.width, seen.camera.height, image, axes=axes)
+    axes = _photo_axes(seen.camera.width, seen.camera.height, image, axes)
     known = result.known_mesh(mesh)
     if known is not None:
         _plot_mesh(axes, seen.camera, seen.alignment, known)
@@ -61,37 +60,32 @@ def plot_result(
     return axes
 
 
-def result_html(result: ResultData) -> str:
-    """HTML of a result for notebooks."""
-    views = "" if len(result.views) == 1 else f" in {len(result.views)} views"
-    count = f"{int(result.inliers.sum())} of {len(result.inliers)}{views}"
-    rows = [("keypoints", count), ("residuals (rms)", f"{result.rms:.3g} px")]
-    rows += _pose_rows(result.alignment.translation, result.stretch, result.std)
-    if result.focal == "estimate":
-        rows.append(("focal length", f"{result.camera.fx:.4g} px"))
-    aspect = result.camera.height / result.camera.width
-    note = f"Warning: {'; '.join(result.warnings)}" if result.warnings else ""
-    picture = draw_picture(lambda axes: plot_result(result, axes=axes), aspect=aspect)
-    return card(f"Result ({result.method})", rows, picture=picture, note=note)
+def _photo_axes(width: int, height: int, image: npt.ArrayLike | None, axes: Axes | None) -> Axes:
+    """Draw a photo (h, w[, 3]) of a camera with so many pixels, or grey where there is none.
 
+    Returns axes in its pixels: the given ones, or those of a new figure.
+    """
+    if axes is None:
+        from matplotlib import pyplot
 
-def _pose_rows(
-    translation: FloatArray, scale: FloatArray, std: Uncertainty | None
-) -> list[tuple[str, str]]:
-    """Rows of position, stretch and, where known, their standard deviations."""
-    shift = ", ".join(f"{value:.4g}" for value in translation)
-    stretch = ", ".join(
-        f"{axis} {value:.4g}" + (f" ± {100 * spread:.2g} %" if spread else "")
-        for axis, value, spread in zip("xyz", scale, std.scale if std else (0, 0, 0), strict=True)
+        axes = pyplot.subplots(figsize=(8, 8 * height / width))[1]
+    pixels = np.full((1, 1, 3), _GREY) if image is None else np.asarray(image)
+    if image is not None and pixels.shape[:2] != (height, width):
+        raise InputError(
+            f"shape {pixels.shape}, but the camera has {width} x {height} pixels",
+            where="image",
+            fix="give the photo of this camera",
+        )
+    axes.imshow(
+        pixels,
+        cmap="gray",
+        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+        interpolation="antialiased",
     )
-    if std is None:
-        return [("translation", shift), ("stretch", stretch)]
-    known_to = ", ".join(f"{value:.2g}" for value in std.translation)
-    return [
-        ("rotation", f"± {std.rotation_deg:.2g}°"),
-        ("translation", f"({shift}) ± ({known_to})"),
-        ("stretch", stretch),
-    ]
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_axis_off()
+    return axes
 
 
 def _plot_mesh(axes: Axes, camera: Camera, alignment: Alignment, mesh: Mesh) -> None:

@@ -123,11 +123,6 @@ class Result(ResultData):
             f"warnings={len(self.warnings)})"
         )
 
-    def _repr_html_(self) -> str:
-        from cadalign.estimation.outputs import result_html
-
-        return result_html(self)
-
     def plot(
         self,
         image: npt.ArrayLike | str | os.PathLike[str] | None = None,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -21,9 +20,6 @@ from cadalign.geometry.pixels import (
     rays_of_image,
     undistort,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 class Camera(Calibration):
@@ -260,35 +256,6 @@ class Camera(Calibration):
             slopes = self.projection_slopes(_homogeneous(normalized))[:, :, :2]
             return np.asarray(slopes / np.array([[self.fx], [self.fy]]))
         return distort(normalized, self.lens, self.distortion)[1]
-
-    def _repr_html_(self) -> str:
-        focal, angle = "unknown", "unknown"
-        if self.focal_known:
-            half = 0.5 * np.diag([self.width, self.height]) + (self.cx, self.cy)
-            rays, valid = replace(self, turn=()).rays_where_valid(half)
-            angles = 2 * np.degrees(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]))
-            focal = f"{self.fx:.5g}, {self.fy:.5g} px"
-            angle = "{:.3g}° x {:.3g}°".format(*angles) if valid.all() else "the lens's whole"
-        lens = ", ".join(f"{value:.3g}" for value in self.distortion)
-        from cadalign.notebook import card, draw_picture, photo_axes
-
-        rows = [
-            ("image", f"{self.width} x {self.height} px"),
-            ("focal length", focal),
-            ("field of view", angle),
-            ("principal point", f"{self.cx:.5g}, {self.cy:.5g} px (pixel centres are integers)"),
-            ("lens", self.lens),
-            ("distortion", lens or "none"),
-        ]
-
-        def draw(axes: Axes) -> None:
-            photo_axes(self.width, self.height, axes=axes)
-            axes.axvline((self.width - 1) / 2, color="0.7", linewidth=0.8)
-            axes.axhline((self.height - 1) / 2, color="0.7", linewidth=0.8)
-            axes.plot(self.cx, self.cy, "+", color="#f03232", markersize=14, markeredgewidth=2)
-
-        picture = draw_picture(draw, aspect=self.height / self.width)
-        return card("Camera", rows, picture=picture)
 
 
 def needs_facing(cameras: Sequence[Camera]) -> bool:

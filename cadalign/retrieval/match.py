@@ -19,7 +19,6 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.io.meshes.files import load_mesh
 from cadalign.io.observation import Observation
-from cadalign.notebook import card, draw_picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -101,29 +100,6 @@ class Match:
             f"Match({self.category!r}, {self.model_id!r}, score={self.score:.3g}, "
             f"rms={self.rms:.3g} px, shared={self.shared}, scale=({stretch}))"
         )
-
-    def _repr_html_(self) -> str:
-        scales = zip("xyz", self.alignment.scale, strict=True)
-        absent = self.none_probability
-        none = [] if absent is None else [("none of these", f"{100 * absent:.3g} %")]
-        rows = [
-            ("category", self.category),
-            ("model", self.model_id),
-            ("score", f"{100 * self.score:.3g} %"),
-            *none,
-            ("keypoints", f"{self.shared} of {self.observed}"),
-            ("residuals (rms)", f"{self.rms:.3g} px"),
-            ("stretch", ", ".join(f"{axis} {value:.3g}" for axis, value in scales)),
-        ]
-        camera = self.camera
-        if camera is None:
-            return card("Match", rows)
-
-        def draw(axes: Axes) -> None:
-            self.result.plot(axes=axes)
-
-        picture = draw_picture(draw, aspect=camera.height / camera.width)
-        return card("Match", rows, picture=picture)
 
     @property
     def result(self) -> Result:

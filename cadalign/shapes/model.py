@@ -360,11 +360,6 @@ class ShapeModel:
         models = "" if self.training is None else f", {len(self.training)} models"
         return f"ShapeModel({self.category!r}, {text}{models})"
 
-    def _repr_html_(self) -> str:
-        from cadalign.shapes.outputs import shape_html
-
-        return shape_html(self)
-
     @property
     def mean(self) -> FloatArray:
         """Mean of the mixture: keypoints, then the box's corners, (m + 2, 3) float."""

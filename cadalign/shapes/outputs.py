@@ -1,4 +1,4 @@
-"""Outputs of shape models: their file, a picture of mean and modes, and cards in notebooks.
+"""Outputs of shape models: their file, and a picture of mean and modes.
 
 The file is a sealed MessagePack document; see `cadalign.io.files` for the header. It holds the
 fields of `cadalign.ShapeModel` and of its parts, arrays as little-endian numbers with their shape.
@@ -22,7 +22,6 @@ from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import BOX_EDGES, bounds_corners
 from cadalign.io.documents import Count, Document, PathText, in_file
 from cadalign.io.files import Seal, as_path, printable, read_bytes, refuse_input, write_whole
-from cadalign.notebook import card, draw_picture
 from cadalign.shapes.parts import BOX_ROWS, ShapeComponent
 
 if TYPE_CHECKING:
@@ -39,7 +38,6 @@ SEAL = Seal(
     fix="learn it with: cadalign shape learn",
 )
 _MAX_BYTES = 1 << 30  # of thousands of models with hundreds of keypoints each
-_SHOWN_MODES = 5  # of a card's table
 _MODES = 4  # of a picture
 _DEVIATIONS = 2.0
 _CELL = 2.9  # inches
@@ -118,39 +116,6 @@ def _check_known(document: Any, made: Any) -> None:
             raise InputError(f"unknown field {min(unknown)!r}")
         for name, entry in document.items():
             _check_known(entry, getattr(made, name))
-
-
-def shape_html(model: ShapeModel) -> str:
-    """HTML of a shape model: its mean keypoints and their standard deviations, and a table."""
-    largest = max(model.components, key=lambda component: component.weight)
-    total = max(float(np.trace(largest.covariance)), 1e-300)
-    shares = ", ".join(f"{100 * share / total:.0f}" for share in largest.variance[:_SHOWN_MODES])
-    rows = [
-        ("category", model.category),
-        ("keypoints", str(len(model.ids))),
-        ("models", "given" if model.training is None else str(len(model.training))),
-        ("components", str(len(model.components))),
-        ("modes", f"{len(largest.modes)}; the first hold {shares or '0'} % of the variance"),
-        ("up axis", model.up_axis or "unknown"),
-        ("unit", model.unit),
-    ]
-    return card("ShapeModel", rows, picture=draw_picture(lambda axes: _draw(axes, model)))
-
-
-def _draw(axes: Axes, model: ShapeModel) -> None:
-    largest = max(model.components, key=lambda component: component.weight)
-    view = _view(model.up_axis)
-    keypoints = largest.mean[:-BOX_ROWS] @ view
-    moved = largest.modes[:, :-BOX_ROWS] @ view
-    spread = np.sqrt((moved**2).sum(axis=0) + largest.residual_sigma**2)
-    x, y = keypoints.T
-    x_std, y_std = spread.T
-    axes.errorbar(x, y, xerr=x_std, yerr=y_std, fmt="o", color="#3366cc", ecolor="0.6")
-    for label, place in zip(model.ids, keypoints, strict=True):
-        axes.annotate(str(label), place, xytext=(4, 4), textcoords="offset points", fontsize=7)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.15)
-    axes.set_axis_off()
 
 
 def draw_shape(path: Path, model: ShapeModel) -> None:

@@ -1,4 +1,4 @@
-"""Results in files, on matplotlib axes, in notebooks and as data frames."""
+"""Results in files, on matplotlib axes and as data frames."""
 
 from __future__ import annotations
 
@@ -113,14 +113,6 @@ def test_plot_refuses_what_does_not_fit(fitted: Result, aligned: Result) -> None
         fitted.plot(np.zeros((10, 10, 3), np.uint8), axes=Figure().add_subplot())
     with pytest.raises(InputError, match="1 is not one of the 1 views"):
         aligned.plot(view=1, axes=Figure().add_subplot())
-
-
-@pytest.mark.long
-def test_notebooks_show_a_picture_and_a_table(fitted: Result, aligned: Result) -> None:
-    for value in (fitted, aligned, CAMERA):
-        html = value._repr_html_()
-        assert "data:image/png;base64," in html
-        assert "<table>" in html
 
 
 def test_reprs_are_short(fitted: Result, aligned: Result) -> None:

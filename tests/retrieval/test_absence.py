@@ -52,7 +52,6 @@ def test_probability_is_that_of_all_matches_and_keeps_scores() -> None:
     matches = retrieve(31)
     assert len({match.none_probability for match in matches}) == 1
     assert matches[0].to_dict()["none_probability"] == matches[0].none_probability
-    assert "none of these" in matches[0]._repr_html_()
     certain = retrieve(31, none_prior=0.0)
     assert [match.score for match in certain] == [match.score for match in matches]
     assert certain[0].none_probability == 0.0

@@ -19,7 +19,6 @@ from cadalign.annotate.object_actions import (
 )
 from cadalign.annotate.objects import PhotoState
 from cadalign.annotate.photos import Mark, WorkList, nearest_corner
-from cadalign.annotate.proposals import proposals_of
 from cadalign.annotate.session import Session
 from cadalign.errors import InputError, quote
 from cadalign.io.documents import ForeignDocument, Index, NotNegative, Point2, Point3, Text, convert
@@ -223,7 +222,7 @@ def identify(state: PhotoState, *, pair: Index, label: Index | Text) -> ActionOu
 def accept(state: PhotoState, *, keypoints: list[Index] | None = None) -> ActionOutcome:
     """Place pairs at a detector's proposals for some keypoints, or for all that are left."""
     document, number = state.document, None
-    for proposal in proposals_of(state):
+    for proposal in state.proposals:
         keypoint = proposal.keypoint
         if (keypoints is None or keypoint in keypoints) and keypoint not in document.keypoints:
             number = document.next_number

@@ -23,7 +23,6 @@ from cadalign.export.aligned_object import names_of, photos_of, write_photo_set
 from cadalign.io.files import write_text
 
 _MARKED = 2  # COCO's flag of a keypoint that is labelled and visible
-_FIRST_TRACK = 1  # the object whose photos are frames of one video
 
 
 def coco_of(session: Session) -> dict[str, Any]:
@@ -44,7 +43,7 @@ def coco_of(session: Session) -> dict[str, Any]:
         numbers = [sorted(marked.get(model, ())) for model in models]
         annotations = []
         for row, objects in enumerate(kept):
-            for slot, state in enumerate(objects):
+            for state in objects:
                 places = {pair.keypoint: pair.uv for pair in state.document.complete_pairs}
                 if not places:
                     continue
@@ -53,8 +52,7 @@ def coco_of(session: Session) -> dict[str, Any]:
                 uv = np.array([places.get(number) or (0.0, 0.0) for number in own], dtype=float)
                 flags = np.array([_MARKED if number in places else 0 for number in own])
                 rectangle = np.concatenate([uv[flags > 0].min(axis=0), uv[flags > 0].max(axis=0)])
-                track = _FIRST_TRACK if session.times and not slot else None
-                annotations.append(CocoObject(row, category, uv, flags, rectangle, track=track))
+                annotations.append(CocoObject(row, category, uv, flags, rectangle))
         files = [objects[0].photo for objects in kept]
         names = names_of(photo.path for photo in files)  # of photos in several folders their paths
         return coco_document(

@@ -275,12 +275,11 @@ class ObjectShape:
 
 @dataclass(frozen=True)
 class Proposal:
-    """A keypoint of the model, where a detector or the other frames put it [px], and how sure."""
+    """A keypoint of the model, where a detector puts it [px], and how sure."""
 
     keypoint: int
     uv: tuple[float, float]
     score: float | None = None
-    sigma: float | None = None  # standard deviation of a prediction [px]
 
 
 @dataclass(eq=False)

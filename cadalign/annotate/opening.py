@@ -34,7 +34,7 @@ from cadalign.annotate.photos import (
     read_camera,
 )
 from cadalign.annotate.problem import LIKELY_STRETCH
-from cadalign.annotate.proposals import read_proposals, times_of
+from cadalign.annotate.proposals import read_proposals
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
@@ -126,8 +126,6 @@ def open_session(
         found = read_proposals(options.detections, files.photos, models[0].registry)
         for state, proposals in zip(session.photos, found, strict=True):
             state.proposals = proposals
-    if options.track:
-        session.times = times_of(photo.path for photo in files.photos)
     for view in [view for owner in session.owners for view in owner.states[1:]]:
         place = next((row for row in session.objects if row[0].key == view.key), None)
         if place is None:  # a photo that is nothing but a further view

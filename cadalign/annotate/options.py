@@ -8,8 +8,6 @@ from typing import Annotated, Literal
 
 import tyro
 
-VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v")
-"""Endings of files that are taken for videos."""
 LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches."""
 
@@ -54,9 +52,6 @@ class FileOptions:
     shape: Path | None = None
     """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
     keypoints that it knows by semantic id or name."""
-    track: bool = False
-    """The photos of the folder are frames of one video and show one object: what is marked in some
-    of them is proposed in the others, by a smooth motion. A video is taken so."""
     shape_sigma: float | None = None
     """Estimate the object's own shape from the model's: standard deviation of the keypoints'
     positions on the object about those on the stretched model [model units]."""

@@ -16,7 +16,6 @@ from cadalign.annotate.live import box_of, drawing_of, facts_of, flat, notes_of
 from cadalign.annotate.object_actions import ActionOutcome
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.problem import LEAST_JOINT_PAIRS, LIKELY_STRETCH
-from cadalign.annotate.proposals import proposals_of
 from cadalign.annotate.session import Session
 from cadalign.annotate.suggestion import Suggestion, ToldApart, name_of, next_best_text
 from cadalign.errors import CadalignError
@@ -89,7 +88,7 @@ def page_state(
             ],
             "proposals": [
                 {**asdict(proposal), "name": registry[proposal.keypoint].name}
-                for proposal in proposals_of(state)
+                for proposal in state.proposals
                 if proposal.keypoint not in used
             ],
             "shape": _shape(state),

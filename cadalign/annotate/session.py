@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from cadalign.annotate.document import AnnotationDocument, history_path, write_history
+from cadalign.annotate.document import history_path, write_history
 from cadalign.annotate.estimate import LiveAlignment, warm_up
 from cadalign.annotate.files import AnnotationFiles
 from cadalign.annotate.library import ModelChoice
@@ -24,7 +24,6 @@ from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.problem import Known
 from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import read_photo
@@ -42,9 +41,6 @@ class Session:
     """Raises a CadalignError where nothing may be written."""
     reserve: Callable[[Sequence[Path]], None] = lambda paths: None
     """Keeps other annotators off an object's files; raises a CadalignError if one has them."""
-    times: tuple[float, ...] = ()  # of the first photos, where these are frames of one video [s]
-    tracked: tuple[tuple[AnnotationDocument, ...], Result | None] | None = None
-    """The last smooth estimate from the frames, with their documents."""
     objects: list[list[PhotoState]] = field(default_factory=list)
     """The objects of each photo, its own observation's first."""
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant

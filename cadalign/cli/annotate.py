@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from cadalign.annotate.options import LOOPBACK, VIDEOS, FileOptions, SessionOptions
+from cadalign.annotate.options import LOOPBACK, FileOptions, SessionOptions
 from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
 from cadalign.cli.options import flag_of
 from cadalign.errors import DataError, InputError
@@ -35,14 +35,11 @@ class Annotate(FileOptions):
     """
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, _FILES] = ()
-    """A photo, a folder of photos, or a video; and the model, an OBJ, PLY, GLB, glTF, STL or OFF
-    file."""
+    """A photo or a folder of photos, and the model, an OBJ, PLY, GLB, glTF, STL or OFF file."""
     image: Path | None = None
     """The photo or folder, in place of PHOTO."""
     model: Path | None = None
     """The model, in place of MODEL."""
-    every: int = 1
-    """Take every so many frames of a video; they are written as photos to <video>_frames."""
     port: int = 0
     """Port to listen on; 0 for a free one."""
     host: str = "127.0.0.1"
@@ -85,24 +82,7 @@ class Annotate(FileOptions):
         rest: dict[str, Any] = {
             field.name: getattr(self, field.name) for field in fields(FileOptions)
         }
-        image = found["image"]
-        if image.suffix.lower() in VIDEOS:
-            rest["track"] = True
-            found["image"] = self._frames(image)
-        elif self.every != 1:
-            raise UsageError(f"{image} is no video", where="--every", fix="leave it out")
-        elif self.track and not image.is_dir():
-            what = f"{image} is neither a video nor a folder"
-            raise UsageError(what, where="--track", fix="give the folder of the frames")
         return SessionOptions(**(found | rest))
-
-    def _frames(self, video: Path) -> Path:
-        """The folder with the frames of a video, which are written if they are not there yet."""
-        from cadalign.annotate.proposals import write_frames
-
-        folder = (self.out or video.parent) / f"{video.stem}_frames"
-        with waiting("reading the video"):
-            return write_frames(video, folder, every=self.every)
 
     def run(self) -> int:
         """Serve until interrupted; returns the exit code."""

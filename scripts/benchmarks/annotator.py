@@ -18,14 +18,12 @@ from playwright.sync_api import Browser, Page
 from support.annotating import (
     Case,
     make_case,
-    opened_page,
     place,
     place_of_pixel,
     place_twenty,
     served,
 )
 from support.chromium import chromium
-from support.clips import CLOSE, FRAMES, make_clip, mark_clip
 from support.killing import kill_at_random
 from support.panels import (
     AXE,
@@ -103,7 +101,7 @@ _LIST = """async () => {
 def annotator(
     given: BenchmarkData,
     *,
-    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "clip", "pictures"),
+    parts: tuple[str, ...] = ("times", "list", "panels", "kills", "pictures"),
     clicks: int = 30,
     photos: int = 200,
     kills: int = 100,
@@ -114,7 +112,6 @@ def annotator(
     - list: a folder of 200 photos: the list, its thumbnails, and going from photo to photo;
     - panels: a session by keys alone through every panel: layout shifts, and what axe-core finds;
     - kills: annotators killed at random moments, and what the next ones had lost;
-    - clip: a video of 60 frames, some marked by hand, the others' predictions taken by a key;
     - pictures: models white, black, with doubled faces, thin, transparent, textured, huge and tiny,
       light and dark, on desktop, laptop and phone, as contact sheets.
 
@@ -134,7 +131,6 @@ def annotator(
         "list": partial(_list, photos),
         "panels": _panels,
         "kills": partial(_kills, kills),
-        "clip": _clips,
         "pictures": _pictures,
     }
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
@@ -243,28 +239,6 @@ def _page(
         page = open_page(browser, access.url, scripts=scripts, **size)
         yield page
         page.context.close()
-
-
-def _clips(given: BenchmarkData, browser: Browser, folder: Path) -> Iterator[Row]:
-    """Clicks and keys until all keypoints of a clip are marked, and errors of its predictions."""
-    clip = make_clip(_case(given, folder), folder)
-    for count in (3, 4, 7):
-        key_frames = np.linspace(0, FRAMES - 1, count).round().astype(int).tolist()
-        session = open_session(clip.options(folder / str(count)))
-        session.warm_up()
-        with opened_page(browser, session, width=1600, height=1400) as page:
-            clicks = mark_clip(page, session, clip, key_frames)
-        yield {
-            "frames by hand": count,
-            "clicks": clicks.marked,
-            "keys": clicks.keys,
-            "corrections": clicks.corrected,
-            "in all": clicks.marked + clicks.keys + clicks.corrected,
-            "all by hand": clicks.by_hand,
-            "within 3 px, %": 100 * float(np.mean(clicks.gaps < CLOSE)),
-            "off by, rms px": float(np.sqrt(np.mean(clicks.gaps**2))),
-            "stated, rms px": float(np.sqrt(2 * np.mean(clicks.stated**2))),
-        }
 
 
 def _timed_clicks(

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 from support.annotating import Case, make_case
-from support.clips import Clip, make_clip
 
 
 @pytest.fixture(scope="session")
@@ -19,9 +18,3 @@ def original(sample_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Cas
 def case(original: Case, tmp_path: Path) -> Case:
     """A copy in a folder of its own."""
     return original.copied_to(tmp_path / "photos")
-
-
-@pytest.fixture(scope="session")
-def clip(original: Case, tmp_path_factory: pytest.TempPathFactory) -> Clip:
-    """A video of the same chair, turning."""
-    return make_clip(original, tmp_path_factory.mktemp("clip"))

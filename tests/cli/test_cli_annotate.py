@@ -102,19 +102,3 @@ def test_model_is_required(capsys: pytest.CaptureFixture[str]) -> None:
         main(["annotate", "--image", "photo.jpg"])
     assert stop.value.code == 2
     assert "--model" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("option", "text"),
-    [
-        (("--every", "2"), "--every: photo.jpg is no video; leave it out"),
-        (("--track",), "--track: photo.jpg is neither a video nor a folder; give the folder"),
-    ],
-)
-def test_options_of_videos_are_refused_with_a_photo(
-    capsys: pytest.CaptureFixture[str], option: tuple[str, ...], text: str
-) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["annotate", "photo.jpg", "model.obj", *option])
-    assert stop.value.code == 2
-    assert text in capsys.readouterr().err

@@ -145,9 +145,7 @@ export class Panel {
   /** What a detector proposes; nothing if it proposes nothing. */
   proposed(proposals) {
     if (!proposals.length) return "";
-    const sigmas = proposals.filter(({ sigma }) => sigma !== null).map(({ sigma }) => sigma);
-    const source = sigmas.length ? `predicted from other frames, ± ${Math.max(...sigmas).toPrecision(2)} px at most` : "of a detector";
-    const count = `${proposals.length} keypoint${proposals.length === 1 ? "" : "s"} ${source}`;
+    const count = `${proposals.length} keypoint${proposals.length === 1 ? "" : "s"} of a detector`;
     return h(
       "p",
       {},

@@ -31,7 +31,7 @@ from benchmarks.gradients import gradient_errors, torch_layer
 from benchmarks.masks import mask_alone, masks
 from benchmarks.mistakes import mistakes
 from benchmarks.photo import photo_times, photos
-from benchmarks.retrieval import mask_retrieval, retrieval, unseen_retrieval
+from benchmarks.retrieval import retrieval, unseen_retrieval
 from benchmarks.runs import evaluation, fits, ransac
 from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables
 from benchmarks.shapes import align, focal_shapes, similar
@@ -76,7 +76,6 @@ ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "proposals": proposal_clicks,
     "detections": real_detections,
     "unseen_retrieval": unseen_retrieval,
-    "mask_retrieval": mask_retrieval,
     "similar": similar,
     "tracks": tracks,
     "warned": warned,

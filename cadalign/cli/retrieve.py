@@ -142,7 +142,7 @@ def _print_table(matches: Sequence[Match]) -> None:
             score_text(match.score),
             f"{match.log_likelihood:.1f}",
             f"{match.rms:.2f}",
-            f"{match.shared}/{match.observed}" if match.observed else "-",
+            f"{match.shared}/{match.observed}",
             f"{match.alignment.scale[1]:.3f}",
             f"{match.alignment.scale[2]:.3f}",
         )

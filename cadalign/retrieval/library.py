@@ -7,12 +7,12 @@ import os
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy.typing as npt
 
 from cadalign.datasets import AnnotatedModel, KeypointNet
-from cadalign.errors import DataError, InputError, quote, refuse_unused
+from cadalign.errors import DataError, InputError, quote
 from cadalign.estimation.focal import FocalPrior
 from cadalign.geometry.camera import Camera
 from cadalign.io.files import as_path, checksum
@@ -31,13 +31,7 @@ from cadalign.retrieval.options import RetrievalOptions
 from cadalign.retrieval.ranking import gather_candidates, make_matches, observe, rank
 from cadalign.shapes.model import ShapeModel
 
-if TYPE_CHECKING:
-    from cadalign.retrieval.by_mask import OutlineStore
-
 logger = logging.getLogger("cadalign")
-
-# Options that say something of the models, of which a mask alone does not make use.
-_OF_KEYPOINTS = ("method", "shape_sigma", "max_stretch", "none_prior")
 
 
 class Library:
@@ -73,7 +67,6 @@ class Library:
 
     def __init__(self, table: ModelTable) -> None:
         self._table = table
-        self._outlines: OutlineStore | None = None
 
     @classmethod
     def from_models(cls, models: Iterable[LibraryModel | AnnotatedModel]) -> Library:
@@ -185,9 +178,9 @@ class Library:
 
     def retrieve(
         self,
-        points_2d: npt.ArrayLike | None = None,
-        ids: npt.ArrayLike | None = None,
-        camera: Camera | None = None,
+        points_2d: npt.ArrayLike,
+        ids: npt.ArrayLike,
+        camera: Camera,
         *,
         shape: ShapeModel | Mapping[str, ShapeModel] | None = None,
         focal_prior: FocalPrior | None = None,
@@ -205,15 +198,10 @@ class Library:
         exhaustive search, and up to 768 more models are searched to fill the list. Ties are broken
         by category and id.
 
-        A mask alone, ``retrieve(mask=mask, camera=camera)``, ranks models with meshes by their
-        silhouettes, whatever pose and stretch: the 8 whose outlines resemble it most are aligned
-        with it, and compared by the likelihood of its contour; see `cadalign.retrieval.by_mask`.
-        The first query renders the models' outlines, which the library keeps while it is open.
-
         Parameters
         ----------
         points_2d : (n, 2) float
-            Keypoints in the image [px]; integers are pixel centres. None for a mask alone.
+            Keypoints in the image [px]; integers are pixel centres.
         ids : (n,) int
             Semantic ids of the keypoints, without repetition. Ids differ by category: without
             ``category`` each model reads them in its own category's sense.
@@ -230,7 +218,7 @@ class Library:
         mask : (h, w) bool, optional
             The object's pixels (of numbers, those above half of the largest possible one): reranks
             the best matches that have a mesh by their silhouettes; see
-            `cadalign.retrieval.by_mask`.
+            `cadalign.retrieval.silhouettes`.
         image : (h, w, 3) or (h, w, 4) uint8, optional
             The image instead of a mask: its opacity, or a segmentation around the keypoints, is
             the mask.
@@ -254,29 +242,14 @@ class Library:
         InputError
             If the library is empty, shapes don't match, a value is NaN or infinite, a semantic id
             is unknown or occurs twice, an option is invalid, or the focal length is unknown without
-            ``shape``; without keypoints, if there is no mask, or no model has a mesh.
+            ``shape``.
         DegenerateError
-            If no model shares at least 4 keypoints with the image, or none can be aligned.
+            If no model shares at least 4 keypoints with the image.
         """
         try:
             chosen = RetrievalOptions(**options)
         except TypeError as error:
             raise InputError(f"unknown option ({error})", where="options") from None
-        if camera is None:
-            raise InputError("no camera is given", where="camera", fix="give a cadalign.Camera")
-        if points_2d is None or ids is None:
-            others = (points_2d, ids, shape, image)
-            if mask is None or any(each is not None for each in others):
-                where = "points_2d" if points_2d is None else "ids"
-                fix = "give keypoints with their ids, or mask= and camera= alone"
-                raise InputError("keypoints are missing", where=where, fix=fix)
-            from cadalign.retrieval.by_mask import OutlineStore, mask_of, rank_by_mask
-
-            refuse_unused(chosen, _OF_KEYPOINTS, "on a mask alone")
-            if self._outlines is None:
-                self._outlines = OutlineStore(self._table)
-            inside, limits = mask_of(mask, None, (), camera), (exclude, workers)
-            return rank_by_mask(self._table, self._outlines, inside, camera, chosen, *limits)
         is_calibrated = not isinstance(camera, Camera) or camera.focal_known
         absent = None
         if shape is None:
@@ -303,6 +276,6 @@ class Library:
         matches = make_matches(self._table, candidates, observed, ranking, chosen.top, absent)
         if mask is None and image is None:
             return matches
-        from cadalign.retrieval.by_mask import mask_of, rerank  # with OpenCV and the renderer
+        from cadalign.retrieval.silhouettes import mask_of, rerank  # with OpenCV and the renderer
 
         return rerank(self._table, matches, mask_of(mask, image, matches, camera), camera)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -91,7 +91,7 @@ class Match:
 
     @property
     def observed(self) -> int:
-        """Number of keypoints in the image; 0 where a mask alone was matched."""
+        """Number of keypoints in the image."""
         return self.shared + len(self.missing_ids)
 
     def __repr__(self) -> str:
@@ -123,8 +123,7 @@ class Match:
 
     def observation(self, seen: Observation) -> Observation:
         """The keypoints of an observation that the model has, paired with the model's."""
-        # None of a mask alone.
-        given = np.empty(0, dtype=np.int64) if seen.ids is None else seen.ids
+        given = cast(IntArray, seen.ids)
         kept = np.flatnonzero(np.isin(given, self.ids))
         ids = given[kept]
         own: dict[str, Any] = {name: getattr(seen, name) for name in ("sigma", "scores", "depths")}

@@ -19,8 +19,8 @@ from cadalign.io.observation import Observation
 from cadalign.render import draw_overlay
 from cadalign.render.drawing.canvas import ByteImage
 from cadalign.render.scene import LIGHT_GREY
-from cadalign.retrieval.by_mask import cast_match
 from cadalign.retrieval.match import Match
+from cadalign.retrieval.silhouettes import cast_match
 from cadalign.web import asset, fill
 
 _MATCHES = "matches.json"
@@ -62,7 +62,6 @@ def write_retrieval(
         style=asset("retrieval.css"),
         models="most likely model" if len(matches) == 1 else f"{len(matches)} most likely models",
         library=escape(library),
-        evidence="keypoints" if any(match.observed for match in matches) else "mask",
         none="" if none is None else f'<p class="lead"><strong>{escape(none)}</strong></p>',
         matches="".join(_card(rank, match) for rank, match in enumerate(matches, start=1)),
     )
@@ -93,14 +92,13 @@ def overlay_name(rank: int) -> str:
 
 def draw_match(image: ByteImage, camera: Camera, match: Match) -> ByteImage:
     """Draw a match over its photo: box, keypoints and, where there is a mesh, the model."""
-    observed = match.points_2d if match.observed else None
     return draw_overlay(
         image,
         camera,
         est_box=match.box,
         est_frame=cast_match(match, camera),  # without a mesh, keypoints and box are drawn
-        observed=observed,
-        reprojected=None if observed is None else observed + match.residuals,
+        observed=match.points_2d,
+        reprojected=match.points_2d + match.residuals,
     )
 
 
@@ -112,13 +110,12 @@ def none_text(matches: Sequence[Match]) -> str | None:
 
 def _card(rank: int, match: Match) -> str:
     scale = match.alignment.scale
-    values = {"stretch": f"y {scale[1]:.2f}, z {scale[2]:.2f}"}
-    if match.observed:
-        values["residuals"] = f"{match.rms:.2f} px"
-        values["shared keypoints"] = f"{match.shared} of {match.observed}"
-    else:
-        values["residuals of the contour"] = f"{match.rms:.2f} px"
-    values["log-likelihood"] = f"{match.log_likelihood:.1f}"
+    values = {
+        "stretch": f"y {scale[1]:.2f}, z {scale[2]:.2f}",
+        "residuals": f"{match.rms:.2f} px",
+        "shared keypoints": f"{match.shared} of {match.observed}",
+        "log-likelihood": f"{match.log_likelihood:.1f}",
+    }
     if match.silhouette_iou is not None:
         values["silhouette IoU"] = f"{match.silhouette_iou:.3f}"
     if match.mirrored:

@@ -66,8 +66,7 @@ class ObservationRetrieval:
     ) -> list[Match]:
         """Rank the library's models by an observation, which messages call ``where``.
 
-        ``mask``, by default the observation's, and ``workers`` are as for `Library.retrieve`. An
-        observation without keypoints is ranked by its mask alone.
+        ``mask``, by default the observation's, and ``workers`` are as for `Library.retrieve`.
 
         Raises
         ------
@@ -80,14 +79,8 @@ class ObservationRetrieval:
             logger.warning(said, where, len(seen.views))
         library, shape = self.opened()
         camera, ids = seen.camera, _semantic_ids(seen, where)
-        cuts_out = self.silhouette and len(ids)
-        if mask is None and seen.evidence.mask is not None and not cuts_out:
+        if mask is None and seen.evidence.mask is not None and not self.silhouette:
             mask = read_mask(seen.evidence.mask)  # as a fit to the observation reads it
-        if not len(ids):
-            if shape is not None:
-                fix = "leave it out, or give keypoints"
-                raise InputError("has no effect on a mask alone", where="--shape", fix=fix)
-            return library.retrieve(mask=mask, camera=camera, workers=workers, **vars(self.ranking))
         if shape is None and not camera.focal_known:
             what = "the focal length is unknown, without which no model's pose is searched"
             fix = "rank by --shape, which estimates it, or give a calibrated camera"
@@ -146,7 +139,8 @@ def read_query(path: Path) -> Observation:
 
 def _semantic_ids(query: Observation, where: str) -> IntArray:
     if not len(query.points_2d):
-        return np.empty(0, dtype=np.int64)
+        with in_file(where):
+            raise DataError("there are no keypoints")
     if query.ids is None:
         fix = "give each the id of the library's models for it"
         with in_file(where):

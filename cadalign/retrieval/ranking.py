@@ -144,7 +144,7 @@ def _covariances(options: RetrievalOptions, pixels: FloatArray, order: IntArray)
     return np.asarray(covariances + (options.shape_sigma * extent) ** 2 * np.eye(2))
 
 
-def chosen_models(
+def _chosen_models(
     table: ModelTable, category: str | None, exclude: Collection[ModelKey]
 ) -> IntArray:
     """Select the rows of the models to compare, in the table's order.
@@ -182,7 +182,7 @@ def gather_candidates(
 ) -> CandidateSet:
     """Gather the candidates of a query, without the models to ``exclude``."""
     threads, query = worker_count(workers), observed.query
-    chosen = chosen_models(table, options.category, exclude)
+    chosen = _chosen_models(table, options.category, exclude)
     known = table.all_ids
     if options.category is not None:
         known = table.known_ids(table.keys[int(chosen[0])][0])

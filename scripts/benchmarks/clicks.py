@@ -20,7 +20,7 @@ from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.metrics import rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view
-from cadalign.retrieval.by_mask import grab_cut
+from cadalign.retrieval.silhouettes import grab_cut
 
 _FEWEST = 3
 _CLICK_PX = 2.0

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Table, Tables
 from cadalign import Box, Library, Observation, ShapeModel
-from cadalign.datasets import AnnotatedModel, KeypointNet
+from cadalign.datasets import KeypointNet
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.queries import (
     RetrievalQuery,
@@ -27,15 +27,12 @@ from cadalign.evaluation.instances.queries import (
 )
 from cadalign.evaluation.instances.unseen import UnseenObject
 from cadalign.metrics import box_iou_up_to_scale
-from cadalign.render import Scene, cast_geometry, sample_view
 from cadalign.retrieval import LibraryModel, Match
-from cadalign.retrieval.by_mask import MOST_ALIGNED
 
 _KEYPOINTS = 8
 _CALLS = 3
 _LEAST_SHARED = 4
 _FLAT = 1e-9
-_SAMPLE_CATEGORIES = 4
 
 
 def retrieval(
@@ -149,65 +146,6 @@ def _observed(
 
 def _retrieve(library: Library, seen: RetrievalQuery, noise_px: float) -> Any:
     return library.retrieve(seen.points_2d, seen.ids, KEYPOINT_CAMERA, sigma=noise_px)
-
-
-def mask_retrieval(
-    given: BenchmarkData, *, sizes: tuple[int, ...] = (100, 1000), queries: int = 30
-) -> Tables:
-    """Retrieval by an exact mask alone: recall and time, among growing libraries.
-
-    The models are ShapeNet's and those of the sample generator. Queries are models of the library,
-    stretched along y and z by 0.5 to 2, in random views of 640 x 480 px. Outlines are compared with
-    the mask's, which is the cheap stage, and the best few models aligned. The first
-    query makes the outlines, which the library keeps, and does not count in the other columns.
-
-    Parameters
-    ----------
-    sizes : tuple[int, ...]
-        Models of the libraries.
-    queries : int
-        Queries per library.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        count = -(-max(sizes) // _SAMPLE_CATEGORIES)
-        sample, real = section.meshed_models(given, folder, per_category=count)
-        models = [*real, *sample]
-        order = np.random.default_rng(given.seed).permutation(len(models)).tolist()
-        for size in sizes:
-            chosen = [models[k] for k in order[:size]]
-            yield f"by a mask alone, {size:,} models", [_queried(chosen, given, queries)]
-
-
-def _queried(models: Sequence[AnnotatedModel], given: BenchmarkData, queries: int) -> Row:
-    library = Library.from_models([LibraryModel.of_annotated(model) for model in models])
-    found: list[Row] = []
-    first = np.nan
-    for number in range(queries + 1):
-        rng = np.random.default_rng([given.seed, 6, number])
-        model = models[int(rng.integers(len(models)))]
-        mask = _stretched_mask(model, rng)
-        query = partial(library.retrieve, mask=mask, camera=KEYPOINT_CAMERA, top=MOST_ALIGNED)
-        wall, _, matches = section.clocked(query)
-        if number == 0:
-            first = wall
-            continue
-        keys = [(match.category, match.model_id) for match in matches]
-        own = (model.category, model.model_id)
-        row: Row = {"first": keys[0] == own, "aligned": own in keys}
-        found.append(row | {"category": keys[0][0] == own[0], "seconds": wall})
-    names = ("first", "aligned", "category")
-    shares = {name: float(np.mean([row[name] for row in found])) for name in names}
-    seconds = section.spread([row["seconds"] for row in found])
-    times = {"first query s": first, "seconds": seconds}
-    return {"models": len(models), "queries": len(found), **shares, **times}
-
-
-def _stretched_mask(model: AnnotatedModel, rng: np.random.Generator) -> np.ndarray:
-    scene = Scene(model.load_mesh())
-    scale = np.array([1.0, *np.exp(rng.uniform(-1, 1, 2) * np.log(2.0))])
-    how: dict[str, Any] = {"scale": scale, "fill": (0.6, 0.9), "roll": 10.0, "min_visible": 0}
-    view = sample_view(scene, model.keypoints.xyz, KEYPOINT_CAMERA, rng=rng, **how)
-    return np.asarray(cast_geometry(scene, KEYPOINT_CAMERA, view.cam_from_model).mask)
 
 
 def unseen_retrieval(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,12 @@ from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA as CAMERA
 from cadalign.io.evidence import ImageEvidence
+from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import Frame, RaycastRenderer, Scene, look_at
 from cadalign.retrieval import LibraryModel
 from cadalign.retrieval.page import draw_match, write_retrieval
-from cadalign.retrieval.query import read_opacity, read_query
+from cadalign.retrieval.query import read_opacity, read_query, read_query_mask
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,9 @@ class TestSilhouettes:
         for mask in (255 * frame.mask.astype(np.uint8), frame.mask.astype(float)):
             ranked = twins.retrieve(pixels, np.arange(7), CAMERA, mask=mask)
             assert [m.to_dict() for m in ranked] == [m.to_dict() for m in by_mask]
+        meshes = twins._table.mesh_at.cache_info()
+        assert meshes.misses == 2  # each is read once
+        pickle.loads(pickle.dumps(twins))
 
     @pytest.mark.slow
     def test_an_image_s_opacity_is_its_mask(self, twins) -> None:
@@ -352,27 +357,22 @@ def test_the_mask_of_an_observation_is_used(
     assert json.loads(capsys.readouterr().out)[0]["silhouette_iou"] > 0.5
 
 
-def test_what_is_shown_of_a_mask_alone_does_not_speak_of_keypoints(
+def test_an_observation_of_a_mask_alone_is_refused(
     case: Case, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    seen = replace(
-        case.observation,
-        points_3d=np.empty((0, 3)),
-        points_2d=np.empty((0, 2)),
-        ids=None,
-        evidence=ImageEvidence(mask=case.folder / "mask.png"),
-    )
-    seen.save(tmp_path / "seen.json")
-    arguments = [str(tmp_path / "seen.json"), *case.arguments[1:], "--out", str(tmp_path / "out")]
-    assert main(["retrieve", *arguments, "--category", "chair", "--top", "1"]) == 0
-    first = capsys.readouterr().out.splitlines()[2].split()
-    assert first[2] == case.model_id
-    assert first[-4] == "-"  # keypoints
-    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-    assert "The most likely model of " in page
-    assert "to explain the mask." in page
-    assert "residuals of the contour" in page
-    assert "keypoints" not in page
+    view = {"camera": CAMERA.to_dict(), "mask": str(case.folder / "mask.png")}
+    path = write_json(tmp_path / "seen.json", {"views": [view]})
+    text = refusal_line(capsys, "retrieve", path, *case.arguments[1:])
+    assert text == f"{path}: there are no keypoints"
+
+
+def test_a_mask_of_labels_is_read_as_a_fit_reads_it(tmp_path: Path) -> None:
+    mask = np.zeros((480, 640), dtype=np.uint8)
+    mask[90:150, 100:200] = 1
+    write_image(tmp_path / "labels.png", mask)
+    assert np.array_equal(read_query_mask(tmp_path / "labels.png", CAMERA), mask > 0)
+    write_image(tmp_path / "white.png", np.dstack([255 * mask] * 3))
+    assert np.array_equal(read_query_mask(tmp_path / "white.png", CAMERA), mask > 0)
 
 
 @pytest.mark.long

@@ -27,13 +27,10 @@ from cadalign.estimation.contours.view_contour import (
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.focal import prior_of_camera
 from cadalign.estimation.model import Model, is_exact_model
-from cadalign.estimation.options import FitOptions
 from cadalign.estimation.pack import evidence_of
-from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
 from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.view import View
-from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.shapes.model import ShapeModel
@@ -198,38 +195,6 @@ def minima_of_mask(
         if is_exact or np.exp(-score / 2) >= LEAST_LIKELIHOOD
     ]
     return likely, steps, starts, mistake
-
-
-class WholeOutline(NamedTuple):
-    """A model's alignment with a mask that shows all of it, roughly.
-
-    The ``residuals`` (S,) [px] are distances of the mask's contour from the rim; so many neighbours
-    as the ``correlation`` count as one. ``is_met`` says that the whole outline meets the contour.
-    """
-
-    alignment: Alignment
-    residuals: FloatArray
-    correlation: float
-    is_met: bool
-
-
-def align_outline(model: Model, view: View) -> WholeOutline | None:
-    """Align an exact model with a mask that shows all of it, roughly; None where it cannot be.
-
-    For a model of another object it takes a fraction of the time of `cadalign.align`, which seeks
-    the mask among parts of the silhouettes, too. Raises InputError if the mask has no contour or
-    the model no mesh.
-    """
-    lenses = Lenses.of([view], "known", None)
-    problem = JointProblem(prior_of(model), [view], None, FitOptions(), lenses)
-    contour, pixel = _rough_contour(view, lenses.cameras[0], _ROUGH_SIZE)
-    proposals, *_ = _searched(problem, model, contour, _SEARCHES[:1])
-    if not proposals:
-        return None
-    best = proposals[0]
-    (alignment,) = poses_of(best.minimum.evidence, best.minimum.state)
-    is_met = best.cost < _met_by(contour)
-    return WholeOutline(alignment, pixel * best.residuals, best.correlation, is_met)
 
 
 def _searched(

@@ -127,7 +127,7 @@ def _affine_cameras(atlas: Atlas, query: Whitened, most: int) -> tuple[FloatArra
 
     Matrices (n, 2, 3) and shifts (n, 2).
     """
-    (overlap,) = overlaps(atlas.views, query, mirrored=False)
+    overlap = overlaps(atlas.views, query)
     # A whitened silhouette may fit at several turns.
     is_peak = (overlap >= np.roll(overlap, 1, 1)) & (overlap >= np.roll(overlap, -1, 1))
     is_peak &= overlap > _LEAST_OF_BEST * overlap.max(axis=1, keepdims=True)

@@ -41,8 +41,6 @@ _CELL_VARIANCE = 1e-3  # that every silhouette has at least
 _CUT_EVERY = 2  # directions, of which the silhouettes are cut
 _CUT_SHARES = (0.15, 0.3)  # of the area that lies beyond a line
 _CUT_ANGLES = 12
-_OUTLINE_CELLS = 60
-_OUTLINE_EVERY = 2  # directions
 _MARGIN = 1.5  # of the image in which silhouettes are compared, relative to the mask's
 
 
@@ -68,20 +66,16 @@ class Atlas(NamedTuple):
     views: Whitened
 
 
-def overlaps(views: Whitened, query: Whitened, *, mirrored: bool = True) -> FloatArray:
-    """Intersections over unions (k, N, turns) of silhouettes and one that is turned.
-
-    The query's mirror image comes second: an affine image is that from the other side.
-    """
+def overlaps(views: Whitened, query: Whitened) -> FloatArray:
+    """Intersections over unions (N, turns) of silhouettes and one that is turned."""
     rings = query.rings[0].astype(np.float32) / 255
     count, turns = rings.shape
     weights = np.repeat(_radii(count), turns)
     around = (np.arange(turns)[:, None] + np.arange(turns)) % turns
-    images = [rings, np.roll(rings[:, ::-1], 1, axis=1)][: 1 + mirrored]
-    turned = [each[:, around].transpose(0, 2, 1).reshape(-1, turns) for each in images]
-    weighted = np.hstack(turned) * weights[:, None].astype(np.float32)
+    turned = rings[:, around].transpose(0, 2, 1).reshape(-1, turns)
+    weighted = turned * weights[:, None].astype(np.float32)
     flat = views.rings.reshape(len(views.rings), -1).astype(np.float32) / 255
-    common = (flat @ weighted).reshape(len(flat), -1, turns).transpose(1, 0, 2)
+    common = flat @ weighted
     areas = flat @ weights.astype(np.float32)
     return np.asarray(common / (areas[:, None] + weighted[:, 0].sum() - common), dtype=np.float64)
 
@@ -103,22 +97,11 @@ def atlas_of(mesh: Mesh, eye: float, *, is_cut: bool = False) -> Atlas:
     return _atlas(surface, directions, eye, _uncut)
 
 
-def outline_of(mesh: Mesh) -> Whitened:
-    """The silhouettes of a mesh from afar along fewer directions, to be compared with many others'.
-
-    Those from the other side are mirror images.
-    """
-    directions = _half_sphere(_DIRECTIONS)[::_OUTLINE_EVERY]
-    return _atlas(RigidSurface(mesh), directions, _AFAR, _uncut, cells=_OUTLINE_CELLS).views
-
-
 def _atlas(
     surface: RigidSurface,
     directions: FloatArray,
     eye: float,
     parts_of: Callable[[FloatArray], tuple[FloatArray, FloatArray]],
-    *,
-    cells: int = CELLS,
 ) -> Atlas:
     """Silhouettes along directions, and the parts of each by their moments and lines."""
     caster, corners = surface.caster, surface.corners
@@ -131,9 +114,9 @@ def _atlas(
         across = (corners - middle) @ base.T
         across *= far / (far + (corners - middle) @ direction)[:, None]
         low, high = across.min(axis=0), across.max(axis=0)
-        cell = float((high - low).max()) / cells or 1.0
-        columns, rows = np.minimum((high - low) // cell + 2, cells + 1).astype(int)
-        x, y = low[:, None] + cell * np.arange(cells + 1)
+        cell = float((high - low).max()) / CELLS or 1.0
+        columns, rows = np.minimum((high - low) // cell + 2, CELLS + 1).astype(int)
+        x, y = low[:, None] + cell * np.arange(CELLS + 1)
         grid = np.stack(np.meshgrid(x[:columns], y[:rows]), axis=-1).reshape(-1, 2)
         rays = (grid / far) @ base + direction
         covered = caster.covered(middle - far * direction, rays)

@@ -19,7 +19,6 @@ from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.demo import DemoOptions
-from cadalign.evaluation.experiments.estimates import EstimatesOptions
 from cadalign.evaluation.methods.registry import load_plugin
 from cadalign.evaluation.options import ExperimentOptions, FunctionOptions, PluginOption, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named, spec_of_config
@@ -191,16 +190,6 @@ class ReportCommand:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
     """Folders of runs, as `cadalign demo`, `evaluate` and `simulate` write them."""
-    estimates: tuple[Path, ...] = ()
-    """Files of poses that other programs estimated, with --data: BOP's results (CSV) or
-    scene_gt.json, or JSON in the form of Scan2CAD's annotations. Each is a method; they are scored
-    by the data set's metrics, in the folder --run, and shown beside the runs given."""
-    data: Path | None = None
-    """Folder of the photos that the estimates are of."""
-    run_folder: Annotated[Path, tyro.conf.arg(name="run")] = Path("runs/estimates")
-    """Folder of the scored estimates."""
-    workers: int = 0
-    """Processes that score estimates; -1 for one for each core."""
     out: Path | None = None
     """File to write. By default report.html, in the run's folder if it is one run; a table goes to
     standard output."""
@@ -214,35 +203,20 @@ class ReportCommand:
         """Write the report; returns the exit code."""
         from cadalign.report import headline_text, write_report
 
-        runs, code = self.runs, 0
-        if self.estimates or self.data is not None:
-            code = self._score()
-            runs = (self.run_folder, *runs)
         if self.format == "html":
-            page = runs[0] / "report.html" if len(runs) == 1 else Path("report.html")
-            report = write_report(runs, self.out or page, assets=self.assets)
+            page = self.runs[0] / "report.html" if len(self.runs) == 1 else Path("report.html")
+            report = write_report(self.runs, self.out or page, assets=self.assets)
             say(f"Report: {report.path}")
             if report.assets is not None:
                 say(f"Its pictures: {report.assets}, to be kept beside it")
-            return code
+            return 0
         if self.assets:
             what = f"a table has no pictures (--format {self.format})"
             raise InputError(what, where="--assets", fix="leave one of them out")
-        text = headline_text(runs, format=self.format)
+        text = headline_text(self.runs, format=self.format)
         if self.out is None:
             sys.stdout.write(text)
         else:
-            with keeping(path for run in runs for path in RunFolder(run).sources):
+            with keeping(path for run in self.runs for path in RunFolder(run).sources):
                 write_text(self.out, text)
-        return code
-
-    def _score(self) -> int:
-        """Score the estimates and print the table; returns the exit code."""
-        if self.data is None:
-            what = "the photos that they are of are not known"
-            fix = "give --data, the folder of the data set"
-            raise InputError(what, where="--estimates", fix=fix)
-        command = command_of(EstimatesOptions)
-        given = {"root": self.data, "estimates": self.estimates}
-        spec, run = command(**given, out=self.run_folder, workers=self.workers).do_run()
-        return conclude(spec, run, json=False)
+        return 0

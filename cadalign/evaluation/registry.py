@@ -142,7 +142,6 @@ _MODULES = (
     "unseen",
     "evidence",
     "photos",
-    "estimates",
     "tracks",
 )
 _REGISTERED: dict[str, Spec] = {}

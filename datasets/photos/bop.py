@@ -19,12 +19,9 @@ from cadalign.arrays import FloatArray
 from cadalign.datasets.photos.bop_files import (
     TRUTH,
     BopModels,
-    BopPoses,
     Nine,
     ScenePose,
     object_name,
-    read_bop_results,
-    read_scene_gt,
     stored_table,
     write_model,
     write_models_info,
@@ -34,7 +31,6 @@ from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     PhotoFormat,
     PoseEstimate,
-    PoseFile,
     leaving_out,
     parse,
     read_each,
@@ -210,14 +206,6 @@ class Bop(PhotoDataset):
         depth_path = _image(folder, ("depth",), key)
         depth = None if depth_path is None else DepthImage(depth_path, depth_scale)
         return Photo(self.names[index], image, camera, objects, depth=depth, problems=problems)
-
-    def open_poses(self, path: Path) -> PoseFile:
-        """Open a CSV file of results of the BOP challenge, or one as ``scene_gt.json``."""
-        if path.suffix.lower() == ".csv":
-            return BopPoses(path, read_bop_results(path), self)
-        if isinstance(read_json(path), list):
-            raise self.other_poses(path, f"give a CSV file of results, or one as {TRUTH}")
-        return BopPoses(path, read_scene_gt(path), self)
 
 
 def find_scenes(folder: Path) -> Iterator[Path]:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections import defaultdict
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -21,8 +20,8 @@ import numpy as np
 from msgspec import Meta
 
 from cadalign.arrays import FloatArray
-from cadalign.datasets.photos.dataset import PhotoDataset, PoseEstimate, PoseFile
-from cadalign.datasets.photos.photo import CadModel, Photo, existing
+from cadalign.datasets.photos.dataset import PoseEstimate
+from cadalign.datasets.photos.photo import CadModel, existing
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import Mesh
@@ -197,38 +196,6 @@ def read_scene_gt(path: Path) -> Estimates:
         except DataError as error:
             problems.append(error)
     return _unless_all_bad(poses, problems)
-
-
-class BopPoses(PoseFile):
-    """BOP's poses, by the numbers of scene and image."""
-
-    def __init__(self, path: Path, estimates: Estimates, dataset: PhotoDataset) -> None:
-        poses, self.problems = estimates
-        self._own = str(int(dataset.root.name)) if dataset.root.name.isdecimal() else ""
-        scenes = {each.scene for each in poses}
-        is_numbered = self._own or any("/" in name for name in dataset.names)
-        if not is_numbered and len(scenes) > 1:
-            what = f"poses of {len(scenes)} scenes, but {dataset.root} is a scene without a number"
-            fix = "give the data set's folder, or a file of that scene alone"
-            raise DataError(what, where=str(path), fix=fix)
-        # A file or a folder without a number is of the one scene there is.
-        self._any_scene = not is_numbered or scenes == {""}
-        self._poses: dict[tuple[str, str], list[PoseEstimate]] = defaultdict(list)
-        for each in poses:
-            self._poses["" if self._any_scene else each.scene, each.image].append(each)
-
-    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
-        return tuple(self._poses.get(self._key(photo.name), ()))
-
-    def strays(self, names: Sequence[str]) -> int:
-        known = {self._key(name) for name in names}
-        return sum(len(poses) for key, poses in self._poses.items() if key not in known)
-
-    def _key(self, name: str) -> tuple[str, str]:
-        scene, _, image = name.rpartition("/")
-        scene = scene.rpartition("/")[2]
-        number = str(int(scene)) if scene.isdecimal() else self._own
-        return "" if self._any_scene else number, str(int(image)) if image.isdecimal() else image
 
 
 def _unless_all_bad(poses: list[PoseEstimate], problems: list[DataError]) -> Estimates:

@@ -6,7 +6,7 @@ import logging
 from abc import ABC, abstractmethod
 from codecs import BOM_UTF8
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, MutableMapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -142,18 +142,6 @@ class PhotoDataset(ABC):
         """List the files of the annotations, by which a run knows those that it began with."""
         found = (path for pattern in self.patterns for path in self.root.glob(pattern))
         return sorted({path for path in found if path.is_file()})
-
-    def open_poses(self, path: Path) -> PoseFile:
-        """Open a file of poses that were estimated on this data set.
-
-        Raises InputError if it is not of the form of this data set, DataError if it cannot be read.
-        """
-        raise self.other_poses(path, "give poses on a data set of BOP or Scan2CAD")
-
-    def other_poses(self, path: Path, fix: str) -> InputError:
-        """The error of a file of poses that this data set's format does not know."""
-        what = f"not a file of poses for {self.kind}, which {self.root} holds"
-        return InputError(what, where=str(path), fix=fix)
 
     def summary(self, *, progress: Callable[[int], object] | None = None) -> PhotoSummary:
         """Read all records, not the images, and count what there is.
@@ -320,18 +308,3 @@ class PoseEstimate:
     cam_from_model: Alignment  # the pose, in the unit of the data set
     score: float = 1.0  # confidence; higher is better
     seconds: float | None = None  # time that the estimate took, of all objects in the photo
-
-
-class PoseFile(ABC):
-    """The poses of a file that was opened on a data set, by photo."""
-
-    problems: tuple[DataError, ...] = ()
-    """Why some of its records could not be read."""
-
-    @abstractmethod
-    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
-        """The estimates of a photo's objects, in the unit of the data set."""
-
-    @abstractmethod
-    def strays(self, names: Sequence[str]) -> int:
-        """Number of estimates, or scans, of photos that are not among these."""

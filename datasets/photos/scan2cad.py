@@ -6,8 +6,7 @@ Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,8 +18,6 @@ from cadalign.datasets.models.shapenet import MESH_FILES, name_of_synset
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     PhotoFormat,
-    PoseEstimate,
-    PoseFile,
     has,
     leaving_out,
     parse,
@@ -45,7 +42,7 @@ from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
-from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert, read_json
+from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert
 from cadalign.io.files import as_path
 
 FULL = "full_annotations.json"
@@ -154,7 +151,6 @@ class Scan2CAD(PhotoDataset):
         frames = [folder / name for name in _FRAME_FOLDERS]
         if scannet is not None:
             frames = [as_path(scannet, "scannet")]
-        self._frame_folders = frames
         below = [folder / name for name in _MODEL_FOLDERS]
         self._models = below if shapenet is None else [as_path(shapenet, "shapenet")]
         self._records: list[tuple[int, ScanNetFrame]] = []  # with the row of the scan
@@ -171,16 +167,6 @@ class Scan2CAD(PhotoDataset):
             fix = "give the folder of ScanNet's scenes: Scan2CAD(root, scannet=...)"
             raise DataError(what, where=str(self.annotations), fix=fix)
         super().__init__(folder, names, bad)
-
-    def open_poses(self, path: Path) -> PoseFile:
-        """Open annotations in the form of these, such as an estimate's, seen from these frames."""
-        if path.suffix.lower() == ".csv" or not isinstance(read_json(path), list):
-            raise self.other_poses(path, f"give JSON as {FULL}")
-        *others, last = self._frame_folders
-        for folder in others:
-            with suppress(DataError):
-                return _Poses(Scan2CAD(path, scannet=folder))
-        return _Poses(Scan2CAD(path, scannet=last))
 
     def read(self, index: int) -> Photo:
         """Read the photo of a number from 0."""
@@ -290,27 +276,6 @@ def _annotation_file(path: Path) -> tuple[Path, Path]:
         return path, found
     what = f"neither {FULL} nor {' nor '.join(_SAMPLES)} is here"
     raise DataError(what, where=str(path), fix="give the folder of Scan2CAD's annotations")
-
-
-class _Poses(PoseFile):
-    """Poses in the form of Scan2CAD's annotations, seen from the frames of the data set."""
-
-    def __init__(self, photos: Scan2CAD) -> None:
-        self._photos, self._names = photos, set(photos.names)
-        self.problems = tuple(photos.problems.values())
-
-    def poses_in(self, photo: Photo) -> tuple[PoseEstimate, ...]:
-        if photo.name not in self._names:
-            return ()
-        seen = self._photos[photo.name]
-        return tuple(
-            PoseEstimate("", photo.name, each.model.model_id, each.truth.cam_from_model)
-            for each in seen.objects
-            if each.model is not None and each.truth.cam_from_model is not None
-        )
-
-    def strays(self, names: Sequence[str]) -> int:
-        return len(self._names - set(names))
 
 
 def scan_entry(

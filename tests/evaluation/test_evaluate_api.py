@@ -36,7 +36,6 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
         "unseen",
         "evidence",
         "photos",
-        "estimates",
         "tracks",
     ]
     for options in known_options():

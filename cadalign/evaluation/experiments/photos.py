@@ -32,7 +32,7 @@ from cadalign.evaluation.metrics.photos import (
     shares_of,
 )
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.metrics.table import BOX_IOU, Metric
+from cadalign.evaluation.metrics.table import BOX_IOU
 from cadalign.evaluation.options import FunctionOptions, PhotoOptions
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.plots import cumulative_curves
@@ -124,20 +124,13 @@ HEADLINE = (
 
 def summarize(run: Run) -> list[Summary]:
     """A summary for every category and method, for all together, and the mean of categories."""
-    return summarize_cells(run.cells, run.methods, further=run.metrics)
-
-
-def summarize_cells(
-    cells: Cells, methods: Sequence[str], *, further: Sequence[Metric] = ()
-) -> list[Summary]:
-    """Summaries of the columns of a result table; see `summarize`."""
-    marked = {**cells, "category": _categories(cells)}
-    summarize = partial(_summarize, measured=measured_columns(protocols.SETS, cells))
-    found = summaries_of(marked, methods, summarize, further=further)
+    marked = {**run.cells, "category": _categories(run.cells)}
+    summarize = partial(_summarize, measured=measured_columns(protocols.SETS, run.cells))
+    found = summaries_of(marked, run.methods, summarize, further=run.metrics)
     names = dict.fromkeys(each.group for each in found if each.group not in (ALL, UNREADABLE))
     if len(names) < 2:
         return found
-    return [*found, *(_mean([s for s in found if s.method == name]) for name in methods)]
+    return [*found, *(_mean([s for s in found if s.method == name]) for name in run.methods)]
 
 
 def _categories(cells: Cells) -> npt.NDArray[np.object_]:

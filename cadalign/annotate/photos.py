@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.facing import require_perspective
 from cadalign.estimation.focal import FocalPrior
-from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.camera import Camera
 from cadalign.io import camera_file
 from cadalign.io.documents import Document, in_file, read_document, written_path
@@ -169,15 +169,15 @@ class Intrinsics:
 
 
 def read_camera(path: Path, size: tuple[int, int] | None = None) -> Camera:
-    """Read a camera as `camera_file` does, or the first one of an Open3D, NeRF or COLMAP file.
+    """Read a camera as `camera_file` does, or the first one of a COLMAP model's folder.
 
     ``size`` is the photos', for a file that holds a calibration matrix alone.
     """
     with reading(path):
         in_folder = path.is_dir()
-    if not in_folder and camera_file.is_camera_file(path):
-        return camera_file.read_camera(path, size=size)
-    return read_camera_views(path)[0].camera
+    if in_folder:
+        return Colmap(path)[0].camera
+    return camera_file.read_camera(path, size=size)
 
 
 def intrinsics_of(photo: PhotoFile, camera: Camera | None) -> Intrinsics:

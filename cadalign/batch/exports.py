@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from cadalign.batch.exported import exported_object
 from cadalign.batch.outputs import RECORD_COLUMNS
-from cadalign.datasets.detections.coco import write_coco_keypoints
-from cadalign.datasets.formats import write_photos
-from cadalign.datasets.photos import bop_files
-from cadalign.datasets.photos.dataset import PoseEstimate
-from cadalign.datasets.photos.photo import Photo
-from cadalign.datasets.sfm.colmap import require_name, write_colmap
-from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import (
     CadalignError,
     DataError,
@@ -31,32 +22,23 @@ from cadalign.errors import (
 from cadalign.estimation.result import Result
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import read_groups
-from cadalign.export.aligned_object import FORMS, AlignedObject, ExportView, names_of, photos_of
-from cadalign.export.camera_files import nerf_camera, write_nerf
+from cadalign.export.aligned_object import AlignedObject, ExportView
 from cadalign.export.formats import export_object, format_of
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.mesh import join
-from cadalign.io.documents import parse_json, written_path
+from cadalign.io.documents import parse_json
 from cadalign.io.files import keeping, listed, made_folder, write_json
 from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import OverlayStyle, Scene, overlay_model
 from cadalign.render.scene import LIGHT_GREY
 
-_MILLIMETRES = 1e-3
-_SAME = 1e-9  # of the model's size
+RUN_FORMATS = ("json", "overlay", "glb")
+"""The formats of whole runs."""
 _FIX = "do the run again"
-_SCENE = "1"
 _NOT_MOVED = Alignment(np.eye(3), np.zeros(3), np.ones(3))
 _Stored = tuple[Path, int, Observation, Result]
-
-
-class RunObject(NamedTuple):
-    """An aligned object of a run, with its row and category."""
-
-    row: int
-    category: str
-    exported: AlignedObject
+_Numbered = tuple[int, AlignedObject]
 
 
 @dataclass(frozen=True)
@@ -91,12 +73,6 @@ def export_run(
         - ``json``: the observation of each, and its ``fit.json`` in a folder beside it;
         - ``overlay``: each model drawn over its photo, further views as ``000000_1.png``;
         - ``glb``: one file of each object, in a folder; or all in one, in the camera's frame;
-        - ``coco``: keypoints and poses as COCO's annotations, photos of several folders by their
-          paths in the one that holds them;
-        - ``bop-results``: poses as BOP's CSV, each object's stretched mesh beside it; photos have
-          the numbers that their names are, those without one, or with another's, the free ones;
-        - ``colmap``, ``nerfstudio``: the cameras in the frame of the object that each sees;
-        - ``bop``, ``kitti``, ``pix3d``, ``scan2cad``, ``objectron``: a data set with its photos.
     metres : float
         Length of one unit of the model [m].
     rows : collection of int
@@ -113,15 +89,14 @@ def export_run(
     """
     folder = RunFolder(run)
     require_run(folder)
-    known = (DOCUMENTS, *RUN_FORMATS)
-    fix = f"of a run, give one of {', '.join(known)}"
-    if format is None and to.name not in known:
+    fix = f"of a run, give one of {', '.join(RUN_FORMATS)}"
+    if format is None and to.name not in RUN_FORMATS:
         try:
             format = format_of(to)
         except InputError as error:
             raise InputError(error.what, where=error.where, fix=fix) from None
     name = format or to.name
-    if name not in known:
+    if name not in RUN_FORMATS:
         raise InputError(f"the format {quote(name)} holds one fit", where="format", fix=fix)
     total = (folder.read_config() or {}).get("tasks", 0)
     for row in rows:
@@ -132,12 +107,13 @@ def export_run(
     results = _run_results(folder, rows)
     made_folder(to.parent)
     with keeping(_inputs(folder)):
-        if name == DOCUMENTS:
+        objects = _run_objects(results, metres, left_out)
+        if name == "json":
             count = _write_documents(to, results)
+        elif name == "glb":
+            count = _write_glb(to, objects, left_out)
         else:
-            objects = _run_objects(results, metres, left_out)
-            write = RUN_FORMATS[name] if style is None else partial(_write_overlays, style=style)
-            count = write(to, objects, left_out)
+            count = _write_overlays(to, objects, left_out, style)
     if not count:
         if left_out:
             raise all_left_out(left_out)
@@ -158,13 +134,6 @@ def require_run(folder: RunFolder) -> None:
     if fits:  # as of the objects of a scene
         fix = f"give the folder of one of the fits in it: {brief(', '.join(fits))}"
     raise DataError("neither a fit nor a run of fits", where=where, fix=fix)
-
-
-def _made_file(path: Path, name: str) -> Path:
-    """The file ``path``, or ``name`` in a folder ``path``; makes the folder that it is in."""
-    file = path if path.suffix.lower() == Path(name).suffix else path / name
-    made_folder(file.parent)
-    return file
 
 
 def _inputs(folder: RunFolder) -> Iterator[Path]:
@@ -203,16 +172,13 @@ def _records(folder: RunFolder) -> Iterator[tuple[Path, int, Observation, str]]:
 
 def _run_objects(
     results: Iterator[_Stored], metres: float, left_out: list[CadalignError]
-) -> Iterator[RunObject]:
+) -> Iterator[_Numbered]:
     """The aligned objects of results; those that lack something are left out."""
     for where, row, seen, result in results:
         try:
-            exported = exported_object(result, seen, where, metres=metres)
+            yield row, exported_object(result, seen, where, metres=metres)
         except CadalignError as error:
             left_out.append(error)
-        else:
-            category = seen.shape.stem if seen.shape is not None else exported.name
-            yield RunObject(row, category, exported)
 
 
 def _write_documents(folder: Path, results: Iterator[_Stored]) -> int:
@@ -226,21 +192,20 @@ def _write_documents(folder: Path, results: Iterator[_Stored]) -> int:
     return count
 
 
-def _write_glb(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
+def _write_glb(path: Path, objects: Iterator[_Numbered], left_out: list[CadalignError]) -> int:
     """One file of all objects in the camera's frame, or in a folder one of each, by its row."""
     placed, view, count = [], None, 0
     is_one = path.suffix.lower() == ".glb"
-    for each in objects:
+    for row, exported in objects:
         try:
             if is_one:
-                mesh = each.exported.placed_mesh("camera")
-                placed.append(mesh.stretched(each.exported.metres))
-                view = view or ExportView(each.exported.views[0].camera, _NOT_MOVED)
+                placed.append(exported.placed_mesh("camera").stretched(exported.metres))
+                view = view or ExportView(exported.views[0].camera, _NOT_MOVED)
             else:
-                export_object(path / f"{each.row:06d}.glb", each.exported)
+                export_object(path / f"{row:06d}.glb", exported)
             count += 1
         except InputError as error:
-            left_out.append(InputError(error.what, where=f"row {each.row}", fix=error.fix))
+            left_out.append(InputError(error.what, where=f"row {row}", fix=error.fix))
     if view is not None:
         export_object(path, AlignedObject((view,), mesh=join(placed, str(path)), name="objects"))
     return count
@@ -248,185 +213,28 @@ def _write_glb(path: Path, objects: Iterator[RunObject], left_out: list[Cadalign
 
 def _write_overlays(
     folder: Path,
-    objects: Iterator[RunObject],
+    objects: Iterator[_Numbered],
     left_out: list[CadalignError],
-    *,
-    style: OverlayStyle | None = None,
+    style: OverlayStyle | None,
 ) -> int:
     """Draw each model over its photos, grey where there is none."""
     made_folder(folder)
     count = 0
-    for each in objects:
+    for row, exported in objects:
         try:
-            if each.exported.mesh is None:
-                raise InputError("no mesh of the object is known", where=f"row {each.row}")
-            scene = Scene(each.exported.mesh)
-            for number, view in enumerate(each.exported.views):
+            if exported.mesh is None:
+                raise InputError("no mesh of the object is known", where=f"row {row}")
+            scene = Scene(exported.mesh)
+            for number, view in enumerate(exported.views):
                 camera, photo = view.camera, view.read_image()
                 if photo is None:
                     size = (camera.height, camera.width, 3)
                     photo = np.full(size, LIGHT_GREY, dtype=np.uint8)
                 drawn = overlay_model(photo, camera, scene, view.cam_from_model, style=style)
-                write_image(folder / _png_name(each.row, number), drawn)
+                name = f"{row:06d}_{number}.png" if number else f"{row:06d}.png"
+                write_image(folder / name, drawn)
         except (InputError, DataError, RenderError) as error:
             left_out.append(error)
         else:
             count += 1
     return count
-
-
-def _write_coco(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-    photos: dict[Path | str, Photo] = {}
-    count = 0
-    for photo in _photos(objects):
-        key = photo.image if isinstance(photo.image, Path) else photo.name
-        known = photos.setdefault(key, photo)
-        if known is not photo:
-            photos[key] = replace(known, objects=known.objects + photo.objects)
-        count += 1
-    names = names_of(photos)
-    named = [replace(photo, name=names.get(key, photo.name)) for key, photo in photos.items()]
-    write_coco_keypoints(_made_file(path, "keypoints.json"), named)
-    return count
-
-
-def _photos(objects: Iterator[RunObject]) -> Iterator[Photo]:
-    """The photos of objects, each object named after its row."""
-    for each in objects:
-        for number, photo in enumerate(photos_of(each.exported, category=each.category)):
-            named = (replace(found, object_id=str(each.row)) for found in photo.objects)
-            name = photo.name if photo.image is not None else _png_name(each.row, number)
-            yield replace(photo, name=name, objects=tuple(named))
-
-
-def _write_bop_results(
-    path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]
-) -> int:
-    """Poses of the stretched meshes, which stand beside them as ``obj_<row + 1>.ply``."""
-    file = _made_file(path, "results.csv")
-    poses, photos, entries = [], list[Path | str](), {}
-    for each in objects:
-        exported, model = each.exported, each.row + 1
-        scale = exported.views[0].cam_from_model.scale * exported.metres / _MILLIMETRES
-        if exported.mesh is not None:
-            entries[model] = bop_files.write_model(
-                file.parent, exported.mesh.stretched(scale), model
-            )
-        elif np.abs(scale - 1).max() > _SAME:
-            what = "BOP's poses have no stretch, and there is no mesh to stretch instead"
-            left_out.append(InputError(what, where=f"row {each.row}"))
-            continue
-        for number, view in enumerate(exported.views):
-            rigid = _rigid(view.cam_from_model, exported.metres / _MILLIMETRES)
-            poses.append(PoseEstimate(_SCENE, "", str(model), rigid))
-            photos.append(_photo(view, _png_name(each.row, number)))
-    if entries:
-        bop_files.write_models_info(file.parent, entries)
-    if poses:
-        numbers = bop_files.photo_numbers(photos)
-        numbered = zip(poses, photos, strict=True)
-        found = [replace(pose, image=str(numbers[photo])) for pose, photo in numbered]
-        bop_files.write_bop_results(file, found)
-    return len({each.model_id for each in poses})
-
-
-def _rigid(pose: Alignment, unit: float) -> Alignment:
-    """A pose without its stretch, lengths in another unit."""
-    return Alignment(pose.rotation, pose.translation * unit, np.ones(3))
-
-
-def _photo(view: ExportView, name: str) -> Path | str:
-    """The file of a view's photo; the name of the view where it has none."""
-    return view.image if isinstance(view.image, Path) else name
-
-
-def _png_name(row: int, number: int) -> str:
-    """The name of the picture of an object's view."""
-    return f"{row:06d}_{number}.png" if number else f"{row:06d}.png"
-
-
-def _cameras(objects: Iterator[RunObject]) -> list[tuple[CameraView, Path | str]]:
-    """The cameras in the frame of the object that each sees [m], and their photos."""
-    found = []
-    for each in objects:
-        for number, view in enumerate(each.exported.views):
-            placed = _rigid(view.cam_from_model, each.exported.metres)
-            name = f"{each.row:06d}_{number}.png"
-            found.append((CameraView(view.camera, placed, name), _photo(view, name)))
-    return found
-
-
-def _accepted(
-    cameras: list[tuple[CameraView, Path | str]],
-    require: Callable[[CameraView, Path | str], object],
-    left_out: list[CadalignError],
-) -> list[tuple[CameraView, Path | str]]:
-    """The cameras that ``require`` does not refuse by an InputError; others are left out."""
-    accepted = []
-    for view, photo in cameras:
-        try:
-            require(view, photo)
-        except InputError as error:
-            left_out.append(error)
-        else:
-            accepted.append((view, photo))
-    return accepted
-
-
-def _write_colmap(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-    """Write the cameras with names of their own: a photo's first one has that of the photo."""
-    cameras, views = _cameras(objects), {}
-    names = names_of(photo for _, photo in cameras)
-
-    def require(view: CameraView, photo: Path | str) -> None:
-        require_name(names.get(photo, view.name), str(photo))
-
-    for view, photo in _accepted(cameras, require, left_out):
-        name = names.get(photo, view.name)
-        if name in views:
-            name = f"{Path(view.name).stem}_{name}"
-        views[name] = replace(view, name=name)
-    if views:
-        write_colmap(path, list(views.values()))
-    return len(views)
-
-
-def _write_nerf(path: Path, objects: Iterator[RunObject], left_out: list[CadalignError]) -> int:
-    """Write the cameras with the paths of their photos."""
-    found = _accepted(
-        _cameras(objects), lambda view, photo: nerf_camera(view.camera, str(photo)), left_out
-    )
-    if found:
-        file = _made_file(path, "transforms.json")
-        folder = file.parent.absolute()
-        views = [
-            replace(view, name=written_path(photo.absolute(), folder=folder))
-            if isinstance(photo, Path)
-            else view
-            for view, photo in found
-        ]
-        write_nerf(file, views)
-    return len(found)
-
-
-def _write_data_set(
-    path: Path, objects: Iterator[RunObject], left_out: list[CadalignError], *, form: str
-) -> int:
-    photos = list(_photos(objects))
-    problems = write_photos(path, photos, form) if photos else ()
-    left_out.extend(problems)
-    return len(photos) - len(problems)
-
-
-DOCUMENTS = "json"
-"""The format that needs no mesh, nor anything else that a file must be read for."""
-RUN_FORMATS: dict[str, Callable[[Path, Iterator[RunObject], list[CadalignError]], int]] = {
-    "overlay": _write_overlays,
-    "glb": _write_glb,
-    "coco": _write_coco,
-    "colmap": _write_colmap,
-    "nerfstudio": _write_nerf,
-    "bop-results": _write_bop_results,
-    **{form: partial(_write_data_set, form=form) for form in FORMS},
-}
-"""The other formats by name."""

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from cadalign.cli.common import SOME_FAILED, SUCCESS, say
-from cadalign.cli.options import FlaggedOptions, named_as_flags
+from cadalign.cli.options import named_as_flags
 from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import refuse_unused
-from cadalign.export.formats import FORMATS, ExportOptions, export_object, format_of
-
-
-@dataclass(frozen=True)
-class _Options(FlaggedOptions, ExportOptions):
-    """Coordinates, and ids that formats ask for."""
-
+from cadalign.export.aligned_object import Frame
+from cadalign.export.formats import FORMATS, export_object, format_of
 
 _MOST_LISTED = 10
 
@@ -27,39 +22,33 @@ _MOST_LISTED = 10
 class Export:
     """Write a fit for another tool.
 
-    GLB and USD hold the textured model, stretched or warped, the cameras and the photos behind it:
-    they open in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh,
-    .lines.ply the box and cameras for Open3D, .csv and scene_gt.json poses for BOP with the
-    stretched mesh beside them, transforms.json and COLMAP's text files the cameras.
-    A run of many fits becomes the observation and fit.json of each, overlays, GLBs (a folder of one
-    each, or one file), COCO's keypoints with poses, BOP's results, cameras for COLMAP or
-    nerfstudio, or a data set in the form of BOP, KITTI, Pix3D, Scan2CAD or Objectron.
+    GLB holds the textured model, stretched or warped, the cameras and the photos behind it: it
+    opens in Blender, three.js and viewers as the overlay shows it. OBJ and PLY hold the mesh.
+    A run of many fits becomes the observation and fit.json of each, overlays, or GLBs (a folder of
+    one each, or one file).
     """
 
     fit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FIT.JSON|RUN")]
     """Result of `cadalign fit` or `cadalign annotate`; their folder; or the folder of a run of many
     fits."""
     to: Path
-    """File to write, or folder of a format of several files. For a run, a format's name is a folder
-    of that name: json, overlay, glb, coco, bop-results, colmap, nerfstudio, bop, kitti, pix3d,
-    scan2cad, objectron."""
+    """File to write. For a run, a format's name is a folder of that name: json, overlay, glb."""
     format: str | None = None
-    """Format, by default what the name's ending tells: glb, usd, obj, ply, lines, bop-results, bop,
-    scan2cad, nerfstudio, colmap, open3d-camera, coco."""
+    """Format, by default what the name's ending tells: glb, obj, ply."""
     observation: Path | None = None
     """Observation that was fitted; by default the one that the fit's file names."""
     shape: Path | None = None
     """Learned shape that was fitted; by default the observation's."""
     metres: float = 1.0
-    """Length of one unit of the model [m]. Written are metres, of BOP's files millimetres."""
+    """Length of one unit of the model [m]. Written are metres."""
+    frame: Frame = "camera"
+    """Frame of the exported coordinates: the first photo's camera, the frame that cameras of known
+    motion share, the world, or the stretched model's own."""
     world: Path | None = None
     """Text file of the first camera's pose in the world, 4 x 4, as ScanNet's pose files; for
     --frame world."""
     rows: tuple[int, ...] = ()
     """For a run, the numbers of the observations to write, by default all."""
-    options: Annotated[
-        _Options, tyro.conf.OmitArgPrefixes, tyro.conf.arg(help=_Options.__doc__)
-    ] = _Options()
 
     def run(self) -> int:
         """Write the file; returns the exit code."""
@@ -70,9 +59,9 @@ class Export:
             fit = fit / "fit.json"
         if fit.is_dir():
             return self._export_run()
-        with named_as_flags(self, self.options, others={"world_from_cam": "--world"}):
+        with named_as_flags(self, others={"world_from_cam": "--world"}):
             refuse_unused(self, ["rows"], "on one fit")
-            if self.options.frame != "world":
+            if self.frame != "world":
                 refuse_unused(self, ["world"], "without --frame world")
             name = self.format or format_of(self.to)
             exported = read_exported(
@@ -82,7 +71,7 @@ class Export:
                 world_from_cam=None if self.world is None else read_matrix(self.world, (4, 4)),
                 metres=self.metres,
             )
-            path = export_object(self.to, exported, format=name, options=self.options)
+            path = export_object(self.to, exported, format=name, frame=self.frame)
         say(f"{path}: {FORMATS[name].about}")
         return 0
 
@@ -92,10 +81,8 @@ class Export:
         from cadalign.evaluation.runs.folder import RunFolder
 
         require_run(RunFolder(self.fit))
-        with named_as_flags(self, self.options):
-            refuse_unused(self, ["observation", "shape", "world"], "on a run")
-            names = [each.name for each in fields(self.options)]
-            refuse_unused(self.options, names, "on a run")
+        with named_as_flags(self):
+            refuse_unused(self, ["observation", "shape", "world", "frame"], "on a run")
             found = export_run(
                 self.fit, self.to, format=self.format, metres=self.metres, rows=self.rows
             )

@@ -29,8 +29,8 @@ class Render:
     """File to write: .png or .jpg; .mp4 (H.264), .webm (VP9) or .gif for a turntable."""
     view: tuple[str, ...] = ("iso",)
     """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
-    degrees (write --view=-30,20 if it begins with a minus), all, or a camera file (Open3D's, or
-    NeRF's transforms.json)."""
+    degrees (write --view=-30,20 if it begins with a minus), all, or the folder of a COLMAP model,
+    for its cameras."""
     size: str = "640x480"
     """Image size WIDTHxHEIGHT in pixels; of a contact sheet, each picture's."""
     style: Literal["color", "depth", "normals", "faces", "lines"] = "color"

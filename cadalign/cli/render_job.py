@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from cadalign.arrays import FloatArray, as_floats, as_points
 from cadalign.datasets.models.model_keypoints import ModelKeypoints
+from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import DataError, InputError, brief, refuse_unused
-from cadalign.export.camera_files import read_camera_views
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.mesh import Mesh
@@ -74,7 +74,7 @@ class RenderJob:
             raise InputError(f"{command.scale} is not positive", where="--scale")
         views = tuple(view for word in command.view for view in _views(word, stretch))
         if views and not any(isinstance(view, Angles) for _, view in views):
-            refuse_unused(command, ["size", "fov"], "beside camera files, which have their own")
+            refuse_unused(command, ["size", "fov"], "beside a model of COLMAP, which has its own")
         if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
         if ending in MOVIES:
@@ -178,7 +178,9 @@ def _refuse_no_turntable(views: Sequence[LabelledView]) -> None:
         what, fix = f"a turntable starts in one view, not in {len(views)}", "give one"
         raise InputError(what, where="--view", fix=fix)
     if not isinstance(views[0][1], Angles):
-        raise InputError("a turntable starts from angles, not a camera file", where="--view")
+        raise InputError(
+            "a turntable starts from angles, not a COLMAP model's camera", where="--view"
+        )
 
 
 def _refuse_several_sizes(views: Sequence[LabelledView], camera: Camera) -> None:
@@ -197,11 +199,12 @@ def _refuse_several_sizes(views: Sequence[LabelledView], camera: Camera) -> None
 def _views(word: str, scale: FloatArray) -> list[LabelledView]:
     if word == "all":
         return [(name, Angles(*angles)) for name, angles in VIEWS.items()]
-    if word in VIEWS or not (word.endswith(".json") or Path(word).exists()):
+    if word in VIEWS or not Path(word).is_dir():
         return [(word, Angles.parse(word))]
     views: list[LabelledView] = []
-    for number, view in enumerate(read_camera_views(word)):
-        check_image_size(view.camera)
-        pose = Alignment(view.cam_from_world.rotation, view.cam_from_world.translation, scale)
-        views.append((view.name or f"{Path(word).stem} {number}", (view.camera, pose)))
+    for name in (model := Colmap(word)).ids:
+        photo = model[name]
+        check_image_size(photo.camera)
+        pose = Alignment(photo.cam_from_world.rotation, photo.cam_from_world.translation, scale)
+        views.append((name, (photo.camera, pose)))
     return views

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import Contribution
-    from cadalign.export import ExportOptions
+    from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
 
 
@@ -175,7 +175,7 @@ class Result(ResultData):
         path: str | os.PathLike[str],
         *,
         format: str | None = None,
-        options: ExportOptions | None = None,
+        frame: Frame = "camera",
         **of_the_object: Any,
     ) -> Path:
         """Write the aligned object for another tool; see `cadalign.export.export_object`.
@@ -183,8 +183,8 @@ class Result(ResultData):
         Parameters
         ----------
         path : path-like
-            Its ending chooses the format: ``.glb``, ``.usdz``, ``.obj``, ``.ply``, BOP's ``.csv``.
-        format, options
+            Its ending chooses the format: ``.glb``, ``.obj`` or ``.ply``.
+        format, frame
             As for `cadalign.export.export_object`.
         **of_the_object
             ``mesh``, ``image`` or ``images``, ``world_from_cam``, ``name`` and ``metres`` of
@@ -198,7 +198,7 @@ class Result(ResultData):
         from cadalign.export import export_object
 
         exported = object_of(self, **of_the_object)
-        return export_object(path, exported, format=format, options=options)
+        return export_object(path, exported, format=format, frame=frame)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as JSON, as `cadalign fit` does.

@@ -60,16 +60,6 @@ def read_camera(
         return Camera.from_dict(form)
 
 
-def is_camera_file(path: Path) -> bool:
-    """True for a file of a form that `read_camera` reads, other than those of other programs."""
-    if path.suffix.lower() == _ARRAY or not _is_json(path):
-        return True
-    data = read_json(path)
-    return isinstance(data, list) or (
-        isinstance(data, dict) and not {"params", *_MATRIX_NAMES}.isdisjoint(data)
-    )
-
-
 def _read_form(path: Path) -> dict[str, Any]:
     """The parsed form of a camera in a file."""
     if path.suffix.lower() == _ARRAY:

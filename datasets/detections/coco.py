@@ -6,7 +6,7 @@ The forms that are read are described in docs/formats/detections.md.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,17 +19,10 @@ from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.datasets.models.model_keypoints import FORMAT as MODEL_KEYPOINTS_FORMAT
 from cadalign.datasets.photos.dataset import leaving_out
-from cadalign.datasets.photos.photo import Photo
-from cadalign.datasets.photos.placed import PlacedObject
 from cadalign.errors import DataError, InputError, quote
-from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.conventions import PIXEL_CENTRE
-from cadalign.geometry.rotations import quat_wxyz_from_rotation
 from cadalign.io.documents import Count, Finite, ForeignDocument, Text, convert, in_file, read_json
-from cadalign.io.files import write_json
 
 _FIX = "is it COCO's keypoint JSON, or a detector's? see cadalign's page on keypoints of detectors"
-_OUTSIDE, _INFERRED, _OBSERVED = 0, 1, 2  # visibility flags
 _Id = int | str
 _Reader = tuple[str, Callable[[], ImageKeypoints | None]]
 """The place of an object in its file, and what reads it."""
@@ -367,8 +360,6 @@ class CocoObject:
     """(k,), 2 for keypoints that are observed, 1 for inferred ones; 0 for others, whose pixels
     don't count."""
     rectangle: FloatArray  # (4,), left, top, right and bottom
-    pose: Alignment | None = None
-    """From the model's axes to the camera's, with the model's scale [m]."""
     track: int | None = None  # of the object through the images of a video
 
     def annotation(self, number: int) -> dict[str, Any]:
@@ -376,17 +367,8 @@ class CocoObject:
         left, top, right, bottom = self.rectangle.tolist()
         pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
         rows = zip(pixels, self.flags.tolist(), strict=True)
-        further: dict[str, Any] = {}
-        if self.pose is not None:
-            further["pose"] = {
-                "quat_wxyz": quat_wxyz_from_rotation(self.pose.rotation).tolist(),
-                "translation": self.pose.translation.tolist(),
-                "scale": self.pose.scale.tolist(),
-            }
-        if self.track is not None:
-            further["track_id"] = self.track
         return {
-            **further,
+            **({} if self.track is None else {"track_id": self.track}),
             "id": number,
             "image_id": self.image,
             "category_id": 1 + self.category,
@@ -418,52 +400,3 @@ def coco_document(
         ],
         "annotations": [each.annotation(number) for number, each in enumerate(objects, start=1)],
     }
-
-
-def write_coco_keypoints(path: Path, photos: Sequence[Photo]) -> None:
-    """Write the keypoints of aligned objects as COCO annotations, one category for each model.
-
-    All keypoints of a model are projected. The visibility flag is 2 for those that are marked in
-    the photo, 1 for those that the alignment adds, and 0, with the coordinates 0, for those outside
-    the image, and for those that only another object of the model has. ``bbox`` is that of the
-    mesh, or else of the keypoints, in the image. ``pose`` is a field of its own: ``quat_wxyz`` and
-    ``translation`` [m] from the model's axes to the camera's, and ``scale`` along the model's axes
-    [m per model unit].
-
-    Raises InputError if the camera, a pose or a model is not known.
-    """
-    placed = [(row, PlacedObject(p, found)) for row, p in enumerate(photos) for found in p.objects]
-    models: dict[str, dict[str, int]] = {}  # the keypoints that any object of a model has
-    for _, each in placed:
-        columns = models.setdefault(each.model.model_id, {})
-        for name in each.names:
-            columns.setdefault(name, len(columns))
-    rows = {model_id: row for row, model_id in enumerate(models)}
-    cameras = [photo.known_camera for photo in photos]
-    images = [(p.name, c.width, c.height) for p, c in zip(photos, cameras, strict=True)]
-    objects = (
-        _projected(each, row, rows[each.model.model_id], models[each.model.model_id])
-        for row, each in placed
-    )
-    categories = ((model_id, tuple(columns)) for model_id, columns in models.items())
-    write_json(path, coco_document(images, categories, objects))
-
-
-def _projected(
-    placed: PlacedObject, image: int, category: int, columns: Mapping[str, int]
-) -> CocoObject:
-    """The keypoints of an object at the ``columns`` of its category; it may lack some."""
-    pixels = placed.camera.project_where_ahead(placed.pose.apply(placed.points))
-    inside: BoolArray = np.asarray(np.isfinite(pixels).all(axis=1))
-    inside[inside] = placed.camera.contains(pixels[inside])
-    observed = [name in placed.marked for name in placed.names]
-    flags = np.where(inside, np.where(observed, _OBSERVED, _INFERRED), _OUTSIDE)
-    try:
-        rectangle = placed.bbox + PIXEL_CENTRE
-    except InputError:  # an object behind the camera
-        rectangle = np.zeros(4)
-    pose = Alignment(placed.pose.rotation, placed.pose.translation, placed.scale)
-    own = [columns[name] for name in placed.names]
-    points_2d, of_all = np.zeros((len(columns), 2)), np.full(len(columns), _OUTSIDE)
-    points_2d[own], of_all[own] = np.round(pixels, 4), flags
-    return CocoObject(image, category, points_2d, of_all, rectangle, pose)

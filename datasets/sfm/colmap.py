@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, read and written: photos with known poses and the points they see.
+"""COLMAP's sparse models: photos with known poses and the points they see.
 
 Schönberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016. The files, text and binary
 (little endian), are described at https://colmap.github.io/format.html.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,19 +18,18 @@ import numpy.typing as npt
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.datasets.sfm.correspondences import (
-    CameraView,
     Correspondences,
     CorrespondenceSet,
     find_layout,
     rigid_pose,
 )
-from cadalign.errors import DataError, InputError, brief, quote
+from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.calibration import COLMAP_PARAMS
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.conventions import PIXEL_CENTRE
-from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import in_file
-from cadalign.io.files import as_path, damaged, made_folder, read_bytes, read_text, write_text
+from cadalign.io.files import as_path, damaged, read_bytes, read_text
 
 _STEMS = ("cameras", "images", "points3D")
 LAYOUTS = tuple(
@@ -138,46 +137,6 @@ class Colmap(CorrespondenceSet):
     def _of_another_model(self, what: str, file: Path, name: str) -> DataError:
         where = f"{self.source}, image {brief(name)}"
         return DataError(what, where=where, fix=f"does {file.name} belong to the same model?")
-
-
-def write_colmap(folder: str | os.PathLike[str], views: Sequence[CameraView]) -> None:
-    """Write a model without points as text, whose cameras other programs read.
-
-    Cameras that are equal are written once. Refused are poses with a scale, and names that are
-    missing, occur twice, or hold white space, where other programs end them.
-    """
-    if not views:
-        raise InputError("give at least one view", where="views")
-    names = [view.name for view in views]
-    if len(set(names)) < len(names) or not all(names):
-        raise InputError("every view needs an image name of its own", where="views")
-    for number, name in enumerate(names):
-        require_name(name, f"views[{number}]")
-    numbers: dict[Camera, int] = {}
-    images, cameras = [], []
-    for number, view in enumerate(views, start=1):
-        camera_id = numbers.setdefault(view.camera, len(numbers) + 1)
-        pose = view.rigid(f"views[{number - 1}]")
-        values = [*quat_wxyz_from_rotation(pose.rotation), *pose.translation]
-        images.append(f"{number} {_written(values)} {camera_id} {view.name}\n\n")
-    for camera, camera_id in numbers.items():
-        entry = camera.to_dict()
-        size = f"{camera.width} {camera.height}"
-        cameras.append(f"{camera_id} {entry['model']} {size} {_written(entry['params'])}\n")
-    folder = made_folder(as_path(folder, "folder"))
-    for stem, lines in zip(_STEMS, (cameras, images, ()), strict=True):
-        write_text(folder / f"{stem}.txt", "".join(lines))
-
-
-def require_name(name: str, where: str) -> None:
-    """Raise an InputError for the name of an image that COLMAP's text files cannot hold."""
-    if name.split() != [name]:
-        what = f"COLMAP's text files end the name {quote(name)} at its white space"
-        raise InputError(what, where=where, fix="rename the photo")
-
-
-def _written(values: Sequence[float]) -> str:
-    return " ".join(f"{value:.17g}" for value in values)
 
 
 # Binary files -------------------------------------------------------------------------------------

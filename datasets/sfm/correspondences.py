@@ -109,23 +109,6 @@ class Correspondences:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class CameraView:
-    """A camera and where it stands."""
-
-    camera: Camera
-    cam_from_world: Alignment  # its pose, with all scales 1
-    name: str = ""  # the image's name; empty where the file has none
-
-    def rigid(self, where: str) -> Alignment:
-        """The pose; raises InputError, which names the place, where it has a scale."""
-        if (self.cam_from_world.scale != 1).any():
-            what = f"the pose has the scale {self.cam_from_world.scale.tolist()}"
-            fix = "camera files hold rigid poses: stretch the model and give the pose with scale 1"
-            raise InputError(what, where=where, fix=fix)
-        return self.cam_from_world
-
-
 class CorrespondenceSet(ABC):
     """The images of a file, each with its correspondences, read one by one.
 

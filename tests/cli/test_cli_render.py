@@ -12,15 +12,14 @@ import pytest
 import trimesh
 import tyro
 from PIL import Image
+from support.files import write_cameras
 from support.refusals import refusal_line
 
 from cadalign import Camera
 from cadalign.cli.doctor import Doctor, Health, compiled_cache
 from cadalign.cli.render import Render
 from cadalign.datasets import load_mesh
-from cadalign.datasets.sfm.correspondences import CameraView
 from cadalign.errors import DataError, InputError, RenderError
-from cadalign.export.camera_files import write_open3d
 from cadalign.render import look_at
 from cadalign.render.probe import Probe, probe_renderer
 
@@ -117,12 +116,12 @@ def test_a_jpg_is_a_still(model, tmp_path):
     assert _pixels(out).shape[:2] == (60, 80)
 
 
-def test_a_camera_file_gives_the_view(model, tmp_path):
+def test_a_model_of_colmap_gives_the_view(model, tmp_path):
     camera = Camera.from_fov(120, 90, fov_x=40)
-    view = CameraView(camera, look_at(azimuth=90, elevation=0, distance=2))
-    write_open3d(tmp_path / "viewpoint.json", [view])
+    pose = look_at(azimuth=90, elevation=0, distance=2)
+    folder = write_cameras(tmp_path / "sparse", {"a.jpg": (camera, pose)})
     out = tmp_path / "v.png"
-    _run(model, "--out", out, "--view", tmp_path / "viewpoint.json", "--style", "depth")
+    _run(model, "--out", out, "--view", folder, "--style", "depth")
     pixels = _pixels(out)
     assert pixels.shape == (90, 120, 3)
     changed = (pixels != pixels[0, 0]).any(axis=2)
@@ -130,13 +129,15 @@ def test_a_camera_file_gives_the_view(model, tmp_path):
     # The side of 0.8 x 0.6, at a depth of 2 - 0.2.
     assert np.ptp(rows) + 1 == pytest.approx(0.8 / 1.8 * camera.fx, abs=1.5)
     assert np.ptp(columns) + 1 == pytest.approx(0.6 / 1.8 * camera.fx, abs=1.5)
-    views = ("--view", tmp_path / "viewpoint.json", "iso", "--size")
-    with pytest.raises(InputError, match=r"--view: .* 120x90 \(.*\), 200x100 \(iso\); give"):
+    views = ("--view", folder, "iso", "--size")
+    with pytest.raises(InputError, match=r"--view: .* 120x90 \(a.jpg\), 200x100 \(iso\); give"):
         _run(model, "--out", out, *views, "200x100")
     assert _run(model, "--out", tmp_path / "sheet.png", *views, "120x90") == 0
     for option in (("--size", "64x48"), ("--fov", "20")):
-        with pytest.raises(InputError, match=f"{option[0]}: has no effect beside camera files"):
-            _run(model, "--out", out, "--view", tmp_path / "viewpoint.json", *option)
+        with pytest.raises(
+            InputError, match=f"{option[0]}: has no effect beside a model of COLMAP"
+        ):
+            _run(model, "--out", out, "--view", folder, *option)
 
 
 @pytest.mark.long
@@ -200,7 +201,7 @@ def test_keypoints_from_a_list_and_from_annotations(model, tmp_path):
         (["--size", "20000x20000"], RenderError, "the limits are 16384 px a side"),
         (["--size", "999999999x1"], RenderError, "the limits are"),
         (["--view", "sideways"], InputError, "is not a view"),
-        (["--view", "nothing.json"], DataError, "no such file"),
+        (["--view", "nothing.json"], InputError, "is not a view"),
         (["--out", "picture.jpeg"], InputError, "neither a PNG nor an MP4"),
         (["--background", "mauve"], InputError, "is not a colour"),
         (["--background", "transparent", "--view", "all"], InputError, "can be transparent"),

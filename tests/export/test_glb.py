@@ -20,7 +20,7 @@ from cadalign import Camera, Mesh
 from cadalign.datasets import load_mesh
 from cadalign.datasets import open as open_photos
 from cadalign.errors import DataError, InputError
-from cadalign.export import AlignedObject, ExportOptions, ExportView, export_object
+from cadalign.export import AlignedObject, ExportView, export_object
 from cadalign.export.scene_parts import photo_plane
 from cadalign.geometry.mesh import Material
 from cadalign.render import Scene, cast_geometry
@@ -192,7 +192,7 @@ def test_world_frame_places_camera_and_object(tmp_path: Path) -> None:
     world[:3, 3] = 1, 2, 3
     exported = aligned(tmp_path, world_from_cam=world)
     path = tmp_path / "world.glb"
-    export_object(path, exported, options=ExportOptions(frame="world"))
+    export_object(path, exported, frame="world")
     camera = next(each for each in tree_of(path)["nodes"] if "camera" in each)
     place = np.reshape(camera["matrix"], (4, 4)).T[:3, 3]
     np.testing.assert_allclose(place, [1, 2, 3], rtol=1e-14)  # a rotation and back rounds
@@ -219,7 +219,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the image is 4 x 3, the camera 320 x 240"):
         export_object(tmp_path / "a.glb", replace(aligned(tmp_path), views=(small,)))
     with pytest.raises(InputError, match="no rig"):
-        export_object(tmp_path / "a.glb", aligned(tmp_path), options=ExportOptions(frame="rig"))
+        export_object(tmp_path / "a.glb", aligned(tmp_path), frame="rig")
     assert not (tmp_path / "a.glb").exists()
 
 

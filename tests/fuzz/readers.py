@@ -29,8 +29,6 @@ from cadalign.datasets import (
     load_mesh,
     read_image_keypoints,
 )
-from cadalign.datasets.sfm.correspondences import CameraView
-from cadalign.export.camera_files import read_camera_views, write_nerf, write_open3d
 from cadalign.io.images import photo_size, read_photo
 from cadalign.io.observation import Observation
 from cadalign.report import headline_text
@@ -313,17 +311,6 @@ def _read_library(path: Path) -> object:
     )
 
 
-def _write_views(write: Callable[..., None], name: str) -> Callable[[Path], Path]:
-    def write_views(folder: Path) -> Path:
-        write(
-            folder / name,
-            [CameraView(_CAMERA, Alignment(np.eye(3), [0, 0, 3], [1, 1, 1]), "a")] * 2,
-        )
-        return folder / name
-
-    return write_views
-
-
 def _read_annotations(path: Path) -> object:
     dataset = KeypointNet(path.parent.parent)
     return [model.keypoints for model in dataset], dataset.problems
@@ -397,7 +384,5 @@ FORMATS = {
             for name in ("run.json", "results.parquet", "timings.parquet")
         ),
         *dataset_formats.FORMATS,
-        Format("open3d", _write_views(write_open3d, "v.json"), read_camera_views),
-        Format("nerf", _write_views(write_nerf, "transforms.json"), read_camera_views),
     )
 }

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.files import write_cameras
 
 from cadalign import Camera
-from cadalign.datasets.sfm.colmap import Colmap, write_colmap
-from cadalign.datasets.sfm.correspondences import CameraView
+from cadalign.datasets.sfm.colmap import Colmap
 from cadalign.errors import InputError
-from cadalign.export.camera_files import read_camera_views, write_nerf
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.pixels import largest_angle
 from cadalign.geometry.rotations import rotation_from_vector
@@ -212,22 +211,5 @@ def test_a_matrix_may_be_a_fisheyes() -> None:
 @every_lens
 def test_colmap_keeps_wide_lenses(name: str, tmp_path) -> None:
     pose = Alignment(np.eye(3), [0.0, 0.0, 3.0], np.ones(3))
-    write_colmap(tmp_path, [CameraView(LENSES[name], pose, "a.png")])
+    write_cameras(tmp_path, {"a.png": (LENSES[name], pose)})
     assert Colmap(tmp_path)["a.png"].camera == LENSES[name]
-
-
-@pytest.mark.parametrize("name", ["equidistant", "opencv"])
-def test_nerf_files_keep_a_fisheye(name: str, tmp_path) -> None:
-    pose = Alignment(np.eye(3), [0.0, 0.0, 3.0], np.ones(3))
-    path = tmp_path / "transforms.json"
-    pinhole = Camera(640, 480, 500, 500, 320, 240)
-    views = [CameraView(LENSES[name], pose, "a.png"), CameraView(pinhole, pose, "b.png")]
-    write_nerf(path, views)
-    assert [view.camera for view in read_camera_views(path)] == [view.camera for view in views]
-
-
-@pytest.mark.parametrize("name", ["thin prism", "fov"])
-def test_nerf_files_have_no_place_for_other_lenses(name: str, tmp_path) -> None:
-    pose = Alignment(np.eye(3), [0.0, 0.0, 3.0], np.ones(3))
-    with pytest.raises(InputError, match="no place for more than k1, k2, p1, p2, or a fisheye's"):
-        write_nerf(tmp_path / "transforms.json", [CameraView(LENSES[name], pose, "a.png")])

@@ -44,7 +44,6 @@ from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
-from cadalign.export.camera_files import read_camera_views
 from cadalign.io.camera_file import read_camera
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.files import open_input, read_bytes, read_text
@@ -73,7 +72,6 @@ READERS = [
     *same(".json", read=Observation.load),
     *same(".json", ".csv", read=read_image_keypoints),
     *same(".json", ".txt", ".npy", read=lambda path: read_camera(path, size=(4, 4))),
-    *same(".json", read=read_camera_views),
     *same(".shape", read=ShapeModel.open),
     *same(".cadalign", read=Library.open),
     *same(".pkl", read=load_pickle),

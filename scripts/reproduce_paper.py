@@ -35,7 +35,6 @@ from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
 from cadalign.evaluation.summary import ALL, Summary, csv_text
 from cadalign.io.files import made_folder, write_text, writing
-from cadalign.web import asset, fill
 
 _TITLE = "The AEPnP paper's tables and figures"
 _METRICS = (metrics.ROTATION, metrics.TRANSLATION, metrics.SCALE_Y, metrics.SCALE_Z)
@@ -61,8 +60,7 @@ Announce = Callable[[str], Callable[[Progress], object]]
 def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda _: None) -> Path:
     """Run everything, or what is left of it; returns ``report.md``, beside figures and tables.
 
-    ``index.html`` is the same as a page. ``announce`` gets the name of the next run, and returns
-    the function that gets its progress.
+    ``announce`` gets the name of the next run, and returns the function that gets its progress.
     """
     made_folder(plan.out / "figures")
     sections = [f"# {_TITLE}\n", _settings(plan)]
@@ -70,17 +68,8 @@ def reproduce_paper(plan: PaperPlan, *, announce: Announce = lambda what: lambda
     for name in SWEEPS:
         sections.append(_sweep_section(plan, name, announce))
     report = plan.out / "report.md"
-    text = "\n".join(sections)
-    write_text(report, text)
-    write_text(plan.out / "index.html", _page(text))
+    write_text(report, "\n".join(sections))
     return report
-
-
-def _page(text: str) -> str:
-    from markdown_it import MarkdownIt
-
-    body = MarkdownIt("commonmark").enable("table").render(text)
-    return fill("paper.html", title=_TITLE, style=asset("report.css"), body=body)
 
 
 def _settings(plan: PaperPlan) -> str:

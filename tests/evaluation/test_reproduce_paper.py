@@ -46,15 +46,7 @@ def test_everything_is_in_one_folder_beside_the_papers_numbers(
         assert f"figures/{picture}.png" in report
     for link in (part.split(")")[0] for part in report.split("](")[1:]):
         assert (tmp_path / link).is_file(), link
-    page = (tmp_path / "index.html").read_text()
-    tables = len(re.findall(r"^\| :?---", report, re.M))
-    assert page.count("<table>") == tables == 3
-    assert '<th style="text-align:left">category</th>' in page
-    assert '<th style="text-align:right">R [deg]</th>' in page
-    pictures = re.findall(r'<img src="([^"]+)"', page)
-    assert all((tmp_path / picture).is_file() for picture in pictures)
-    assert f"figures/{picture}.png" in pictures
-    assert not re.search(r'(?:src|href)="(?:https?:)?//', page)
+    assert len(re.findall(r"^\| :?---", report, re.M)) == 3
     with (tmp_path / "table1.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert rows[0]["category"] == "all"

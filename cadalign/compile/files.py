@@ -6,6 +6,7 @@ going back to an older version compiles anything that was compiled before.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import io
 import json
@@ -309,11 +310,10 @@ class KernelFiles(CodeFiles):
         one could read code of an older version, or that of another signature. Where nothing can be
         written, every process compiles for itself (`cadalign doctor` says so).
         """
-        from filelock import FileLock
-
         try:
             os.makedirs(self._cache_path, exist_ok=True)
-            with FileLock(f"{self._index_path}.lock"):
+            with open(f"{self._index_path}.lock", "a") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
                 names = self._load_index()
                 taken = set(names.values())
                 free = (self._data_name(number) for number in count(1))

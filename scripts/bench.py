@@ -25,7 +25,7 @@ from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.annotator import annotator
 from benchmarks.cameras import photo_lenses, scenes
 from benchmarks.cars import noise_of_detector, real_detections
-from benchmarks.clicks import clicks, outline_methods, proposal_clicks
+from benchmarks.clicks import clicks, outline_methods
 from benchmarks.coverage import coverage
 from benchmarks.gradients import gradient_errors, torch_layer
 from benchmarks.masks import mask_alone, masks
@@ -73,7 +73,6 @@ ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "photo_times": photo_times,
     "clicks": clicks,
     "outlines": outline_methods,
-    "proposals": proposal_clicks,
     "detections": real_detections,
     "unseen_retrieval": unseen_retrieval,
     "similar": similar,

@@ -220,15 +220,15 @@ def identify(state: PhotoState, *, pair: Index, label: Index | Text) -> ActionOu
 
 
 def accept(state: PhotoState, *, keypoints: list[Index] | None = None) -> ActionOutcome:
-    """Place pairs at a detector's proposals for some keypoints, or for all that are left."""
+    """Place pairs at a detector's places of some keypoints, or of all that are left."""
     document, number = state.document, None
-    for proposal in state.proposals:
-        keypoint = proposal.keypoint
+    for found in state.detected:
+        keypoint = found.keypoint
         if (keypoints is None or keypoint in keypoints) and keypoint not in document.keypoints:
             number = document.next_number
-            document = document.append(Pair(number, proposal.uv, keypoint))
+            document = document.append(Pair(number, found.uv, keypoint))
     if number is None:
-        return ActionOutcome(message="Nothing is proposed that is not placed.")
+        return ActionOutcome(message="No keypoint of a detector is left to place.")
     state.record(document)
     return ActionOutcome(number)
 

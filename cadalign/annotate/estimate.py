@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.candidates import MaskCandidates
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.problem import LEAST_SIGMA, LIKELY_STRETCH, Known, LiveProblem
 from cadalign.arrays import BoolArray, FloatArray
@@ -50,10 +49,6 @@ class LiveAlignment:
     prior_lengths: FloatArray = field(default_factory=lambda: np.zeros(3))
     """(3,), standard deviations of the logarithms of the lengths before any pair."""
     also_used: tuple[str, ...] = ()  # evidence beyond the photo's pairs
-    candidates: MaskCandidates | None = None  # where the mask alone says where the search begins
-    chances: FloatArray = field(default_factory=lambda: np.empty(0))
-    """(k,), their probabilities with the pairs; 0 for those that these rule out."""
-    frames: tuple[Wireframe, ...] = ()  # lines of the model, warped to each of several candidates
 
     @classmethod
     def of(cls, known: Known, observation: Observation) -> LiveAlignment:
@@ -68,12 +63,8 @@ class LiveAlignment:
                 continue
             if (stored := observation.fit_options.get("sigma")) is not None:
                 sigma, options = stored, {"sigma": stored}
-            text = assumed.format(reason="" if reason is None else reason.what) or attempt.proposal
-            found = cls(result, text, attempt, sigma, options)
-            if attempt.is_by_mask:  # with the mask's candidates that the pairs leave
-                candidates, chances = attempt.candidates, attempt.chances
-                found = replace(found, candidates=candidates, chances=chances)
-            return found
+            text = assumed.format(reason="" if reason is None else reason.what) or attempt.unsaved
+            return cls(result, text, attempt, sigma, options)
         assert reason is not None
         raise reason
 

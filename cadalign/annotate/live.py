@@ -16,7 +16,6 @@ from cadalign.annotate.problem import LEAST_JOINT_PAIRS, LEAST_PAIRS, Known
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.estimation.result import Result
-from cadalign.estimation.result_parts import Alternative
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
@@ -54,7 +53,7 @@ def live_alignment(
     assert problem is not None
     counts = shape.known(points)
     free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
-    lines, carried = _warped(wireframe, result, result.ids, known, free)
+    lines, carried = _warped(wireframe, result, known, free)
     camera = result.cameras[place]
     residuals = np.empty((len(points), 2))
     residuals[counts] = result.views[place].residuals
@@ -72,7 +71,6 @@ def live_alignment(
         residuals=residuals,
         outliers={int(rows[row]): off for row, off in judged.contradicting(place).items()},
         wireframe=lines,
-        frames=_frames(estimate, known, wireframe),
         prior_lengths=(
             shape.length_sigmas(problem.model)
             if shape.is_estimated
@@ -80,16 +78,6 @@ def live_alignment(
         ),
         also_used=evidence_labels(observation),
     )
-
-
-def _frames(live: LiveAlignment, known: Known, wireframe: Wireframe) -> tuple[Wireframe, ...]:
-    """The model's lines warped to each of the mask's candidates that are left, if several are."""
-    candidates, left = live.candidates, np.flatnonzero(live.chances)
-    if candidates is None or len(left) < 2:
-        return ()
-    ids, nothing = candidates.result.ids, np.empty((0, 3))
-    every = (candidates.every[number] for number in left)
-    return tuple(_warped(wireframe, each, ids, known, nothing)[0] for each in every)
 
 
 def missing_text(counts: BoolArray, shape: ObjectShape, *, is_plain: bool, has_others: bool) -> str:
@@ -119,16 +107,15 @@ def _assumed_text(photos: tuple[str, ...], camera: Camera) -> str:
 
 def _warped(
     wireframe: Wireframe,
-    result: Result | Alternative,
-    ids: Sequence[Any],
+    result: Result,
     known: Known,
     free: FloatArray,
 ) -> tuple[Wireframe, FloatArray]:
     """The model warped such that its known keypoints come to the estimated ones, with points."""
     if not known.shape.is_estimated:
         return wireframe, free
-    rows = [row for row, label in enumerate(ids) if label in known.anchors]
-    source = np.array([known.anchors[ids[row]].xyz for row in rows]).reshape(-1, 3)
+    rows = [row for row, label in enumerate(result.ids) if label in known.anchors]
+    source = np.array([known.anchors[result.ids[row]].xyz for row in rows]).reshape(-1, 3)
     return wireframe.warped(source, result.points_3d[rows], result.bounds, carried=free)
 
 
@@ -138,7 +125,7 @@ def drawing_of(
     """Box and edges of the model and, for an own shape, its keypoints with regions that hold them.
 
     Regions of keypoints that the model lacks are the faint ones. There are none in another view
-    than the first, nor while several of the mask's candidates are left.
+    than the first.
     """
     result, lines = live.result, live.wireframe
     assert result is not None
@@ -150,7 +137,7 @@ def drawing_of(
         "regions": [],
         "faint_regions": [],
     }
-    if not shape.is_estimated or live.place or live.frames:
+    if not shape.is_estimated or live.place:
         return drawing
     in_camera = result.alignment.apply(result.points_3d)
     names = {shape.id_of(point): (point.name, number in used) for number, point in registry}

@@ -274,7 +274,7 @@ class ObjectShape:
 
 
 @dataclass(frozen=True)
-class Proposal:
+class Detected:
     """A keypoint of the model, where a detector puts it [px], and how sure."""
 
     keypoint: int

@@ -169,10 +169,10 @@ def model(state: PhotoState, *, category: Text, model: Text) -> ActionOutcome | 
     owner.model, owner.alone = new, None
     for each in owner.states:
         each.live = None
-        each.proposals = tuple(
-            replace(proposal, keypoint=carried[proposal.keypoint])
-            for proposal in each.proposals
-            if proposal.keypoint in carried
+        each.detected = tuple(
+            replace(one, keypoint=carried[one.keypoint])
+            for one in each.detected
+            if one.keypoint in carried
         )
     lost = before - len(state.document.keypoints)
     if not lost:
@@ -335,23 +335,10 @@ def use_photo(state: PhotoState, *, on: bool) -> ActionOutcome | None:
     return ActionOutcome(message="The photo takes the place of the mask; undo brings it back.")
 
 
-def begin_at(state: PhotoState, *, candidate: Index | None = None) -> None:
-    """Begin at one of the alignments that the mask allows, 0 for the one shown; None for none."""
-    if candidate is None:
-        state.mark(start=None)
-        return
-    live, _ = state.session.live(state)
-    known = () if live.candidates is None else live.candidates.every
-    if candidate >= len(known):
-        what = f"there is no candidate {candidate}"
-        raise InputError(what, where="candidate", fix="reload the page")
-    state.mark(start=StartFields.of(known[candidate].alignment))
-
-
 OBJECT_ACTIONS = (
     *(add_object, rename_object, delete_object, restore_object, add_view, remove_view, model),
 )
 EVIDENCE_ACTIONS = (
     *(focal, prior, mask_paint, mask_load, mask_cut, mask_clear, vertical, gravity_clear, lengths),
-    *(use_photo, begin_at),
+    use_photo,
 )

@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from cadalign.annotate.candidates import MaskCandidates
 from cadalign.annotate.document import AnnotationDocument, History, Pair, Pixel
 from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.evidence import MaskDrawing, draw_mask
 from cadalign.annotate.files import AnnotationFiles, written_half
-from cadalign.annotate.models import OpenedModel, Proposal
+from cadalign.annotate.models import Detected, OpenedModel
 from cadalign.annotate.names import file_name, mask_files, object_number
 from cadalign.annotate.photos import Intrinsics, PhotoFile
 from cadalign.annotate.problem import LEAST_JOINT_PAIRS
 from cadalign.annotate.suggestion import Suggestion
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import CadalignError, InputError
+from cadalign.estimation.result import Result
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import written_path
@@ -58,8 +58,8 @@ class AnnotatedObject:
         default=None, repr=False
     )
     """The last estimate of the object alone, from all photos, with the document it belongs to."""
-    by_mask: tuple[object, dict[Camera, MaskCandidates]] | None = field(default=None, repr=False)
-    """What the mask alone allows, with what it depends on."""
+    by_mask: tuple[object, dict[Camera, Result]] | None = field(default=None, repr=False)
+    """Estimates by the mask alone, with what they depend on."""
 
     @property
     def document(self) -> AnnotationDocument:
@@ -78,8 +78,8 @@ class AnnotatedObject:
         return [view for view in self.states if view is self.first or view.is_shown]
 
     @property
-    def allowed_by_mask(self) -> dict[Camera, MaskCandidates]:
-        """Alignments that the mask alone allows, kept until more than pairs changes."""
+    def estimates_by_mask(self) -> dict[Camera, Result]:
+        """Estimates by the mask alone, kept until more than pairs changes."""
         document = self.document
         key = replace(document.evidence, start=None), document.priors, self.model
         if self.by_mask is None or self.by_mask[0] != key:
@@ -113,7 +113,7 @@ class PhotoState:
     intrinsics: Intrinsics
     evidence: ImageEvidence = field(default_factory=ImageEvidence)
     """The photo's in the observation file, of which marks take the place."""
-    proposals: tuple[Proposal, ...] = ()  # of a detector
+    detected: tuple[Detected, ...] = ()  # of a detector
     drawn: tuple[MaskDrawing, Path, bool] | None = None
     """The mask that was written last, its file, and whether anything is in it."""
     live: tuple[object, LiveAlignment, Suggestion | None] | None = field(default=None, repr=False)

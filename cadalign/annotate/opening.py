@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cadalign.annotate.detected import read_detected
 from cadalign.annotate.document import History, Priors, history_path, read_history
 from cadalign.annotate.evidence import MarkedEvidence, MarkedLengths, MaskDrawing, draw_mask
 from cadalign.annotate.files import AnnotationFiles, StoredView
@@ -34,7 +35,6 @@ from cadalign.annotate.photos import (
     read_camera,
 )
 from cadalign.annotate.problem import LIKELY_STRETCH
-from cadalign.annotate.proposals import read_proposals
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.geometry.camera import Camera
@@ -123,9 +123,9 @@ def open_session(
     for photo, file in zip(files.photos, files.observations, strict=True):
         session.objects.append(_open_photo(session, options, photo, file, camera, photo is first))
     if options.detections is not None:
-        found = read_proposals(options.detections, files.photos, models[0].registry)
-        for state, proposals in zip(session.photos, found, strict=True):
-            state.proposals = proposals
+        found = read_detected(options.detections, files.photos, models[0].registry)
+        for state, detected in zip(session.photos, found, strict=True):
+            state.detected = detected
     for view in [view for owner in session.owners for view in owner.states[1:]]:
         place = next((row for row in session.objects if row[0].key == view.key), None)
         if place is None:  # a photo that is nothing but a further view

@@ -42,7 +42,7 @@ class FileOptions:
     further_photos: tuple[Path, ...] = ()
     """Further photos, such as other views of the same object, which the page can add to it."""
     detections: Path | None = None
-    """Keypoints of a detector, proposed to confirm or correct: COCO's JSON, MMPose's, ultralytics'
+    """Keypoints of a detector, to confirm or correct: COCO's JSON, MMPose's, ultralytics'
     or CSV, with the photos' file names and the names of the model's keypoints."""
     library: Path | None = None
     """File of `cadalign library build`: the model can be chosen from it by the pairs marked so far,

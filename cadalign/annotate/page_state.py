@@ -12,17 +12,16 @@ import numpy as np
 from cadalign.annotate.actions import MIRRORED
 from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.evidence import MarkedLengths, find_up
-from cadalign.annotate.live import box_of, drawing_of, facts_of, flat, notes_of
+from cadalign.annotate.live import box_of, drawing_of, facts_of, notes_of
 from cadalign.annotate.object_actions import ActionOutcome
 from cadalign.annotate.objects import PhotoState, shown_objects
-from cadalign.annotate.problem import LEAST_JOINT_PAIRS, LIKELY_STRETCH
+from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.annotate.session import Session
-from cadalign.annotate.suggestion import Suggestion, ToldApart, name_of, next_best_text
+from cadalign.annotate.suggestion import name_of, next_best_text
 from cadalign.errors import CadalignError
 from cadalign.io.documents import read_json
 from cadalign.io.evidence import LENGTHS
 
-_NUMBERS = ("no", "one", "two", "three")
 _VIEW = re.compile(r"views\[(\d+)\]")
 
 
@@ -86,21 +85,19 @@ def page_state(
                 }
                 for keypoint, point in registry
             ],
-            "proposals": [
-                {**asdict(proposal), "name": registry[proposal.keypoint].name}
-                for proposal in state.proposals
-                if proposal.keypoint not in used
+            "detected": [
+                {**asdict(found), "name": registry[found.keypoint].name}
+                for found in state.detected
+                if found.keypoint not in used
             ],
             "shape": _shape(state),
             "alignment": _alignment(state, live),
-            "by_mask": _candidates(state, live, suggestion),
             "suggestion": None
             if suggestion is None
             else {
                 "keypoint": suggestion.point.semantic_id,
                 "xyz": cad.to_display(suggestion.point.xyz).tolist(),
                 "uv": suggestion.uv,
-                "others": getattr(suggestion.next_best, "places", None),
                 "text": next_best_text(suggestion.next_best, name_of(suggestion)),
             },
             "objects": [
@@ -186,39 +183,6 @@ def _shape(state: PhotoState) -> dict[str, Any] | None:
         "category": None if shape.learned is None else shape.learned.category,
         "missing": [label for label in shape.ids if label not in known],
     }
-
-
-def _candidates(
-    state: PhotoState, live: LiveAlignment, suggestion: Suggestion | None
-) -> dict[str, Any]:
-    """Alignments that mask and pairs allow, as lines x1, y1, x2, ... [px], if several are left.
-
-    ``chosen`` says that the user has decided for one, ``text`` how many clicks leave one.
-    """
-    chosen, candidates = state.is_first and state.begins, live.candidates
-    found: dict[str, Any] = {"chosen": chosen, "candidates": [], "text": ""}
-    if chosen or candidates is None or not live.frames:
-        return found
-    left = np.flatnonzero(live.chances)
-    most = float(live.chances.max())
-    shown: list[dict[str, Any]] = [
-        {
-            "number": int(number),
-            "lines": flat(frame.seen_in(live.camera, candidates.every[number].alignment)),
-            "likelihood": float(live.chances[number]) / most,
-        }
-        for number, frame in zip(left, live.frames, strict=True)
-    ]
-    shown.sort(key=lambda each: -each["likelihood"])
-    told = None if suggestion is None else suggestion.next_best
-    text = "choose one, or mark pairs"
-    if isinstance(told, ToldApart):
-        pairs = len(state.known_pairs)
-        clicks = LEAST_JOINT_PAIRS - pairs if told.clicks is None else told.clicks
-        clicks = min(clicks, LEAST_JOINT_PAIRS - pairs)  # which need no mask
-        text = f"choose one, or click: {_NUMBERS[clicks]} click{'s' * (clicks > 1)}"
-        text += " settles it" if clicks == 1 else " settle it"
-    return found | {"candidates": shown, "text": f"The mask allows several alignments: {text}."}
 
 
 def _moved(state: PhotoState) -> str:

@@ -13,11 +13,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from cadalign.annotate.candidates import MaskCandidates
 from cadalign.annotate.models import ObjectShape
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
-from cadalign.errors import CadalignError, DegenerateError
+from cadalign.errors import CadalignError
 from cadalign.estimation.align import align
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.model import Model
@@ -65,8 +64,8 @@ class Known:
     """Photos whose focal length is neither known nor estimated, this one by an empty name."""
     estimates_focal: bool = False  # estimate the focal lengths of all photos
     focal_prior: FocalPrior | None = None  # on these
-    by_mask: dict[Camera, MaskCandidates] = field(default_factory=dict)
-    """What the mask alone allows, by the camera; kept while nothing but pairs changes."""
+    by_mask: dict[Camera, Result] = field(default_factory=dict)
+    """Estimates by the mask alone, by the camera; kept while nothing but pairs changes."""
 
     def model_for(self, observation: Observation) -> Model | ShapeModel:
         """The model that `cadalign fit` aligns to the observation.
@@ -97,7 +96,7 @@ class LiveProblem:
     estimates_focal: bool
     focal_prior: FocalPrior | None
     init: Alignment | None = None
-    by_mask: dict[Camera, MaskCandidates] = field(default_factory=dict)
+    by_mask: dict[Camera, Result] = field(default_factory=dict)
 
     @classmethod
     def of(cls, known: Known, observation: Observation) -> LiveProblem:
@@ -124,16 +123,14 @@ class LiveProblem:
         return model if isinstance(model, Model) and model.shape_sigma is None else None
 
     @property
-    def proposal(self) -> str:
+    def unsaved(self) -> str:
         """Says that it is shown and not saved, since `cadalign fit` would not find it; else empty.
 
-        That knows neither a similar model's other keypoints nor where the mask's search begins.
+        That does not know a similar model's other keypoints.
         """
-        if self.exact is None and self.is_by_mask:
-            return "A proposal by the mask: it is saved from the third pair on."
         is_similar = self.exact is None and isinstance(self.model, Model)
         if is_similar and not any(len(view.keypoint_ids) for view in self.views):
-            return "A proposal: it is saved from the first pair on."
+            return "It is saved from the first pair on."
         return ""
 
     def attempts(self) -> Iterator[tuple[LiveProblem, str]]:
@@ -174,10 +171,8 @@ class LiveProblem:
         if self.estimates_focal:
             options |= {"focal": "estimate", "focal_prior": self.focal_prior}
         init = self.init
-        if self.is_by_mask:
-            if not len(self.views[0].keypoint_ids):
-                return self.candidates.result
-            init = self.candidates.every[int(np.argmax(self.chances))].alignment
+        if self.is_by_mask and len(self.views[0].keypoint_ids):
+            init = self._start_by_mask()
         return align(self.model, self.views, size=self.size, init=init, **options)
 
     @property
@@ -187,31 +182,21 @@ class LiveProblem:
         few = len(self.views) == 1 and len(view.keypoint_ids) < LEAST_JOINT_PAIRS
         return few and view.mask is not None and self.init is None
 
-    @property
-    def candidates(self) -> MaskCandidates:
-        """Alignments that the mask of the only view allows."""
-        (view,) = self.views
+    def _start_by_mask(self) -> Alignment:
+        """The alignment by the mask alone that agrees best with the pairs."""
+        (view,), model = self.views, self.exact
+        assert model is not None
         if view.camera not in self.by_mask:
             alone = replace(without_keypoints(view), image=None)
-            result = align(self.model, alone, size=self.size)
-            self.by_mask[view.camera] = MaskCandidates.of(self.model, view.camera, result)
-        return self.by_mask[view.camera]
+            self.by_mask[view.camera] = align(model, alone, size=self.size)
+        result, points = self.by_mask[view.camera], _points_of(model, view.keypoint_ids)
 
-    @property
-    def chances(self) -> FloatArray:
-        """Probabilities (k,) of the candidates; raises DegenerateError if the pairs exclude all."""
-        (view,), model = self.views, self.model
-        ids = list(view.keypoint_ids)
-        points = np.zeros((len(ids), 3))
-        if isinstance(model, Model) and ids:
-            points = _points_of(model, ids)
-        chances = self.candidates.probabilities(ids, points, np.asarray(view.points_2d))
-        if not chances.any():
-            missing = LEAST_JOINT_PAIRS - len(ids)
-            what = "the pairs agree with none of the poses that the mask allows"
-            more = f"{missing} more pair{'s' * (missing > 1)} to the first alignment"
-            raise DegenerateError(f"{what}; {more}", where="views", fix="mark another pair")
-        return chances
+        def gap(alignment: Alignment) -> float:
+            pixels = view.camera.project(alignment.apply(points))
+            return float(np.linalg.norm(pixels - np.asarray(view.points_2d)))
+
+        found = (result.alignment, *(each.alignment for each in result.alternatives))
+        return min(found, key=gap)
 
     def solve(self) -> tuple[Result, float, Mapping[str, Any]]:
         """Align at the noise that is due; with its factor [px] and the options of the fit."""
@@ -325,12 +310,10 @@ class LiveProblem:
 def _shows_surface(observation: Observation) -> bool:
     """True if a mask, a depth image or the photo bears on the mesh, which every keypoint warps.
 
-    Not of proposals, which are not saved: without a pair, and where the mask alone says where the
-    search begins, with fewer than three.
+    Not without a pair, which is not saved.
     """
-    evidence, count = observation.evidence, len(observation.points_2d)
-    by_mask = evidence.mask is not None and observation.init is None
-    if count < (LEAST_JOINT_PAIRS if by_mask else 1):
+    evidence = observation.evidence
+    if not len(observation.points_2d):
         return False
     has_photo = bool(observation.fit_options.get("image"))
     return has_photo or evidence.mask is not None or evidence.depth is not None

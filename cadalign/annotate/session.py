@@ -162,9 +162,9 @@ class Session:
         """Say what the first alignment needs; empty if nothing."""
         observation, pairs = state.observation(), state.document.complete_pairs
         is_single = len(observation.views) == 1
+        by_mask = observation.evidence.mask is not None and not self.shape.is_estimated
         by_photo = observation.init is not None and "image" in observation.fit_options
-        is_enough = observation.evidence.mask is not None or by_photo
-        if self.shape.has_mesh and is_single and is_enough:
+        if is_single and (by_mask or (by_photo and self.shape.has_mesh)):
             return ""
         return missing_text(
             self.shape.known(state.model.points_of(pairs)),
@@ -216,7 +216,7 @@ class Session:
             assumed_focal=() if is_estimated else tuple(names),
             estimates_focal=is_estimated,
             focal_prior=owner.document.priors.focal,
-            by_mask=owner.allowed_by_mask,
+            by_mask=owner.estimates_by_mask,
         )
 
     def save(self, owner: AnnotatedObject) -> None:

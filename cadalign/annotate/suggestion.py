@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.annotate.candidates import best_click, clicks_needed
 from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.live import short
 from cadalign.annotate.model import ClickableModel
@@ -58,23 +57,12 @@ class NextBest:
 
 
 @dataclass(frozen=True)
-class ToldApart:
-    """The mask's candidates, of which a click leaves few, ``clicks`` leave one.
-
-    None if no clicks do. The ``places`` [px] are where the others predict the keypoint.
-    """
-
-    clicks: int | None
-    places: tuple[tuple[float, float], ...]
-
-
-@dataclass(frozen=True)
 class Suggestion:
     """The next-best keypoint of the model, or a corner of the surface without a semantic id."""
 
     point: ModelKeypoint
     uv: tuple[float, float]  # its predicted place in the photo [px]
-    next_best: NextBest | ToldApart | float
+    next_best: NextBest | float
     """What is gained; for an own shape the standard deviation of its place in the photo [px]."""
 
 
@@ -93,9 +81,6 @@ def suggest(
     if result is None or live.place or result.covariance is None:
         return None
     own = [point for number, point in registry if number not in used]
-    if live.frames:
-        known = [point for point in own if shape.id_of(point) is not None]
-        return _suggest_among(live, known, shape)
     if shape.is_estimated:
         return _suggest_of_shape(live, own, shape)
     if "x" in result.stretched_axes:
@@ -142,32 +127,6 @@ def _suggest_of_shape(
     best = int(np.argmax(np.round(gain, 9)))
     chosen, sigma = int(rows[best]), float(np.sqrt(np.trace(covariances[best])))
     return _predicted(live, by_id[result.ids[chosen]], result.points_3d[chosen], sigma)
-
-
-def _suggest_among(
-    live: LiveAlignment, own: Sequence[ModelKeypoint], shape: ObjectShape
-) -> Suggestion | None:
-    """Choose the keypoint whose click tells the mask's candidates apart best."""
-    candidates, chances = live.candidates, live.chances
-    if candidates is None or not own:
-        return None
-    ids = [shape.id_of(point) for point in own]
-    points = np.array([point.xyz for point in own])
-    places, sigmas = candidates.predicted(ids, points)
-    seen = np.zeros(sigmas.shape, dtype=bool)
-    left = np.flatnonzero(chances)
-    for number, frame in zip(left, live.frames, strict=True):
-        each = candidates.every[number]
-        of_each = candidates.points_of(each, ids, points), live.camera, each.alignment
-        seen[number] = visible_keypoints(frame.scene, *of_each, tolerance=_BENEATH)
-    row = best_click(chances, places, sigmas, seen)
-    if row is None:
-        return None
-    likeliest, *others = left[np.argsort(-chances[left], kind="stable")]
-    u, v = places[likeliest, row].tolist()
-    elsewhere = tuple((u, v) for u, v in places[others, row].tolist() if np.isfinite(u + v))
-    clicks = clicks_needed(chances, places, sigmas, seen)
-    return Suggestion(own[row], (u, v), ToldApart(clicks, elsewhere))
 
 
 def _predicted(
@@ -285,10 +244,8 @@ def _widening(result: Result) -> float:
     return float(np.sqrt(np.mean(calibrated.diagonal()[known] / linear.diagonal()[known])))
 
 
-def next_best_text(next_best: NextBest | ToldApart | float, name: str) -> str:
+def next_best_text(next_best: NextBest | float, name: str) -> str:
     """Name of the next-best keypoint, and what is gained by it."""
-    if isinstance(next_best, ToldApart):
-        return f"Click in the photo: {name}. It tells the mask's alignments apart best."
     if isinstance(next_best, float):
         known = f"so far known to ± {short(next_best)} px"
         return f"{name}: {known}; it would tell most about pose and shape"

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -15,11 +13,8 @@ from benchmarks import section
 from benchmarks.photo import PhotoClicks, drawn_clicks, real_cases
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Model, View, align
-from cadalign.annotate.candidates import MaskCandidates, best_click
-from cadalign.datasets import AnnotatedModel, KeypointNet, write_sample_dataset
-from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.metrics import rotation_error
-from cadalign.render import Scene, cast_geometry, sample_view
+from cadalign.render import Scene, cast_geometry
 from cadalign.retrieval.silhouettes import grab_cut
 
 _FEWEST = 3
@@ -116,108 +111,6 @@ def outline_methods(given: BenchmarkData, *, draws: int = 5) -> Tables:
             found[f"{clicks.case.group}, {name}"].append(row)
     rows = [{"photos": name, **section.summary(each)} for name, each in found.items()]
     yield "rough clicks refined, rigid models: medians", rows
-
-
-def proposal_clicks(
-    given: BenchmarkData,
-    *,
-    models: int = 4,
-    views: int = 2,
-    shape_sigma: float = 0.06,
-    categories: tuple[str, ...] = ("bottle", "car", "chair", "vessel"),
-) -> Tables:
-    """Clicks that tell apart what a mask allows of a model that is only similar.
-
-    Photos of sample models, stretched by 0.74 to 1.35, exact masks, and the next model of the
-    category with the keypoints that both have. The clicks, off by 2 px, are those that the
-    annotator asks for, on visible keypoints, until one alignment is left. Right is a rotation
-    within 30 degrees, up to the object's symmetry.
-
-    Parameters
-    ----------
-    models : int
-        Models of each category.
-    views : int
-        Views of every model.
-    shape_sigma : float
-        Standard deviation of a keypoint on the object about the model's [model units].
-    categories : tuple[str, ...]
-        Categories of the sample.
-    """
-    found: dict[str, list[Row]] = defaultdict(list)
-    with tempfile.TemporaryDirectory() as folder:
-        sample = write_sample_dataset(Path(folder) / "sample", per_category=models)
-        for category in categories:
-            alike = [each for each in KeypointNet(sample) if each.category == category]
-            for number, own in enumerate(alike):
-                other = alike[(number + 1) % len(alike)]
-                for view in range(views):
-                    rng = np.random.default_rng([given.seed, 5, number, view])
-                    found[category].append(_clicked(own, other, rng, shape_sigma))
-    every = [row for rows in found.values() for row in rows]
-    table = [_told(name, rows) for name, rows in {**found, "all": every}.items()]
-    yield "clicks among what a mask allows of a similar model", table
-
-
-def _clicked(
-    own: AnnotatedModel, other: AnnotatedModel, rng: np.random.Generator, shape_sigma: float
-) -> Row:
-    """Click until one alignment is left."""
-    scene, scale = Scene(own.load_mesh()), np.exp([0.0, *rng.uniform(-0.3, 0.3, 2)])
-    how = {"rng": rng, "scale": scale, "fill": (0.6, 0.9), "roll": 10.0}
-    view = sample_view(scene, own.keypoints.xyz, KEYPOINT_CAMERA, min_visible=4, **how)
-    gt = view.cam_from_model
-    pixels = KEYPOINT_CAMERA.project(gt.apply(own.keypoints.xyz))
-    places = dict(zip(own.keypoints.ids.tolist(), pixels, strict=True))
-    visible = set(own.keypoints.ids[view.visible].tolist())
-    ids, points = other.keypoints.ids.tolist(), other.keypoints.xyz
-    model = Model(points_3d=points, ids=ids, mesh=other.load_mesh(), shape_sigma=shape_sigma)
-    mask = cast_geometry(scene, KEYPOINT_CAMERA, gt).mask
-    wall, _, result = section.clocked(lambda: align(model, View(KEYPOINT_CAMERA, mask=mask)))
-    candidates = MaskCandidates.of(model, KEYPOINT_CAMERA, result)
-    predicted = candidates.predicted(ids, points)
-    chances = candidates.probabilities((), np.empty((0, 3)), np.empty((0, 2)))
-    first, clicked = int(np.count_nonzero(chances)), list[int]()
-    while np.count_nonzero(chances) > 1:
-        free = np.array([label in visible and label not in clicked for label in ids])
-        row = best_click(chances, *predicted, np.tile(free, (len(chances), 1)))
-        if row is None:
-            break
-        clicked.append(ids[row])
-        seen = np.array([places[label] for label in clicked])
-        seen += rng.normal(0, _CLICK_PX, seen.shape)
-        chances = candidates.probabilities(clicked, np.empty((len(clicked), 3)), seen)
-    poses = (each.alignment for each in candidates.every)
-    turns = [rotation_error(est=pose, gt=gt, symmetry=own.symmetry) for pose in poses]
-    right, left = np.array(turns) < _SIMILAR_DEG, np.flatnonzero(chances)
-    return {
-        "first": bool(right[0]),
-        "among": bool(right.any()),
-        "candidates": first,
-        "clicks": len(clicked),
-        "settled": len(left) == 1,
-        "refused": len(left) == 0,
-        "right": len(left) == 1 and bool(right[left[0]]),
-        "seconds": wall,
-    }
-
-
-def _told(name: str, rows: list[Row]) -> Row:
-    """Shares and numbers of clicks where several were allowed; `None` without any."""
-    several = [row for row in rows if row["candidates"] > 1]
-    clicks = [row["clicks"] for row in several if row["settled"]]
-    return {
-        "objects": name,
-        "count": len(rows),
-        "right first": np.mean([row["first"] for row in rows]),
-        "right among": np.mean([row["among"] for row in rows]),
-        "several": len(several),
-        "clicks": section.spread(clicks) if clicks else None,
-        "one left": len(clicks),
-        "none left": sum(row["refused"] for row in several),
-        "right left": sum(row["right"] for row in several),
-        "seconds": float(np.median([row["seconds"] for row in rows])),
-    }
 
 
 def _by_clicks(clicks: PhotoClicks) -> Alignment:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from playwright.sync_api import Browser, Page, expect
 from support.annotating import (
     IDLE,
     Case,
-    make_case,
     masks_searched_once,
     opened_page,
     place_of_pixel,
@@ -61,7 +59,6 @@ def test_a_box_and_one_key_align_to_the_photo(browser: Browser, case: Case) -> N
         draw_box(page, case)
         assert page.evaluate("annotator.state.alignment.status") == "done"
         assert rotation_error(est=shown(session), gt=truth) < 1.0
-        expect(page.get_by_text("The mask allows several")).to_be_hidden()
         page.keyboard.press("i")
         wait(page, f"{IDLE} && annotator.state.evidence.photo")
         expect(page.get_by_label("Fit to the photo itself")).to_be_checked()
@@ -71,24 +68,3 @@ def test_a_box_and_one_key_align_to_the_photo(browser: Browser, case: Case) -> N
         page.keyboard.press("Control+z")
         wait(page, f"{IDLE} && !annotator.state.evidence.photo")
         assert page.evaluate("annotator.state.alignment.also_used") == "mask"
-
-
-def test_one_of_several_alignments_is_chosen(
-    browser: Browser, sample_root: Path, tmp_path: Path
-) -> None:
-    case = make_case(sample_root, tmp_path, category="bottle", model_id="sample_bottle_000")
-    session = case.open()
-    with opened_page(browser, session) as page:
-        draw_box(page, case)
-        first = shown(session)
-        pictures = page.get_by_role("button", name="as likely")
-        assert pictures.count() >= 1
-        expect(page.get_by_role("button", name="Alignment 1, likeliest")).to_be_visible()
-        assert pictures.first.locator("path").get_attribute("d").startswith("M")
-        pictures.first.click()
-        wait(page, f"{IDLE} && annotator.state.by_mask.chosen")
-        assert rotation_error(est=shown(session), gt=first) > 1.0
-        page.get_by_role("button", name="Choose again").click()
-        wait(page, f"{IDLE} && !annotator.state.by_mask.chosen")
-        assert rotation_error(est=shown(session), gt=first) < 0.01
-        assert pictures.count() >= 1

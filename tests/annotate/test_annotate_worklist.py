@@ -99,27 +99,27 @@ def detections(case: Case, session: Session, names: list[str], shift: float) -> 
     }
 
 
-def test_detections_are_proposed_and_taken(case: Case) -> None:
+def test_keypoints_of_a_detector_are_shown_and_taken(case: Case) -> None:
     folder_of(case, "other.png")
     file = case.folder / "found.json"
     file.write_text(json.dumps(detections(case, case.open(), ["photo.png"], 1.0)))
     session = case.open(image=case.folder, detections=file)
     other, photo = session.photos
-    assert other.proposals == ()
+    assert other.detected == ()
     count = len(case.clicks)
-    assert len(page_state(session, 1)["proposals"]) == count
+    assert len(page_state(session, 1)["detected"]) == count
     keypoint, (u, v) = case.clicks[2]
     perform(session, 1, {"do": "accept", "keypoints": [keypoint]})
     (pair,) = photo.document.pairs
     assert (pair.keypoint, pair.uv) == (keypoint, (u + 1, v))
-    assert len(page_state(session, 1)["proposals"]) == count - 1
+    assert len(page_state(session, 1)["detected"]) == count - 1
     perform(session, 1, {"do": "accept"})
     state = page_state(session, 1)
-    assert state["proposals"] == []
+    assert state["detected"] == []
     assert state["alignment"]["status"] == "done"
     perform(session, 1, {"do": "undo"})  # all at once
     assert len(photo.document.pairs) == 1
-    assert "Nothing is proposed" in perform(session, 0, {"do": "accept"}).message
+    assert "No keypoint of a detector is left" in perform(session, 0, {"do": "accept"}).message
     file.write_text(json.dumps(detections(case, case.open(), ["elsewhere.png"], 1.0)))
     with pytest.raises(CadalignError, match="no keypoint of the model"):
         case.open(image=case.folder, detections=file)
@@ -152,7 +152,7 @@ def test_photos_of_one_name_in_two_folders_are_told_apart(case: Case) -> None:
     (out / "found.json").write_text(json.dumps(data))
     fresh = case.open(**options | {"out": case.folder, "detections": out / "found.json"})
     expected = [{keypoint for keypoint, _ in case.clicks[n : 5 + n]} for n in (0, 1)]
-    found = [{each.keypoint for each in photo.proposals} for photo in fresh.photos]
+    found = [{each.keypoint for each in photo.detected} for photo in fresh.photos]
     assert found == expected
 
 
@@ -192,7 +192,7 @@ def test_annotations_are_exported_as_coco_and_glb(
         glb_of(session, 2)
 
 
-def test_proposals_are_taken_in_the_page(browser: Browser, case: Case) -> None:
+def test_keypoints_of_a_detector_are_taken_in_the_page(browser: Browser, case: Case) -> None:
     file = case.folder / "found.json"
     file.write_text(json.dumps(detections(case, case.open(), ["photo.png"], 0.0)))
     session = case.open(detections=file)

@@ -9,7 +9,7 @@ const KEYS = [
   ["Wheel, pinch, + and −", "zoom"],
   ["Arrow keys", "nudge the selected point by 0.25 px, with Shift by 2.5 px; in the model they turn it"],
   ["Enter", "places a point at the middle of the view that has the focus"],
-  ["A", "takes all keypoints that a detector proposes"],
+  ["A", "takes all keypoints of a detector"],
   ["[ and ]", "select the pair before and after"],
   ["N", "uses the suggested model point"],
   ["Delete", "deletes the selected pair"],

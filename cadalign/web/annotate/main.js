@@ -240,13 +240,9 @@ class App {
     return true;
   }
 
-  /** Place a point in the photo: of the pair that is begun, else of the keypoint that is asked for. */
+  /** Place a point in the photo. */
   place(uv) {
-    const { pairs, suggestion } = this.state;
-    const isBegun = pairs.some((pair) => !pair.uv || pair.keypoint === null);
-    const isAsked = !isBegun && suggestion?.others;
-    if (isAsked) this.act({ do: "suggested", uv, snap: this.photoReach });
-    else this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach });
+    this.act({ do: "place_uv", uv, pair: this.selected, snap: this.photoReach });
   }
 
   /** Choose what clicks in the photo mark. */
@@ -414,9 +410,9 @@ class App {
     return this.objects.showDialog();
   }
 
-  /** Take all that a detector proposes. */
+  /** Take all keypoints of a detector. */
   accept() {
-    if (!this.state?.proposals.length) return false;
+    if (!this.state?.detected.length) return false;
     this.act({ do: "accept" });
     return true;
   }

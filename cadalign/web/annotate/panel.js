@@ -1,7 +1,6 @@
 // The lower half: what the alignment is, what to mark next, and the list of pairs.
 import { button, h } from "../common/dom.js";
 import { addressOf, download } from "./api.js";
-import { Candidates } from "./candidates.js";
 import { EvidencePanel } from "./evidence_panel.js";
 
 const FORMS = [
@@ -16,7 +15,6 @@ export class Panel {
     this.focal = this.makeFocal();
     this.priors = this.makePriors();
     this.evidence = new EvidencePanel(handlers);
-    this.candidates = new Candidates(handlers);
     this.advice = h("div", { class: "advice" });
     this.ranking = h("div", { class: "ranking" });
     this.keypoints = h("ul", { class: "keypoints" });
@@ -26,7 +24,7 @@ export class Panel {
     this.root = h(
       "section",
       { class: "panel", "aria-label": "Results" },
-      card("Alignment", this.focal, this.priors, this.evidence.root, this.candidates.root, this.alignment),
+      card("Alignment", this.focal, this.priors, this.evidence.root, this.alignment),
       card("Next keypoint", this.details, this.advice, this.ranking),
       card("Pairs", this.makeTable()),
     );
@@ -38,7 +36,6 @@ export class Panel {
     this.showFocal(state.focal, state.shape);
     this.showPriors(state.priors);
     this.evidence.show(state);
-    this.candidates.show(state);
     this.showAdvice(state);
     this.showKeypoints(state.keypoints, state.image.model_number);
     this.showPairs(state, selected);
@@ -142,10 +139,10 @@ export class Panel {
     this.priors.hidden = !ofStretch && !ofFocal;
   }
 
-  /** What a detector proposes; nothing if it proposes nothing. */
-  proposed(proposals) {
-    if (!proposals.length) return "";
-    const count = `${proposals.length} keypoint${proposals.length === 1 ? "" : "s"} of a detector`;
+  /** Keypoints of a detector, if there are any. */
+  detected(detected) {
+    if (!detected.length) return "";
+    const count = `${detected.length} keypoint${detected.length === 1 ? "" : "s"} of a detector`;
     return h(
       "p",
       {},
@@ -154,26 +151,24 @@ export class Panel {
     );
   }
 
-  showAdvice({ suggestion, alignment, shape, proposals }) {
+  showAdvice({ suggestion, alignment, shape, detected }) {
     if (!suggestion) {
       const text =
         alignment.status === "done"
           ? nothingLeft(shape)
           : `Mark the same place in the photo and on the model; either comes first. ${shape ? "Three" : "Four"} pairs give the first alignment.`;
-      this.advice.replaceChildren(this.proposed(proposals), h("p", { class: "soft" }, text));
+      this.advice.replaceChildren(this.detected(detected), h("p", { class: "soft" }, text));
       return;
     }
     this.advice.replaceChildren(
-      this.proposed(proposals),
+      this.detected(detected),
       h("p", {}, suggestion.text),
       h(
         "p",
         { class: "soft" },
-        suggestion.others
-          ? "It is marked by a dashed yellow ring on the model, and in the photo where each alignment puts it. Any other point: click it on the model first."
-          : "It is marked by a dashed yellow ring on the model, and in the photo where it should be.",
+        "It is marked by a dashed yellow ring on the model, and in the photo where it should be.",
       ),
-      suggestion.others ? "" : button("Use this model point", this.handlers.suggested, { title: "N" }),
+      button("Use this model point", this.handlers.suggested, { title: "N" }),
     );
   }
 

@@ -97,9 +97,9 @@ export class PhotoGestures {
     } else if (press.pair) {
       view.handlers.onSelect(press.pair.pair);
     } else if (press.button === 0) {
-      const proposal = view.proposalAt(press.start);
+      const detected = view.detectedAt(press.start);
       const uv = view.toPixel(press.start);
-      if (proposal) view.handlers.onAccept(proposal.keypoint);
+      if (detected) view.handlers.onAccept(detected.keypoint);
       else if (view.contains(uv)) view.handlers.onPlace(uv);
     }
   }

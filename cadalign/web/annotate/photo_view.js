@@ -198,7 +198,7 @@ export class PhotoView {
         this.drawAlignment(this.state.alignment, mode);
         this.context.globalAlpha = 1;
       }
-      for (const proposal of this.state.proposals) this.drawProposal(proposal);
+      for (const each of this.state.detected) this.drawDetected(each);
       this.drawSuggestion(this.state.suggestion);
       this.drawPairs(this.state.pairs);
     }
@@ -272,10 +272,8 @@ export class PhotoView {
   drawSuggestion(suggestion) {
     if (!suggestion) return;
     this.context.setLineDash([4, 3]);
-    for (const uv of [suggestion.uv, ...(suggestion.others ?? [])]) {
-      const { x, y } = this.toView(uv);
-      drawBadge(this.context, "suggested", "", x, y);
-    }
+    const { x, y } = this.toView(suggestion.uv);
+    drawBadge(this.context, "suggested", "", x, y);
     this.context.setLineDash([]);
   }
 
@@ -295,20 +293,20 @@ export class PhotoView {
   }
 
   /** A keypoint that a detector has found. */
-  drawProposal({ uv }) {
+  drawDetected({ uv }) {
     const { x, y } = this.toView(uv);
     this.context.setLineDash([3, 3]);
-    drawBadge(this.context, "proposed", "?", x, y);
+    drawBadge(this.context, "detected", "?", x, y);
     this.context.setLineDash([]);
   }
 
   /** The detector's keypoint at a place of the view, if any. */
-  proposalAt(place) {
+  detectedAt(place) {
     const gap = ({ uv }) => {
       const own = this.toView(uv);
       return Math.hypot(own.x - place.x, own.y - place.y);
     };
-    const near = (this.state?.proposals ?? []).filter((each) => gap(each) < REACH);
+    const near = (this.state?.detected ?? []).filter((each) => gap(each) < REACH);
     return near.sort((a, b) => gap(a) - gap(b))[0] ?? null;
   }
 

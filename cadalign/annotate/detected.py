@@ -1,4 +1,4 @@
-"""Keypoints of a detector that could be taken."""
+"""Keypoints of a detector, to be taken or corrected."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
 
-from cadalign.annotate.models import KeypointRegistry, Proposal
+from cadalign.annotate.models import Detected, KeypointRegistry
 from cadalign.annotate.photos import PhotoFile
 from cadalign.datasets.detections.image_keypoints import ImageKeypoints
 from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import DataError
 
 
-def read_proposals(
+def read_detected(
     path: Path, photos: Sequence[PhotoFile], registry: KeypointRegistry
-) -> list[tuple[Proposal, ...]]:
+) -> list[tuple[Detected, ...]]:
     """Read COCO's keypoints or a detector's for each photo, by its file name.
 
     Of photos of one name an image's are those whose folders agree most with its own. Where a photo
@@ -41,7 +41,7 @@ def read_proposals(
     for photo in photos:
         own = objects[photo] or (list(found) if len(photos) == 1 else [])
         own.sort(key=lambda each: -(each.score or 0.0))
-        by_photo.append(_proposals(own[0], photo, registry) if own else ())
+        by_photo.append(_detected(own[0], photo, registry) if own else ())
     if not any(by_photo):
         raise DataError(
             "has no keypoint of the model in any of the photos",
@@ -57,9 +57,9 @@ def _folders_alike(image: str, photo: Path) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _proposals(
+def _detected(
     found: ImageKeypoints, photo: PhotoFile, registry: KeypointRegistry
-) -> tuple[Proposal, ...]:
+) -> tuple[Detected, ...]:
     by_name = {point.name: number for number, point in registry}
     count = len(found.points_2d)
     wanted: list[int | None]
@@ -71,9 +71,9 @@ def _proposals(
         numbers = sorted(number for number, _ in registry)
         wanted = list(numbers) if len(numbers) == count else [None] * count
     scores = [None] * count if found.scores is None else found.scores.tolist()
-    proposals = []
+    keypoints = []
     for keypoint, (u, v), score in zip(wanted, found.points_2d.tolist(), scores, strict=True):
         inside = -0.5 <= u <= photo.width - 0.5 and -0.5 <= v <= photo.height - 0.5
         if keypoint is not None and inside and score != 0:
-            proposals.append(Proposal(keypoint, (u, v), score))
-    return tuple(proposals)
+            keypoints.append(Detected(keypoint, (u, v), score))
+    return tuple(keypoints)

@@ -20,11 +20,11 @@ from sphinx.util.nodes import nested_parse_with_titles
 from cadalign.cli import main
 from cadalign.datasets.models import model_keypoints
 from cadalign.estimation import document
-from cadalign.io.observation_file import OneView, SeveralViews, with_evidence
+from cadalign.io.observation_file import OneView, SeveralViews
 
 COLUMNS = "96"
 FORMATS: dict[str, tuple[Any, ...]] = {
-    "observation": (with_evidence(OneView), with_evidence(SeveralViews)),
+    "observation": (OneView, SeveralViews),
     "model_keypoints": (model_keypoints._File,),
     "fit": (document._Result,),
 }

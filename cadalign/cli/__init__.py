@@ -167,9 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def class_of(name: str) -> Any:
     """The class of a command; its module is imported when the command is called."""
     module, _, kind = COMMANDS[name][0].partition(".")
-    command = getattr(import_module(f"cadalign.cli.{module}"), kind)
-    declared = getattr(command, "with_declared_fields", None)
-    return command if declared is None else declared()
+    return getattr(import_module(f"cadalign.cli.{module}"), kind)
 
 
 def _parse(arguments: list[str]) -> Any:

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, make_dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,7 +16,7 @@ from cadalign.cli.common import JsonOption, OptionError, UsageError
 from cadalign.errors import CadalignError, DataError, InputError, refuse_unused
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import convert
-from cadalign.io.evidence import Size, evidence_fields
+from cadalign.io.evidence import EVIDENCE, Size
 from cadalign.io.observation import DetectorOptions, Observation, ObservationChanges
 from cadalign.io.observation_file import SizeFields, read_size
 
@@ -153,34 +153,39 @@ class CameraOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class EvidenceOptions:
-    """Evidence beyond keypoints: the declared fields are options, see `with_declared_fields`."""
+    """Evidence beyond keypoints."""
 
     size: Annotated[dict[str, float] | None, tyro.conf.arg(metavar="NAME LENGTH ...")] = None
     """Known lengths of the object: width, height, length (along the model's x, y, z) and sigma,
     their relative standard deviation, as in --size height 0.91 sigma 0.005."""
-
-    @classmethod
-    def with_declared_fields(cls) -> type[EvidenceOptions]:
-        """The command with an option for every field of `cadalign.io.evidence`."""
-        options = []
-        for each in evidence_fields():
-            if each.option is not None:
-                kind: Any = each.option | None
-                option = Annotated[kind, tyro.conf.arg(help=each.help)]
-                options.append((each.name, option, field(default=None)))
-        command = make_dataclass(cls.__name__, options, bases=(cls,), frozen=True, kw_only=True)
-        command.__doc__, command.__module__ = cls.__doc__, cls.__module__
-        return command
+    mask: Path | None = None
+    """Mask of the object, a grey PNG of the photo's size."""
+    mask_sigma: float | None = None
+    """Standard deviation of the mask's contour [px]; estimated by default."""
+    depth: Path | None = None
+    """Depth image that is registered to the photo, a PNG of 16 bits; 0 where unknown."""
+    depth_scale: float | None = None
+    """Units per count of the depth image; 0.001 by default, millimetres to metres."""
+    depth_sigma: float | None = None
+    """Relative standard deviation of the depths; 0.01 by default."""
+    up: tuple[float, float, float] | None = None
+    """Upward direction in the camera's frame, whose y points down: 0 -1 0 for a level one."""
+    up_sigma_deg: float | None = None
+    """Standard deviation of this direction [degrees]; 1 by default."""
+    camera_height: float | None = None
+    """Height of the camera above the plane that the object stands on."""
+    camera_height_sigma: float | None = None
+    """Relative standard deviation of this height; 0.02 by default."""
 
     @property
     def given(self) -> dict[str, Any]:
         """The fields of evidence that are given, by name."""
-        found = {}
-        for each in evidence_fields():
-            value = getattr(self, each.name, None)
-            if value is not None:
-                found[each.name] = value.resolve() if isinstance(value, Path) else value
-        return found
+        values = {name: getattr(self, name, None) for name in EVIDENCE}
+        return {
+            name: value.resolve() if isinstance(value, Path) else value
+            for name, value in values.items()
+            if value is not None
+        }
 
     def add_to(self, observation: Observation, **others: Any) -> Observation:
         """An observation with the evidence of the options, which takes the place of its own.

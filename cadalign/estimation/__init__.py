@@ -10,13 +10,6 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.estimation.align import align_batch
-    from cadalign.estimation.evidence_kinds import (
-        EvidenceKind,
-        KnownDirection,
-        KnownDistance,
-        register_evidence,
-        remove_evidence,
-    )
     from cadalign.estimation.fit import fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
@@ -47,13 +40,10 @@ __all__ = [
     "AlignedScene",
     "Alternative",
     "Contribution",
-    "EvidenceKind",
     "EvidenceSummary",
     "FitOptions",
     "FitStats",
     "FocalPrior",
-    "KnownDirection",
-    "KnownDistance",
     "MaskResiduals",
     "Misfit",
     "Model",
@@ -77,8 +67,6 @@ __all__ = [
     "model_of",
     "object_of",
     "rank_evidence",
-    "register_evidence",
-    "remove_evidence",
     "to_dataframe",
     "views_from",
     "views_of",

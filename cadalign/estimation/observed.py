@@ -15,7 +15,7 @@ from cadalign.estimation.options import FitOptions, Sigma
 from cadalign.estimation.view import View
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.documents import within
-from cadalign.io.evidence import ObservedImage, as_arguments
+from cadalign.io.evidence import ObservedImage
 from cadalign.io.observation import Observation
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import KeypointId
@@ -113,7 +113,7 @@ def views_of(
                 sigma=own_sigma if sigma is None else sigma,
                 scores=image.scores,
                 image=image.image if with_photos else None,
-                **as_arguments(evidence),
+                **evidence,
             )
             views.append(view)
     return tuple(views)

@@ -11,7 +11,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
-from cadalign.estimation.evidence_kinds import is_told, known_of
+from cadalign.estimation.known_evidence import known_directions, known_distances
 from cadalign.estimation.options import LOSSES, FitOptions
 from cadalign.estimation.prior import Lenses, ShapePrior, prior_of, rows_among, scale_priors
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
@@ -70,7 +70,8 @@ def evidence_of(
         if frames is None and not tells_something(view):
             fix = "give keypoints, a mask or a direction, or leave the view away"
             raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
-    directions, offsets = known_of(prior, [view.given for view in views], size)
+    offsets = known_distances(prior, views, size)
+    directions = known_directions(prior, views)
     if any(camera.turn for camera in lenses.cameras):
         # What is known in the lenses' frames, in those of cameras that are turned.
         turns = np.array([lenses.cameras[image].lens_from_camera for image in directions.image])
@@ -114,7 +115,8 @@ def _is_metric(offsets: Offsets, views: Sequence[View], frames: Sequence[int] | 
 def tells_something(view: View) -> bool:
     """True if a view has any evidence about the object."""
     has_image = view.mask is not None or view.image is not None
-    return bool(len(view.keypoint_ids)) or has_image or is_told(view.given)
+    is_told = view.up is not None or view.camera_height is not None
+    return bool(len(view.keypoint_ids)) or has_image or is_told
 
 
 def _sightings(

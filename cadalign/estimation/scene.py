@@ -21,8 +21,8 @@ import numpy as np
 from cadalign.arrays import FloatArray, as_positive
 from cadalign.errors import CadalignError, DegenerateError, InputError, quote, require_kind
 from cadalign.estimation.align import align
-from cadalign.estimation.evidence_kinds import upward
 from cadalign.estimation.focal import FocalPrior, PriorOption, prior_of_camera
+from cadalign.estimation.known_evidence import upward
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result

@@ -15,8 +15,8 @@ from typing import cast
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.estimation.evidence_kinds import lowest_corner, upward
 from cadalign.estimation.focal import FocalPrior
+from cadalign.estimation.known_evidence import lowest_corner, upward
 from cadalign.estimation.model import Model
 from cadalign.estimation.prior import prior_of
 from cadalign.estimation.result import Result

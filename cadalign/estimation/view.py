@@ -28,7 +28,7 @@ from cadalign.estimation.options import Sigma
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
-from cadalign.io.evidence import DeclaredEvidence
+from cadalign.io.evidence import BeyondKeypoints
 from cadalign.io.images import ByteImage, read_grey, read_mask, read_photo
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class _Numbers(tuple[int, ...]):
 
 
 @dataclass(frozen=True, eq=False)
-class View(DeclaredEvidence):
+class View(BeyondKeypoints):
     """Evidence of one image about an object.
 
     Parameters
@@ -102,9 +102,6 @@ class View(DeclaredEvidence):
     image : (h, w, 3) uint8, or path, optional
         The photo in RGB, as evidence: the model's outline is sought in it, from the estimate by
         everything else; the model needs a mesh. It does not count beside a mask of the same view.
-    more : mapping of str to values
-        Evidence of registered kinds; see
-        `cadalign.estimation.evidence_kinds.register_evidence`.
 
     Raises
     ------
@@ -131,7 +128,6 @@ class View(DeclaredEvidence):
     time: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self, noise: DetectorNoise | None) -> None:
-        self._check_more()
         for name, value in _DEFAULTS.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)

@@ -6,12 +6,11 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.io.camera_file import read_camera
-    from cadalign.io.evidence import EvidenceField, ImageEvidence, ObservedImage, Size
+    from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
     from cadalign.io.meshes.files import load_mesh
     from cadalign.io.observation import Observation
 
 __all__ = [
-    "EvidenceField",
     "ImageEvidence",
     "Observation",
     "ObservedImage",

@@ -1,17 +1,9 @@
-"""Evidence beyond keypoints: the fields of an image, declared once, and an object's known lengths.
-
-`DeclaredEvidence` declares each field with its type in observation files and the help text of its
-command line option: `cadalign.View` takes the fields as arguments, `cadalign.io.observation` reads
-and writes them, `cadalign.cli.options` makes options of them. `register_fields` adds fields of
-further kinds of evidence to all three.
-"""
+"""Evidence beyond keypoints: the fields of an image, and an object's known lengths."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
-from functools import cache
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,177 +13,59 @@ import numpy.typing as npt
 from cadalign.arrays import FloatArray, IntArray, as_floats, as_one_or_each, as_points, as_positive
 from cadalign.errors import InputError, require_kind
 from cadalign.geometry.camera import Camera
-from cadalign.io.documents import Finite, PathText, Point3, Positive
 from cadalign.io.files import as_path
 
-_Row4 = tuple[Finite, Finite, Finite, Finite]
-_AXIS = tuple[float, float, float]
 LENGTHS = ("width", "height", "length")
 """Names of the lengths along the model's x, y and z."""
 _LENGTH_SIGMA = 0.01  # relative
 
 
-@dataclass(frozen=True)
-class EvidenceField:
-    """A field of evidence beyond keypoints.
-
-    Parameters
-    ----------
-    name : str
-        The argument of `cadalign.View`, the key in observation files, and the option of commands.
-    stored : type
-        Its type in observation files, as `cadalign.io.documents` checks it.
-    help : str
-        Meaning, unit and default, for the command line.
-    option : type, optional
-        Type of the option of commands; None for no option.
-    refines : str, optional
-        The field without which it means nothing.
-    check : function of the value, optional
-        Returns the value that is kept; raises InputError if it is invalid.
-    """
-
-    name: str
-    stored: Any
-    help: str
-    option: Any = None
-    refines: str | None = None
-    check: Callable[[Any], Any] | None = None
-
-    def checked(self, value: Any) -> Any:
-        """The value that is kept, where it is valid."""
-        if self.check is not None:
-            return self.check(value)
-        return as_positive(value, name=self.name) if self.stored is Positive else value
-
-
-_registered: dict[str, EvidenceField] = {}
-
-
-def register_fields(*added: EvidenceField) -> None:
-    """Add fields; see `cadalign.estimation.evidence_kinds.register_evidence`."""
-    for each in added:
-        _registered[each.name] = each
-
-
-def remove_fields(*names: str) -> None:
-    """Remove registered fields."""
-    for name in names:
-        _registered.pop(name, None)
-
-
-def evidence_fields() -> tuple[EvidenceField, ...]:
-    """All declared fields, then the registered ones."""
-    return (*_declared(), *_registered.values())
-
-
-@cache
-def _declared() -> tuple[EvidenceField, ...]:
-    own = fields(DeclaredEvidence)
-    return tuple(EvidenceField(each.name, **each.metadata) for each in own if each.metadata)
-
-
-def as_arguments(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Values of fields as arguments of `DeclaredEvidence`, with registered ones as ``more``."""
-    more = {name: value for name, value in values.items() if name in _registered}
-    return {name: value for name, value in values.items() if name not in more} | {"more": more}
-
-
-def _stored_as(stored: Any, text: str, option: Any = None, refines: str | None = None) -> Any:
-    declared = {"stored": stored, "help": text, "option": option, "refines": refines}
-    return field(default=None, metadata=declared)
+REFINED = {
+    "mask_sigma": "mask",
+    "depth_scale": "depth",
+    "depth_sigma": "depth",
+    "up_sigma_deg": "up",
+    "camera_height_sigma": "camera_height",
+}
+"""The field without which a field means nothing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class DeclaredEvidence:
+class BeyondKeypoints:
     """Evidence of an image beyond keypoints; None for what is not known.
 
-    `cadalign.View` describes the fields; ``more`` holds values of registered ones by name.
+    `cadalign.View` describes the fields.
     """
 
-    mask: npt.ArrayLike | str | os.PathLike[str] | None = _stored_as(
-        PathText, "Mask of the object, a grey PNG of the photo's size.", Path
-    )
-    mask_sigma: float | None = _stored_as(
-        Positive,
-        "Standard deviation of the mask's contour [px]; estimated by default.",
-        float,
-        refines="mask",
-    )
-    depth: npt.ArrayLike | str | os.PathLike[str] | None = _stored_as(
-        PathText,
-        "Depth image that is registered to the photo, a PNG of 16 bits; 0 where unknown.",
-        Path,
-    )
-    depth_scale: float | None = _stored_as(
-        Positive,
-        "Units per count of the depth image; 0.001 by default, millimetres to metres.",
-        float,
-        refines="depth",
-    )
-    depth_sigma: npt.ArrayLike | None = _stored_as(
-        Positive,
-        "Relative standard deviation of the depths; 0.01 by default.",
-        float,
-        refines="depth",
-    )
-    up: npt.ArrayLike | None = _stored_as(
-        Point3,
-        "Upward direction in the camera's frame, whose y points down: 0 -1 0 for a level one.",
-        _AXIS,
-    )
-    up_sigma_deg: npt.ArrayLike | None = _stored_as(
-        Positive,
-        "Standard deviation of this direction [degrees]; 1 by default.",
-        float,
-        refines="up",
-    )
-    camera_height: float | None = _stored_as(
-        Positive, "Height of the camera above the plane that the object stands on.", float
-    )
-    camera_height_sigma: float | None = _stored_as(
-        Positive,
-        "Relative standard deviation of this height; 0.02 by default.",
-        float,
-        refines="camera_height",
-    )
-    cam_from_rig: npt.ArrayLike | None = _stored_as(
-        tuple[_Row4, _Row4, _Row4, _Row4],
-        "The camera's known pose in the frame that the views share.",
-    )
-    more: Mapping[str, Any] = field(default_factory=dict)
+    mask: npt.ArrayLike | str | os.PathLike[str] | None = None
+    mask_sigma: float | None = None
+    depth: npt.ArrayLike | str | os.PathLike[str] | None = None
+    depth_scale: float | None = None
+    depth_sigma: npt.ArrayLike | None = None
+    up: npt.ArrayLike | None = None
+    up_sigma_deg: npt.ArrayLike | None = None
+    camera_height: float | None = None
+    camera_height_sigma: float | None = None
+    cam_from_rig: npt.ArrayLike | None = None
 
     @property
     def given(self) -> dict[str, Any]:
         """The fields that are known, by name."""
-        values = {name: getattr(self, name) for name in DeclaredEvidence.__dataclass_fields__}
-        known = values | dict(values.pop("more"))
-        return {name: value for name, value in known.items() if value is not None}
+        values = {name: getattr(self, name) for name in EVIDENCE}
+        return {name: value for name, value in values.items() if value is not None}
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of the fields that are known and are evidence by themselves."""
-        values = vars(self) | dict(self.more)
-        return tuple(
-            each.name
-            for each in evidence_fields()
-            if not each.refines and values.get(each.name) is not None
-        )
+        return tuple(name for name in self.given if name not in REFINED)
 
-    def _check_more(self) -> None:
-        if not self.more:
-            return
-        checked = {}
-        for name, value in self.more.items():
-            if name not in _registered:
-                fix = f"known are {', '.join(_registered) or 'none'}"
-                raise InputError(f"unknown evidence {name!r}", where="more", fix=fix)
-            checked[name] = None if value is None else _registered[name].checked(value)
-        object.__setattr__(self, "more", checked)
+
+EVIDENCE = tuple(BeyondKeypoints.__dataclass_fields__)
+"""Names of the fields."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ImageEvidence(DeclaredEvidence):
+class ImageEvidence(BeyondKeypoints):
     """Evidence of an image as an observation file holds it, with paths of mask and depth image.
 
     Raises
@@ -209,18 +83,14 @@ class ImageEvidence(DeclaredEvidence):
     cam_from_rig: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        self._check_more()
         given = self.given
-        for each in evidence_fields():
-            if each.name not in given:
-                continue
+        for name, value in given.items():
             # depth_sigma may be that of depths of the keypoints
-            if each.name != "depth_sigma" and each.refines not in {None, *given}:
-                what, fix = f"given without {each.refines}", f"give {each.refines}, too"
-                raise InputError(what, where=each.name, fix=fix)
-            if each.stored is Positive and each.name not in self.more:
-                value = as_positive(given[each.name], name=each.name)
-                object.__setattr__(self, each.name, value)
+            if name != "depth_sigma" and (missing := REFINED.get(name, name)) not in given:
+                what, fix = f"given without {missing}", f"give {missing}, too"
+                raise InputError(what, where=name, fix=fix)
+            if name in REFINED or name == "camera_height":
+                object.__setattr__(self, name, as_positive(value, name=name))
         _keep_paths(self, "mask", "depth")
         for name, shape in (("up", (3,)), ("cam_from_rig", (4, 4))):
             if (value := getattr(self, name)) is not None:

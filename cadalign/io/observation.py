@@ -20,7 +20,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.io.documents import Positive, in_file, path_from, read_json, within, written_path
-from cadalign.io.evidence import ImageEvidence, ObservedImage, Size, as_arguments
+from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
 from cadalign.io.files import as_path, once_per_file, write_json
 from cadalign.io.observation_file import (
     fill_xyz,
@@ -250,7 +250,7 @@ class ObservationChanges:
         changes: dict[str, Any] = {} if camera is None else {"camera": camera}
         if self.evidence:
             given = observation.evidence.given | dict(self.evidence)
-            changes["evidence"] = ImageEvidence(**as_arguments(given))
+            changes["evidence"] = ImageEvidence(**given)
         if self.size is not None:
             changes["size"] = self.size
         if changes and observation.others:

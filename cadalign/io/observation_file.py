@@ -6,7 +6,6 @@ The format is described in docs/formats/observation.md.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, cast
 
@@ -21,6 +20,7 @@ from cadalign.geometry.camera import Camera
 from cadalign.geometry.pixels import PixelOrigin, check_pixels, shift_of
 from cadalign.io.documents import (
     Document,
+    Finite,
     Index,
     NotNegative,
     PathText,
@@ -33,16 +33,32 @@ from cadalign.io.documents import (
     require_unique,
     written_path,
 )
-from cadalign.io.evidence import (
-    EvidenceField,
-    ImageEvidence,
-    ObservedImage,
-    Size,
-    as_arguments,
-    evidence_fields,
-)
+from cadalign.io.evidence import ImageEvidence, ObservedImage, Size
 
+_Row4 = tuple[Finite, Finite, Finite, Finite]
+_EVIDENCE: dict[str, Any] = {
+    "mask": PathText,
+    "mask_sigma": Positive,
+    "depth": PathText,
+    "depth_scale": Positive,
+    "depth_sigma": Positive,
+    "up": Point3,
+    "up_sigma_deg": Positive,
+    "camera_height": Positive,
+    "camera_height_sigma": Positive,
+    "cam_from_rig": tuple[_Row4, _Row4, _Row4, _Row4],
+}
+_PATHS = ("mask", "depth")
 Declared = TypeVar("Declared", bound=Document)
+
+
+def _with_evidence(fields: type[Declared]) -> type[Declared]:
+    """The declared fields with those of an image's evidence beyond keypoints."""
+    added: list[tuple[str, Any, Any]] = [
+        (name, each | None, None) for name, each in _EVIDENCE.items()
+    ]
+    extended = msgspec.defstruct(fields.__name__, added, bases=(fields,), kw_only=True)
+    return cast("type[Declared]", extended)
 
 
 class SeenKeypoint(Document, kw_only=True):
@@ -115,8 +131,9 @@ class StartFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Alignment(np.array(self.rotation), np.array(self.translation), np.array(self.scale))
 
 
+@_with_evidence
 class ViewFields(Document, kw_only=True):
-    """One entry of ``views``, beside the fields of `cadalign.io.evidence`."""
+    """One entry of ``views``."""
 
     camera: Any  # in the form of `Camera.from_dict`
     pixel_origin: PixelOrigin = "center"  # of the keypoints' uv
@@ -138,6 +155,7 @@ class _ObjectFields(Document, kw_only=True):
     fit: FitFields = msgspec.field(default_factory=FitFields)
 
 
+@_with_evidence
 class OneView(_ObjectFields, kw_only=True):
     """A file of one image."""
 
@@ -159,21 +177,6 @@ class SeveralViews(_ObjectFields, kw_only=True):
     views: Annotated[list[ViewFields], Meta(min_length=1)]
 
 
-def with_evidence(fields: type[Declared]) -> type[Declared]:
-    """The declared fields of an image, or of a file of several, with those of its evidence."""
-    return _with_evidence(fields, evidence_fields())
-
-
-@cache
-def _with_evidence(fields: type[Declared], evidence: tuple[EvidenceField, ...]) -> type[Declared]:
-    added: list[tuple[str, Any, Any]] = [(each.name, each.stored | None, None) for each in evidence]
-    if issubclass(fields, SeveralViews):
-        views: Any = _with_evidence(ViewFields, evidence)
-        added = [("views", Annotated[list[views], Meta(min_length=1)], msgspec.NODEFAULT)]
-    extended = msgspec.defstruct(fields.__name__, added, bases=(fields,), kw_only=True)
-    return cast("type[Declared]", extended)
-
-
 def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | OneView, ...]]:
     """Check the parsed form of a file; returns its fields and those of its views.
 
@@ -182,13 +185,13 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
     if not isinstance(data, Mapping) or "views" not in data:
         given = data if isinstance(data, Mapping) else {}
         needs_none = given.get("init") is not None or given.get("mask") is not None
-        one: OneView = convert(data, with_evidence(StartedView if needs_none else OneView))
+        one: OneView = convert(data, StartedView if needs_none else OneView)
         sigma = one.fit.sigma
         if isinstance(sigma, list) and len(sigma) != len(one.keypoints):
             what = f"{len(sigma)} numbers for {len(one.keypoints)} keypoints"
             raise DataError(what, where="fit.sigma", fix="give one for each, or one for all")
         return one, (one,)
-    several: SeveralViews = convert(data, with_evidence(SeveralViews))
+    several: SeveralViews = convert(data, SeveralViews)
     if isinstance(several.fit.sigma, list):
         fix = "give one for all, or `sigma` of every keypoint"
         raise DataError("a list, but there are several views", where="fit.sigma", fix=fix)
@@ -197,11 +200,10 @@ def read_fields(data: Any) -> tuple[OneView | SeveralViews, tuple[ViewFields | O
 
 def named_files(data: Any, folder: Path) -> Iterator[Path]:
     """Photos, masks and meshes that an observation names, in its parsed form, valid or not."""
-    evidence = [each.name for each in evidence_fields() if each.stored is PathText]
     given = data if isinstance(data, Mapping) else {}
     views = given.get("views")
     for part in (given, *(views if isinstance(views, list) else ())):
-        for name in ("image", "model", "shape", *evidence):
+        for name in ("image", "model", "shape", *_PATHS):
             path = part.get(name) if isinstance(part, Mapping) else None
             if isinstance(path, str) and path:
                 yield path_from(path, folder)
@@ -219,11 +221,9 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
     camera = Camera.from_dict(read.camera)
     points_2d = np.array([each.uv for each in read.keypoints]).reshape(-1, 2)
     check_pixels(points_2d, camera.width, camera.height, where="keypoints.uv")
-    evidence = {}
-    for each in evidence_fields():
-        value = getattr(read, each.name)
-        is_path = each.stored is PathText and value is not None
-        evidence[each.name] = path_from(value, folder) if is_path else value
+    evidence = {name: getattr(read, name) for name in _EVIDENCE}
+    for name in _PATHS:
+        evidence[name] = evidence[name] and path_from(evidence[name], folder)
     return ObservedImage(
         points_3d=np.array([each.xyz for each in read.keypoints]).reshape(-1, 3),
         points_2d=points_2d - shift_of(read.pixel_origin),
@@ -234,7 +234,7 @@ def read_image_fields(read: ViewFields | OneView, folder: Path | None) -> Observ
         scores=_column(read.keypoints, "score"),
         image=None if read.image is None else path_from(read.image, folder),
         depths=_depths(read.keypoints),
-        evidence=ImageEvidence(**as_arguments(evidence)),
+        evidence=ImageEvidence(**evidence),
     )
 
 

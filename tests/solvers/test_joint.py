@@ -68,7 +68,6 @@ def evidence_of(
         np.array([[0, 0.8, 0.6]]),
         np.array([1]),
         30 * np.eye(3)[None] + rng.normal(size=(1, 3, 3)),
-        np.zeros(1, dtype=np.int64),
     )
     ends = [[0, 1], [2, 3], [5, -1], [-1, 4]]  # two lengths, a height, and a distance from a camera
     along = [[1.0, 0, 0], [0, 1, 0], [0, 0.6, 0.8], [0.8, 0, 0.6]]
@@ -78,7 +77,6 @@ def evidence_of(
         np.array(along),
         np.array([1.0, 2.0, 2.0, -3.0]),
         np.array([10.0, 20.0, 20.0, 10.0]),
-        np.arange(4),
     )
     planes = Planes(
         np.array([2, 6]),

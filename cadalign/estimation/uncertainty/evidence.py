@@ -13,7 +13,6 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.estimates import pose_and_lengths
-from cadalign.estimation.evidence_kinds import SIZE, kind_names
 from cadalign.estimation.facing import turned_covariance
 from cadalign.estimation.pack import SingleBasis
 from cadalign.estimation.prior import has_scale_prior
@@ -59,29 +58,24 @@ def told_by(sightings: Sightings) -> dict[str, BoolArray]:
 
 def pieces_of(evidence: Evidence) -> list[Piece]:
     """All pieces, view by view."""
-    rig, known = evidence.rig, (evidence.directions, evidence.offsets)
+    rig, offsets = evidence.rig, evidence.offsets
     told = {kind: evidence.sightings.image[on] for kind, on in told_by(evidence.sightings).items()}
     told["depth"] = np.append(told["depth"], evidence.planes.image)
-    for number, kind in enumerate(kind_names()):
-        told[kind] = np.concatenate([each.image[each.kind == number] for each in known])
+    told["gravity"] = evidence.directions.image
+    told["camera height"] = offsets.image[offsets.image >= 0]
     told["rig"] = np.flatnonzero(np.bincount(rig.pose)[rig.pose] > 1)
     views = {kind: set(rows.tolist()) for kind, rows in told.items()}
     pieces = [
         Piece(kind, view) for view in range(len(rig.pose)) for kind in views if view in views[kind]
     ]
-    if -1 in views[SIZE]:
-        pieces.append(Piece(SIZE, None))
+    if (offsets.image < 0).any():
+        pieces.append(Piece("size", None))
     return pieces
 
 
-def _known_in(evidence: Evidence, piece: Piece) -> tuple[BoolArray, BoolArray]:
-    """Known directions, and distances, that belong to a piece."""
-    number, view = kind_names().index(piece.kind), -1 if piece.view is None else piece.view
-    directions, offsets = (
-        (each.kind == number) & (each.image == view)
-        for each in (evidence.directions, evidence.offsets)
-    )
-    return directions, offsets
+def _offsets_of(evidence: Evidence, piece: Piece) -> BoolArray:
+    """Known distances (L,) that belong to a piece: the size, or a camera's height."""
+    return np.asarray(evidence.offsets.image == (-1 if piece.view is None else piece.view))
 
 
 def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, State]:
@@ -90,11 +84,12 @@ def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, S
     Without the known motion of its camera, a view has a pose of its own.
     """
     kind, view, sightings = piece.kind, piece.view, evidence.sightings
-    if view is None or kind in kind_names():
-        in_directions, in_offsets = _known_in(evidence, piece)
-        directions = kept_rows(evidence.directions, ~in_directions)
-        offsets = kept_rows(evidence.offsets, ~in_offsets)
-        return evidence._replace(directions=directions, offsets=offsets), state
+    if view is None or kind == "camera height":
+        offsets = kept_rows(evidence.offsets, ~_offsets_of(evidence, piece))
+        return evidence._replace(offsets=offsets), state
+    if kind == "gravity":
+        directions = kept_rows(evidence.directions, evidence.directions.image != view)
+        return evidence._replace(directions=directions), state
     if kind == "rig":
         pose: IntArray = evidence.rig.pose.copy()
         own = state.poses[pose[view]]
@@ -139,11 +134,13 @@ def summaries_of(
     """Root mean square residuals of all pieces but masks, view by view."""
     found = []
     for piece in pieces_of(evidence):
-        if piece.kind in kind_names():
-            found.extend(_of_known(evidence, state, piece))
-        elif piece.view is not None and piece.kind == "keypoints":
+        if piece.view is None or piece.kind == "camera height":
+            found.append(_of_distances(evidence, state, piece))
+        elif piece.kind == "gravity":
+            found.append(_of_gravity(evidence, state, piece.view))
+        elif piece.kind == "keypoints":
             found.append(_of_keypoints(evidence, state, piece.view, cameras[piece.view]))
-        elif piece.view is not None and piece.kind == "depth":
+        elif piece.kind == "depth":
             expected, measured, weights = _depths(evidence, state, piece.view)
             errors = expected - measured
             counted = np.abs(errors * weights) < _OUTLIER
@@ -197,11 +194,8 @@ def measured_factor(evidence: Evidence, state: State, piece: Piece) -> float | N
     """Median of a piece's measured over expected depths or distances; None where it has none."""
     if piece.kind == "depth" and piece.view is not None:
         expected, measured, _ = _depths(evidence, state, piece.view)
-    elif piece.kind in kind_names():
-        offsets = kept_rows(evidence.offsets, _known_in(evidence, piece)[1])
-        points = points_of(evidence.shape, state)
-        expected = distances_of(evidence._replace(offsets=offsets), state.poses, points)
-        measured = offsets.value
+    elif piece.view is None or piece.kind == "camera height":
+        expected, measured, _ = _distances(evidence, state, piece)
     else:
         return None
     return float(np.median(measured / expected)) if len(measured) else None
@@ -231,24 +225,30 @@ def plane_distances(evidence: Evidence, state: State) -> FloatArray:
     return np.asarray((seen * planes.normal).sum(axis=1) / (rays * planes.normal).sum(axis=1))
 
 
-def _of_known(evidence: Evidence, state: State, piece: Piece) -> list[EvidenceSummary]:
-    in_directions, in_offsets = _known_in(evidence, piece)
-    found = []
-    directions = kept_rows(evidence.directions, in_directions)
-    if len(directions.kind):
-        origin = seen_in_cameras(evidence, state, 0.0 * directions.model, directions.image)
-        seen = seen_in_cameras(evidence, state, directions.model, directions.image)
-        differences = seen - origin - directions.camera
-        whitened = np.einsum("nij,nj->ni", directions.whitening, differences)
-        halves = np.minimum(np.linalg.norm(differences, axis=1) / 2, 1.0)
-        angles = np.degrees(2 * np.arcsin(halves))
-        found.append(_summary(*piece, angles, np.linalg.norm(whitened, axis=1), "deg", 2))
-    offsets = kept_rows(evidence.offsets, in_offsets)
-    if len(offsets.kind):
-        points, measured = points_of(evidence.shape, state), evidence._replace(offsets=offsets)
-        errors = distances_of(measured, state.poses, points) - offsets.value
-        found.append(_summary(*piece, errors, errors * offsets.weight, ""))
-    return found
+def _of_gravity(evidence: Evidence, state: State, view: int) -> EvidenceSummary:
+    directions = kept_rows(evidence.directions, evidence.directions.image == view)
+    origin = seen_in_cameras(evidence, state, 0.0 * directions.model, directions.image)
+    seen = seen_in_cameras(evidence, state, directions.model, directions.image)
+    differences = seen - origin - directions.camera
+    whitened = np.einsum("nij,nj->ni", directions.whitening, differences)
+    halves = np.minimum(np.linalg.norm(differences, axis=1) / 2, 1.0)
+    angles = np.degrees(2 * np.arcsin(halves))
+    return _summary("gravity", view, angles, np.linalg.norm(whitened, axis=1), "deg", 2)
+
+
+def _of_distances(evidence: Evidence, state: State, piece: Piece) -> EvidenceSummary:
+    expected, measured, weights = _distances(evidence, state, piece)
+    errors = expected - measured
+    return _summary(*piece, errors, errors * weights, "")
+
+
+def _distances(
+    evidence: Evidence, state: State, piece: Piece
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Expected and measured distances of a piece (n,), with the inverse standard deviations."""
+    offsets = kept_rows(evidence.offsets, _offsets_of(evidence, piece))
+    points, some = points_of(evidence.shape, state), evidence._replace(offsets=offsets)
+    return distances_of(some, state.poses, points), offsets.value, offsets.weight
 
 
 def _summary(

@@ -28,6 +28,13 @@ _LEAST_TURN = 1e-12  # [rad], and of a relative variance
 _ROUNDING = 1e-12  # relative standard deviation below which a length is known
 _REGION = 0.95  # probability of the stated region, which alternatives outside of it contradict
 _MOST_NAMED = 5  # outliers, in a sentence
+_FIELDS = {
+    "keypoints": "points_2d",
+    "photo": "image",
+    "gravity": "up",
+    "camera height": "camera_height",
+    "rig": "cam_from_rig",
+}
 
 
 @dataclass(frozen=True)
@@ -210,7 +217,7 @@ class EvidenceSummary:
 
     kind: str
     """Name of the kind: "keypoints", "mask", "photo", "depth", "gravity", "size", "camera height",
-    "rig", or that of a registered one."""
+    "rig"."""
     view: int | None
     """Number of the view; None for the object's size."""
     count: int
@@ -260,9 +267,7 @@ def name_of(kind: str, view: int | None) -> str:
     >>> name_of("size", None), name_of("depth", 0)
     ('size', 'views[0].depth')
     """
-    from cadalign.estimation.evidence_kinds import field_of  # a fit of keypoints has one kind
-
-    return kind if view is None else f"views[{view}].{field_of(kind)}"
+    return kind if view is None else f"views[{view}].{_FIELDS.get(kind, kind)}"
 
 
 @dataclass(frozen=True)

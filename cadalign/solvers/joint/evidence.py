@@ -80,14 +80,12 @@ class Directions(NamedTuple):
     """Directions ``model`` (D, 3) seen as ``camera`` (D, 3) in a view.
 
     ``whitening`` (D, 3, 3) [1/rad] gives the difference of the unit vectors unit covariance.
-    ``kind`` (D,) numbers the kind of evidence, for what is said of a result.
     """
 
     model: FloatArray
     camera: FloatArray
     image: IntArray
     whitening: FloatArray
-    kind: IntArray
 
 
 class Offsets(NamedTuple):
@@ -95,7 +93,7 @@ class Offsets(NamedTuple):
 
     ``ends`` (L, 2) numbers the points from and to which they are measured, -1 for the place of the
     camera ``image`` (L,), which is -1 where neither end is a camera. ``weight`` (L,) is the inverse
-    standard deviation and ``kind`` (L,) as in `Directions`.
+    standard deviation.
     """
 
     ends: IntArray
@@ -103,7 +101,6 @@ class Offsets(NamedTuple):
     direction: FloatArray
     value: FloatArray
     weight: FloatArray
-    kind: IntArray
 
 
 class Planes(NamedTuple):

@@ -27,6 +27,7 @@ from benchmarks.cameras import photo_lenses, scenes
 from benchmarks.cars import noise_of_detector, real_detections
 from benchmarks.clicks import clicks, outline_methods
 from benchmarks.coverage import coverage
+from benchmarks.evidence import evidence
 from benchmarks.gradients import gradient_errors, torch_layer
 from benchmarks.masks import mask_alone, masks
 from benchmarks.mistakes import mistakes
@@ -67,6 +68,7 @@ USUAL: dict[str, Callable[..., Tables]] = {
     "noise": noise_of_detector,
 }
 ON_REQUEST: dict[str, Callable[..., Tables]] = {
+    "evidence": evidence,
     "mask_alone": mask_alone,
     "mistakes": mistakes,
     "photo": photos,

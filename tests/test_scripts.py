@@ -11,9 +11,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from benchmarks.evidence import SeenObject, bound_of, draw_object, evidence_for, moved
 
+from cadalign import align
 from cadalign.cli import main
+from cadalign.datasets import KeypointNet
+from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 
 pytestmark = pytest.mark.slow
 
@@ -151,3 +156,35 @@ class TestComparingRatios:
     def test_an_unknown_section_is_refused(self, bench: Callable[..., int]) -> None:
         with pytest.raises(SystemExit, match="no section nothing; known are toy"):
             bench("nothing")
+
+
+@pytest.fixture(scope="module")
+def car(sample_root: Path) -> SeenObject:
+    return draw_object(KeypointNet(sample_root)["car"][0], 0, noise_px=0.0, seed=0)
+
+
+class TestEvidenceWithoutNoise:
+    """The problems of `bench.py evidence`."""
+
+    def test_shots_show_the_truth(self, car: SeenObject) -> None:
+        points = np.asarray(car.model.points_3d)
+        for shot in car.shots:
+            seen = moved(car.instance.gt, shot.cam_from_first).apply(points[shot.rows])
+            np.testing.assert_allclose(KEYPOINT_CAMERA.project(seen), shot.points_2d, atol=1e-8)
+        rows, columns = np.nonzero(car.mask())
+        low, high = car.shots[0].points_2d.min(axis=0), car.shots[0].points_2d.max(axis=0)
+        assert (low >= [columns.min() - 3, rows.min() - 3]).all()
+        assert (high <= [columns.max() + 3, rows.max() + 3]).all()
+
+    @pytest.mark.parametrize(
+        "kind",
+        ["keypoints", "gravity", "length", "depth", "views-2", "views-2-free", "gravity+length"],
+    )
+    def test_bound_is_that_of_the_estimate(self, car: SeenObject, kind: str) -> None:
+        """The estimate is the truth, where its stated covariance is the bound."""
+        given = evidence_for(kind, car)
+        result = align(car.model, given.views, size=given.size)
+        bound = bound_of(result, given, car)
+        assert np.linalg.eigvalsh(bound)[-1] > 0
+        stated = np.sqrt(result.covariance.diagonal())
+        np.testing.assert_allclose(np.sqrt(bound.diagonal()), stated, rtol=0.2, atol=1e-9)

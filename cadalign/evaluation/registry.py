@@ -140,7 +140,6 @@ _MODULES = (
     "correspondences",
     "retrieval",
     "unseen",
-    "evidence",
     "photos",
     "tracks",
 )

@@ -191,9 +191,7 @@ def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) ->
     return summaries
 
 
-def by_category_and_method(
-    run: Run, statistics: Statistics, *, count_skipped: bool = False
-) -> list[Summary]:
+def by_category_and_method(run: Run, statistics: Statistics) -> list[Summary]:
     """A summary of each category's cells for every method, and of all where there are several.
 
     Statistics are of the rows that are ok. Medians of registered metrics are added.
@@ -201,8 +199,6 @@ def by_category_and_method(
 
     def summarize(category: str, method: str, cells: Cells) -> Summary:
         values = _values(cells, method, statistics)
-        if count_skipped:
-            values["skipped"] = counted(cells, method)[1]
         return Summary(category, {"category": category, "method": method}, values)
 
     return summaries_of(run.cells, run.methods, summarize, further=run.metrics)

@@ -34,7 +34,6 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
         "correspondences",
         "retrieval",
         "unseen",
-        "evidence",
         "photos",
         "tracks",
     ]

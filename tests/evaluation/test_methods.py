@@ -192,17 +192,6 @@ def test_on_views_of_models_with_tables_and_page(sample_root: Path, tmp_path: Pa
 
 
 @pytest.mark.long
-def test_on_evidence_and_photos(sample_root: Path, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"categories": ["car"], "workers": 0}
-    table = cadalign.evaluate(
-        sample_root, "evidence", methods=[joint, linear, "keypoints"], **options
-    )
-    assert (table.status == "ok").all()
-    errors = table.set_index("method").rotation_error_deg
-    assert errors["joint"] < errors["keypoints"]  # it is given all evidence
-
-
-@pytest.mark.long
 def test_on_unseen_objects_functions_get_the_learned_shape(real_data: Path) -> None:
     options: dict[str, Any] = {"categories": ["mug"], "max_models": 4, "workers": 0}
     table = cadalign.evaluate(

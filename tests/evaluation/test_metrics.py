@@ -92,11 +92,10 @@ def test_it_is_shown_wherever_metrics_are(
 
 
 @pytest.mark.long
-def test_every_experiment_with_functions_takes_it(sample_root: Path, real_data: Path) -> None:
+def test_every_experiment_with_functions_takes_it(real_data: Path) -> None:
     register_metric("depth_off", depth_error)
     common: dict[str, Any] = {"metrics": ["depth_off"], "workers": 0}
     for root, experiment, options in (
-        (sample_root, "evidence", {"methods": ["keypoints"], "categories": ["car"]}),
         (real_data / "real/scan2cad", "photos", {"methods": ["rigid"]}),
         (
             real_data / "keypointnet",

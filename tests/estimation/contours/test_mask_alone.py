@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from benchmarks.evidence import damaged_mask
 
 from cadalign import Alignment, Camera, FocalPrior, Mesh, Model, Size, Symmetry, View, align
 from cadalign.datasets import KeypointNet, write_sample_dataset
 from cadalign.errors import DegenerateError, InputError
 from cadalign.estimation.contours.resembling import distinct, resembling_poses
 from cadalign.estimation.contours.silhouettes import atlas_of
-from cadalign.evaluation.instances.evidence import damaged_mask
 from cadalign.geometry.metrics import nearest_truth
 from cadalign.geometry.rotations import rotation_from_vector
 from cadalign.metrics import rotation_error

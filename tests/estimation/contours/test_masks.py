@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from benchmarks.evidence import damaged_mask
 
 from cadalign import Alignment, Camera, Model, Result, View, align
 from cadalign.datasets import KeypointNet
 from cadalign.errors import DataError, DegenerateError, InputError
 from cadalign.estimation.contours.view_contour import contour_bound
-from cadalign.evaluation.instances.evidence import damaged_mask
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.metrics import alignment_box_iou, rotation_error
 from cadalign.render import Scene, cast_geometry, sample_view

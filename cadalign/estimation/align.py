@@ -219,9 +219,9 @@ def _align_all(
     problem = JointProblem(prior, views, size, options, lenses)
     starts = [] if any(inits) else starts_by_one_view(views, size, align_some)
     if not starts and is_mask_alone(model, views, inits):
-        from cadalign.estimation.contours.proposals import minima_of_mask  # with OpenCV and embree
+        from cadalign.estimation.contours.silhouette_starts import minima_of_mask  # with OpenCV
 
-        minima, iterations, hypotheses, mistake = minima_of_mask(problem, model)
+        minima, iterations, hypotheses, mistake = minima_of_mask(problem, cast(Model, model))
     elif begins_at_outline(model, views, inits):
         minima, iterations, hypotheses = minima_at_start(problem, inits)
         mistake = None

@@ -131,6 +131,12 @@ def no_pose_error(
         surfaces_of(model, keypoints, shown[0])
     if shown and fix is None:
         is_rig = len(views) > 1 and views[0].cam_from_rig is not None
+        if not seen and len(views) == 1 and views[0].mask is not None:
+            return DegenerateError(
+                "a mask without keypoints does not tell the pose of an object that is only similar",
+                where=shown[0],
+                fix="give at least 3 keypoints, `init`, or the object's own model",
+            )
         if not seen and len(views) == 1:
             return DegenerateError(
                 "a photo without keypoints does not tell where its outline is to be sought",

@@ -55,8 +55,8 @@ def is_single(model: object, views: Sequence[View]) -> bool:
 
 
 def is_mask_alone(model: object, views: Sequence[View], inits: Sequence[Alignment | None]) -> bool:
-    """True where the mask of one view is all evidence of the pose of a model with a mesh."""
-    if isinstance(model, Model) and model.mesh is None:
+    """True where the mask of one view is all evidence of the pose of an exact model with a mesh."""
+    if not isinstance(model, Model) or model.mesh is None or not is_exact_model(model):
         return False
     return len(views) == 1 and inits[0] is None and views[0].has_mask_alone
 

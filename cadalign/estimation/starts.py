@@ -252,8 +252,8 @@ class _Rows(NamedTuple):
 def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
     """Poses (1, 12) and log scales (3,) of evidence with one pose, the likeliest first.
 
-    The rotations of its ``own`` starts are proposals; that of the linear solution and, where there
-    are none, those of a grid join them.
+    They have the rotations of its ``own`` starts, that of the linear solution and, where there are
+    none, those of a grid.
     """
     rows, is_tied = _rows_of(evidence), has_scale_prior(evidence.scales)
     basis = np.ones((3, 1)) if is_tied else np.eye(3)  # of scales that a prior holds together

@@ -18,8 +18,6 @@ from cadalign.render import Scene, cast_geometry
 from cadalign.retrieval.silhouettes import grab_cut
 
 _FEWEST = 3
-_CLICK_PX = 2.0
-_SIMILAR_DEG = 30.0
 _MARGIN = 0.05  # of a box that is dragged around an object, relative to its larger side
 _BAND = 0.1  # about an estimated outline, relative to the larger side of its box
 _RAPID_STEPS = 20

@@ -381,6 +381,13 @@ def requests() -> list[Request]:
             lambda: align(learned, _seen(mask=mask)),
         ),
         Request(
+            "a mask without keypoints and `init`, `Model` with `shape_sigma` or `ShapeModel`",
+            "other shapes in other poses have outlines alike",
+            "views[0].mask: a mask without keypoints does not tell the pose of an object that is "
+            "only similar; give at least 3 keypoints, `init`, or the object's own model",
+            lambda: align(similar, View(CAMERA, mask=mask)),
+        ),
+        Request(
             "gravity or camera height, `ShapeModel` without `up_axis`",
             "the model does not say which of its directions is up",
             "views[0].up: the model has no up axis; learn it with an up axis, or leave `up` away",

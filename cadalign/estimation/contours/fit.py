@@ -156,7 +156,7 @@ def fit_masks(
         warnings.append(f"{where} contradicts the rest and is left out: {reason}{off}")
         left_out.append(contour)
         used = [each for each in used if each is not contour]
-    if used and search.is_proposed:
+    if used and search.by_outline:
         warnings.extend(_uncovered(best[0]))
     fits = best[0].settled.fits if used else ()
     residuals: list[MaskResiduals | None] = [None] * len(views)
@@ -176,9 +176,9 @@ def fit_masks(
 class _Search(NamedTuple):
     """Minima without masks, and the surfaces that are brought to the masks' contours from there.
 
-    The search ``is_open`` where nothing but the masks determines the estimate. The minima of an own
-    model and a mask alone are proposals, near their ends, and some of their ends may explain no
-    more than a part of the contour: where it ``is_proposed``, the outline's likelihood ranks them.
+    The search ``is_open`` where nothing but the masks determines the estimate. The minima of a mask
+    alone are near their ends, and some of their ends may explain no more than a part of the
+    contour: the outline's likelihood ranks them, ``by_outline``.
     """
 
     first: Minimum
@@ -186,7 +186,7 @@ class _Search(NamedTuple):
     keypoints: int
     choice: SurfaceChoice
     is_open: bool
-    is_proposed: bool
+    by_outline: bool
 
     @classmethod
     def of(cls, minima: Sequence[Minimum], keypoints: int, choice: SurfaceChoice) -> _Search:
@@ -196,14 +196,14 @@ class _Search(NamedTuple):
         likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
         starts = [(each, each.state) for each in likely]
         most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
-        is_proposed = first.outline_score is not None and choice.surfaces[0].is_exact
-        return cls(first, starts[:most], keypoints, choice, is_open, is_proposed)
+        by_outline = first.outline_score is not None
+        return cls(first, starts[:most], keypoints, choice, is_open, by_outline)
 
     def best(
         self, contours: list[ViewContour], views: Sequence[View]
     ) -> tuple[list[_Candidate], list[ViewContour]]:
         """Candidates, the likeliest first, and the contours, or those of hulls in their place."""
-        if self.is_proposed:
+        if self.by_outline:
             return self._by_outline(contours), contours
         surfaces, convex = self.choice
         best = self._explored(contours, surfaces)
@@ -225,7 +225,7 @@ class _Search(NamedTuple):
         return _finished(best), contours
 
     def _by_outline(self, contours: list[ViewContour]) -> list[_Candidate]:
-        """Candidates from proposals, by the likelihood of a contour that is theirs in part."""
+        """Candidates by the likelihood of a contour that is theirs in part."""
         best = _finished(self._explored(contours, self.choice.surfaces))
         if best:
             correlation = best[0].settled.noises[0].correlation
@@ -238,8 +238,8 @@ class _Search(NamedTuple):
         Surfaces of a learned shape follow its modes alone: with the keypoints' own displacements a
         step takes several times as long, and modes distinguish the surfaces.
         """
-        cost = _outline_cost if self.is_proposed else _misfit
-        is_wide = self.is_open and not self.is_proposed
+        cost = _outline_cost if self.by_outline else _misfit
+        is_wide = self.is_open and not self.by_outline
         found = []
         for start, state in self.starts:
             evidence = start.evidence

@@ -33,6 +33,7 @@ from cadalign.geometry.rotations import angle_between
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 
+_EVERY = 2  # rows and columns, of which one is compared
 _LINES = 16  # directions of what hides a part
 _HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
 _LEAST_HIDDEN = 0.03  # of the area, that a line hides
@@ -72,18 +73,17 @@ def resembling_poses(
     free: BoolArray,
     count: int,
     is_cut: bool = False,
-    every: int = 1,
     symmetry: Symmetry | None = None,
     possible: Possible | None = None,
 ) -> list[Resembling]:
     """Distinct alignments whose silhouettes resemble a mask (h, w), the best first.
 
     ``free`` (3,) marks the scales that are unknown; ``is_cut`` says that the mask may lack all that
-    lies beyond a line. One row and column in ``every`` are compared. Of alignments that are equal
-    under the ``symmetry`` one is kept. Those that are not ``possible`` are left out.
+    lies beyond a line. Of alignments that are equal under the ``symmetry`` one is kept. Those that
+    are not ``possible`` are left out.
     """
     view = FacedMask.of(mask, camera)
-    query, compared = view.outline, _Cells.of(view, every)
+    query, compared = view.outline, _Cells.of(view)
     atlas = atlas_of(mesh, eye_of(mesh, query), is_cut=is_cut)
     most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
     cameras = _affine_cameras(atlas, query, most if possible is None else _WIDER * most)
@@ -104,22 +104,21 @@ def resembling_poses(
 
 
 class _Cells(NamedTuple):
-    """Cells (m,) of `FacedMask`, their rays (m, 3) and if they are seen (m,); every so many."""
+    """Cells (m,) of `FacedMask`, their rays (m, 3) and if they are seen (m,); one in `_EVERY`."""
 
     mask: FloatArray
     rays: FloatArray
     is_seen: BoolArray
-    every: int
     middle: FloatArray
     cell: float
 
     @classmethod
-    def of(cls, view: FacedMask, every: int) -> _Cells:
+    def of(cls, view: FacedMask) -> _Cells:
         """The cells of so many rows and columns that stand for all."""
-        some = np.arange(CELLS**2).reshape(CELLS, CELLS)[::every, ::every].ravel()
+        some = np.arange(CELLS**2).reshape(CELLS, CELLS)[::_EVERY, ::_EVERY].ravel()
         middle = view.corner + view.cell * (CELLS - 1) / 2
         mask = view.image.ravel()[some].astype(float)
-        return cls(mask, view.rays[some], view.is_seen[some], every, middle, view.cell)
+        return cls(mask, view.rays[some], view.is_seen[some], middle, view.cell)
 
 
 def _affine_cameras(atlas: Atlas, query: Whitened, most: int) -> tuple[FloatArray, FloatArray]:
@@ -185,9 +184,9 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
 
 
 @cache
-def _line_bins(every: int) -> IntArray:
+def _line_bins() -> IntArray:
     """Numbers (`_LINES`, m) of the cells' places along directions, all around."""
-    places = np.arange(0, CELLS, every) - (CELLS - 1) / 2
+    places = np.arange(0, CELLS, _EVERY) - (CELLS - 1) / 2
     x, y = np.meshgrid(places, places)
     cosine, sine = around(_LINES).T[:, :, None]
     along = cosine * x.ravel() + sine * y.ravel()
@@ -207,7 +206,7 @@ def _resemblance(atlas: Atlas, view: _Cells, pose: Alignment, *, is_cut: bool) -
         overlap = float(both.sum()) / (total + len(both) - float(both.sum()))
         return Resembling(overlap, pose, np.zeros(3))
     best, line = 0.0, np.zeros(3)
-    for normal, bins in zip(around(_LINES), _line_bins(view.every)[:, seen], strict=True):
+    for normal, bins in zip(around(_LINES), _line_bins()[:, seen], strict=True):
         count = np.cumsum(np.bincount(bins, minlength=1))
         common = np.cumsum(np.bincount(bins, weights=both, minlength=1))
         share = count / max(float(count[-1]), 1.0)

@@ -208,4 +208,4 @@ def _nearest_with_mesh(
 
 @lru_cache(maxsize=16)
 def _mesh_at(path: Path) -> Mesh:
-    return load_mesh(path)  # one object, for which silhouettes are rendered once
+    return load_mesh(path)

@@ -1,8 +1,7 @@
-"""Starts of an estimate from a mask alone: alignments whose silhouettes resemble it."""
+"""Starts of an estimate from a mask alone: alignments of the own model that resemble it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple, cast
 
 import cv2
@@ -17,7 +16,7 @@ from cadalign.estimation.contours.resembling import (
     distinct,
     resembling_poses,
 )
-from cadalign.estimation.contours.surface import Surface, surfaces_of
+from cadalign.estimation.contours.surface import RigidSurface, rigid_surface
 from cadalign.estimation.contours.view_contour import (
     ViewContour,
     contour_view,
@@ -26,24 +25,19 @@ from cadalign.estimation.contours.view_contour import (
 )
 from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.focal import prior_of_camera
-from cadalign.estimation.model import Model, is_exact_model
+from cadalign.estimation.model import Model
 from cadalign.estimation.pack import evidence_of
 from cadalign.estimation.search import JointProblem, Minimum, find_minima
-from cadalign.estimation.solve import LEAST_LIKELIHOOD
 from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.symmetry import Symmetry
-from cadalign.shapes.model import ShapeModel
-from cadalign.shapes.parts import TrainingShapes
+from cadalign.geometry.mesh import Mesh
 
-_MOST_MESHES = 4  # of a learned shape's training models
-_MOST_COMPARED = 100  # of these
 _MEETS = 0.003  # standard deviation of a contour that meets the rim, relative to its size
 _MEETS_PX = 0.5
 _FAR = 0.01  # misfit, relative to the mask's size, of a model that may be another
 _FAR_PX = 2.0
-_MOST_PROPOSALS = 5
-_CLOSE = 1.1  # cost above the least, of a contour's sample, at which a proposal is still one
+_MOST_ENDS = 5
+_CLOSE = 1.1  # cost above the least, of a contour's sample, at which an end still counts
 _ROUGH_SIZE = 160.0  # [px], of the mask's copy in which starts are followed
 _LEAST_PIXEL = 1.3  # of a smaller copy, in those of the mask
 _ROUGHLY = np.radians(10.0)  # standard deviation of a start's directions
@@ -56,27 +50,22 @@ _WHERE = "views[0].mask"
 class _Search(NamedTuple):
     """A search of starts whose silhouettes resemble the mask, or what lines leave of these.
 
-    Silhouettes are compared in ``every`` so many rows and columns. So many ``starts`` are followed
-    for some ``steps``, and the ``kept`` best ones to the end.
+    So many ``starts`` are followed for some ``steps``, and the ``kept`` best ones to the end.
     """
 
     is_cut: bool
-    every: int
     starts: int
     steps: int
     kept: int
 
 
 _SEARCHES = (
-    _Search(is_cut=False, every=2, starts=12, steps=2, kept=4),
-    _Search(is_cut=True, every=2, starts=24, steps=5, kept=8),
-)
-_SEARCHES_OF_SIMILAR = (  # whose surfaces meet no mask
-    _Search(is_cut=False, every=1, starts=12, steps=0, kept=12),
+    _Search(is_cut=False, starts=12, steps=2, kept=4),
+    _Search(is_cut=True, starts=24, steps=5, kept=8),
 )
 
 
-class _Proposal(NamedTuple):
+class _End(NamedTuple):
     """A minimum near the mask.
 
     The ``residuals`` (S,) [px] are the distances of the mask's contour from the rim, the ``cost``
@@ -99,7 +88,7 @@ class _Proposal(NamedTuple):
         """Number of samples that are off independently."""
         return len(self.residuals) / self.correlation
 
-    def over(self, best: _Proposal) -> float:
+    def over(self, best: _End) -> float:
         """-2 log of the likelihood over the best one's, for the fewer independent samples."""
         return 2 * (self.cost - best.cost) * min(self.independent, best.independent)
 
@@ -117,7 +106,7 @@ class _Start(NamedTuple):
 
     @property
     def cost(self) -> float:
-        """See `_Proposal`; the contour that is not shown lies anywhere within the reach."""
+        """See `_End`; the contour that is not shown lies anywhere within the reach."""
         reach, residuals = self.approach.first_reach, self.approach.residuals()
         share = len(residuals) / len(self.masked.views[0].contour.points)
         own = cost_of_contour(residuals, reach)
@@ -129,7 +118,7 @@ class _Start(NamedTuple):
         return None if further is None else self._replace(approach=further)
 
     @property
-    def proposal(self) -> _Proposal:
+    def end(self) -> _End:
         """The minimum near the start, its outline brought to the mask's."""
         (contour,), here = self.masked.views, self.approach
         if here.reach < here.first_reach or self.shown is not self.masked:
@@ -137,22 +126,19 @@ class _Start(NamedTuple):
         residuals, every = here.residuals(), np.ones(len(contour.contour.points), dtype=bool)
         cost = cost_of_contour(residuals, here.first_reach)
         alike = correlation_length(contour.contour, residuals, every)
-        return _Proposal(self.minimum._replace(state=here.place.state), residuals, cost, alike)
+        return _End(self.minimum._replace(state=here.place.state), residuals, cost, alike)
 
 
 def minima_of_mask(
-    problem: JointProblem, model: Model | ShapeModel
+    problem: JointProblem, model: Model
 ) -> tuple[list[Minimum], int, int, str | None]:
     """Minima of the evidence beside the mask of the only view, at alignments that resemble it.
 
-    The best is the first; then numbers of iterations and of starts, and a mistake to warn of.
+    The model is exact and has a mesh. The best is the first; then numbers of iterations and of
+    starts, and a mistake to warn of.
 
-    For a model that is only similar, and for a learned shape, they are proposals: another shape in
-    another pose has an outline alike. Their ``outline_score`` is what ranks them: warped to the
-    mask, a model follows it in a wrong pose, too.
-
-    Raises InputError if the mask has no contour, the model no mesh, or no prior says roughly what
-    the focal length is.
+    Raises InputError if the mask has no contour, or no prior says roughly what the focal length is;
+    DegenerateError if no start leads to the mask.
     """
     (view,), camera = problem.views, problem.lenses.cameras[0]
     known = prior_of_camera(problem.lenses.prior, camera)
@@ -163,55 +149,42 @@ def minima_of_mask(
             fix="give a calibrated camera, a focal_prior whose relative_sigma is at most "
             f"{_LARGEST_FOCAL_SIGMA}, or keypoints",
         )
-    is_exact = is_exact_model(model)
-    # The likelihoods of a similar model's proposals are calibrated for the mask itself.
-    contour, pixel = _rough_contour(view, camera, _ROUGH_SIZE if is_exact else np.inf)
-    searches = _SEARCHES if is_exact else _SEARCHES_OF_SIMILAR
-    proposals, steps, starts = _searched(problem, model, contour, searches)
-    if not proposals:
+    contour, pixel = _rough_contour(view, camera)
+    ends, steps, starts = _searched(problem, model, contour)
+    if not ends:
         raise DegenerateError(
             "no pose gives the model an outline like the mask's",
             where=_WHERE,
             fix="check that the mask is nonzero on the object, not around it, and that the model "
             "is the object's; or give an init or keypoints",
         )
-    misfit, size = pixel * proposals[0].misfit, pixel * contour.contour.size
+    misfit, size = pixel * ends[0].misfit, pixel * contour.contour.size
     mistake = None
-    if not is_exact:
-        mistake = (
-            f"{_WHERE} alone does not tell the pose of an object that is only similar: the "
-            "estimate is a proposal, as its alternatives are, and three keypoints settle it"
-        )
-    elif misfit > max(_FAR_PX, _FAR * size):
+    if misfit > max(_FAR_PX, _FAR * size):
         mistake = (
             f"{_WHERE}: the outline of the best pose found is {misfit:.1f} px from the mask's on "
             "average: the object may be partly hidden, the model another, or the pose wrong"
         )
-    chosen = _chosen(proposals, _symmetry_of(model))
-    scores = [each.over(chosen[0]) for each in chosen]
-    likely = [
-        each.minimum._replace(outline_score=score)
-        for each, score in zip(chosen, scores, strict=True)
-        if is_exact or np.exp(-score / 2) >= LEAST_LIKELIHOOD
-    ]
-    return likely, steps, starts, mistake
+    likely = [each for each in ends if each.cost <= ends[0].cost + _CLOSE]
+    poses = [poses_of(each.minimum.evidence, each.minimum.state)[0] for each in likely]
+    chosen = distinct(zip(poses, likely, strict=True), _MOST_ENDS, model.symmetry)
+    minima = [each.minimum._replace(outline_score=each.over(chosen[0])) for each in chosen]
+    return minima, steps, starts, mistake
 
 
 def _searched(
-    problem: JointProblem,
-    model: Model | ShapeModel,
-    contour: ViewContour,
-    searches: Sequence[_Search],
-) -> tuple[list[_Proposal], int, int]:
+    problem: JointProblem, model: Model, contour: ViewContour
+) -> tuple[list[_End], int, int]:
     """Minima near a contour, the likeliest first; numbers of iterations and of starts.
 
     A search follows those before it where none of these meets the contour.
     """
-    found: list[_Proposal] = []
+    surface = rigid_surface(cast(Mesh, model.mesh))
+    found: list[_End] = []
     steps, starts = 0, 0
-    for search in searches:
+    for search in _SEARCHES:
         begun = []
-        for each, surface in _resembling(problem, model, search):
+        for each in _resembling(problem, model, search):
             start, iterations = _begun(problem, each, surface, contour)
             starts, steps = starts + 1, steps + iterations
             tried = None if start is None else start.followed(search.steps)
@@ -219,8 +192,8 @@ def _searched(
                 begun.append(tried)
         begun.sort(key=lambda start: start.cost)
         ends = [start.followed() for start in begun[: search.kept]]
-        found.extend(end.proposal for end in ends if end is not None)
-        found.sort(key=lambda proposal: proposal.cost)
+        found.extend(start.end for start in ends if start is not None)
+        found.sort(key=lambda end: end.cost)
         if found and found[0].cost < _met_by(contour):
             break
     return found, steps, starts
@@ -232,13 +205,13 @@ def _met_by(contour: ViewContour) -> float:
     return float(np.log(sigma) + (1 + np.log(2 * np.pi)) / 2)
 
 
-def _rough_contour(view: View, camera: Camera, size: float) -> tuple[ViewContour, float]:
-    """The contour of a view's mask, or of a copy of a ``size`` [px] where it is larger.
+def _rough_contour(view: View, camera: Camera) -> tuple[ViewContour, float]:
+    """The contour of a view's mask, or of a copy of `_ROUGH_SIZE` where it is larger.
 
     Then how many of the mask's pixels one of the copy is.
     """
     contour = contour_view(0, view, _WHERE, camera)
-    pixel = contour.contour.size / size
+    pixel = contour.contour.size / _ROUGH_SIZE
     if pixel < _LEAST_PIXEL:
         return contour, 1.0
     mask = np.asarray(view.mask_image, dtype=np.float32)
@@ -249,35 +222,27 @@ def _rough_contour(view: View, camera: Camera, size: float) -> tuple[ViewContour
     return contour_view(0, smaller, _WHERE, camera.resized(width, height)), pixel
 
 
-def _resembling(
-    problem: JointProblem, model: Model | ShapeModel, search: _Search
-) -> list[tuple[Resembling, Surface]]:
-    """Alignments of all meshes whose silhouettes resemble the mask, the best first."""
-    (view,), camera = problem.views, problem.lenses.cameras[0]
-    free = np.asarray(problem.prior.scales.free > 0)
-    mask = cast(FloatArray, view.mask_image)
-    found: list[tuple[Resembling, Surface]] = []
-    for surface in _surfaces_of(model):
-        poses = resembling_poses(
-            surface.mesh,
-            mask,
-            camera,
-            free=free,
-            count=search.starts,
-            is_cut=search.is_cut,
-            every=search.every,
-            symmetry=_symmetry_of(model),
-            possible=_possible(problem, surface),
-        )
-        found.extend((each, surface) for each in poses)
-    return sorted(found, key=lambda pair: -pair[0].overlap)[: search.starts]
+def _resembling(problem: JointProblem, model: Model, search: _Search) -> list[Resembling]:
+    """Alignments whose silhouettes resemble the mask, the best first."""
+    (view,) = problem.views
+    mesh = cast(Mesh, model.mesh)
+    return resembling_poses(
+        mesh,
+        cast(FloatArray, view.mask_image),
+        problem.lenses.cameras[0],
+        free=np.asarray(problem.prior.scales.free > 0),
+        count=search.starts,
+        is_cut=search.is_cut,
+        symmetry=model.symmetry,
+        possible=_possible(problem, mesh),
+    )
 
 
-def _possible(problem: JointProblem, surface: Surface) -> Possible | None:
+def _possible(problem: JointProblem, mesh: Mesh) -> Possible | None:
     """Tell which poses known directions, such as gravity's, and known lengths leave."""
     directions = evidence_of(problem.prior, problem.views, lenses=problem.lenses).directions
     lengths = np.full(3, np.nan) if problem.size is None else problem.size.lengths
-    known = np.log(lengths / np.ptp(surface.mesh.bounds, axis=0))
+    known = np.log(lengths / np.ptp(mesh.bounds, axis=0))
     if not len(directions.model) and np.isfinite(known).sum() < 2:
         return None
     roots, axes = np.linalg.eigh(directions.whitening.swapaxes(1, 2) @ directions.whitening)
@@ -295,7 +260,7 @@ def _possible(problem: JointProblem, surface: Surface) -> Possible | None:
 
 
 def _begun(
-    problem: JointProblem, start: Resembling, surface: Surface, contour: ViewContour
+    problem: JointProblem, start: Resembling, surface: RigidSurface, contour: ViewContour
 ) -> tuple[_Start | None, int]:
     """A start before its first step towards the mask's outline; and iterations that led there."""
     _, minima, iterations, _ = find_minima(problem, [start.alignment], None)
@@ -307,41 +272,3 @@ def _begun(
     shown = masked if part is contour else masked._replace(views=[part])
     approach = FirstSteps.begun(shown, best.state, is_wide=True)
     return _Start(best, masked, shown, approach), iterations
-
-
-def _symmetry_of(model: Model | ShapeModel) -> Symmetry | None:
-    """The symmetry under which alignments are equal; a learned shape's mirror is none."""
-    return model.symmetry if isinstance(model, Model) else None
-
-
-def _surfaces_of(model: Model | ShapeModel) -> list[Surface]:
-    """Surfaces of the model's mesh, or of varied training models'."""
-    if isinstance(model, Model):
-        shapes = [cast(FloatArray, model.points_3d)]
-    else:
-        mean = model.components[0].mean[: len(model.ids)]
-        surfaces_of(model, mean, _WHERE)  # refuses a model without meshes
-        training = cast(TrainingShapes, model.training)
-        rows = _varied(training, mean)
-        shapes = list(training.points_3d[rows].astype(np.float64))
-    return [surfaces_of(model, points, _WHERE).surfaces[0] for points in shapes]
-
-
-def _varied(training: TrainingShapes, mean: FloatArray) -> list[int]:
-    """Rows of training models with meshes: the nearest to the mean, and those far from others."""
-    rows = training.rows_with_mesh
-    rows = rows[:: 1 + len(rows) // _MOST_COMPARED]
-    points = training.points_3d[rows].astype(np.float64)
-    points = np.where(np.isfinite(points), points, mean)
-    gaps = np.linalg.norm(points[:, None] - points[None], axis=3).mean(axis=2)
-    chosen = [int(np.linalg.norm(points - mean, axis=2).mean(axis=1).argmin())]
-    while len(chosen) < min(_MOST_MESHES, len(rows)):
-        chosen.append(int(gaps[:, chosen].min(axis=1).argmax()))
-    return [rows[k] for k in chosen]
-
-
-def _chosen(proposals: list[_Proposal], symmetry: Symmetry | None) -> list[_Proposal]:
-    """The distinct ones of sorted proposals that are about as likely as the best."""
-    likely = [each for each in proposals if each.cost <= proposals[0].cost + _CLOSE]
-    poses = [poses_of(each.minimum.evidence, each.minimum.state)[0] for each in likely]
-    return distinct(zip(poses, likely, strict=True), _MOST_PROPOSALS, symmetry)

@@ -307,11 +307,6 @@ def _common_options(command: Fit, options: dict[str, FitOptions]) -> FitOptions:
                 what = f"{quote(value)}, but {quote(getattr(common, option))} for {first}"
                 fix = "give objects of one photo the same options, beside `objects`"
                 raise InputError(what, where=f"{name}: fit.{option}", fix=fix)
-    if common.principal_sigma is not None:
-        what = "objects of one photo are aligned with a known principal point"
-        is_stored = command.fitting.principal_sigma is None
-        where = f"{first}: fit.principal_sigma" if is_stored else "principal_sigma"
-        raise InputError(what, where=where, fix="leave it out, or give a file for each object")
     return common
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import numpy as np
 
-from cadalign.arrays import FloatArray, worker_count
+from cadalign.arrays import worker_count
 from cadalign.errors import (
     CadalignError,
     InputError,
@@ -77,7 +76,6 @@ def align(
     ransac: RansacOptions | None = None,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
-    principal_sigma: float | None = FitOptions.principal_sigma,
     motion: Motion | Literal["smooth"] | None = None,
 ) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
@@ -109,9 +107,6 @@ def align(
         cameras share one. ``result.cameras`` have the estimates.
     focal_prior : FocalPrior, "usual" or None
         Prior on focal lengths to be estimated, as for `cadalign.fit`.
-    principal_sigma : float, optional
-        Standard deviation of the principal point about the camera's [px], as for `cadalign.fit`:
-        of views of one camera, with neither masks nor depth images.
     motion : Motion or "smooth", optional
         The views are frames of a video (``View.time``) in which the object, or the camera, moves
         smoothly. Frames of few keypoints or none take part, and with ``ransac`` so do frames whose
@@ -149,13 +144,7 @@ def align(
     if size is not None:
         require_kind(size, Size, "size")
     inits = _checked_inits(init, given)
-    options = FitOptions(
-        loss=loss,
-        loss_scale=loss_scale,
-        focal=focal,
-        focal_prior=focal_prior,
-        principal_sigma=principal_sigma,
-    )
+    options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
     align_some: Align
@@ -163,12 +152,7 @@ def align(
         from cadalign.estimation.tracks.motion import Motion
         from cadalign.estimation.tracks.smooth import align_track  # with the kernels of tracks
 
-        if principal_sigma is not None:
-            what = "a motion takes the principal point as known"
-            raise InputError(what, where="principal_sigma", fix="leave one of both away")
         align_some = partial(align_track, model, Motion.of(motion), size, options, ransac)
-    elif principal_sigma is not None:
-        return _align_cropped(model, given, options, size=size, init=init, ransac=ransac)
     elif size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
@@ -179,22 +163,6 @@ def align(
         surrounds = ransac is not None
         return align_facing(given, inits, align_some, may_surround=surrounds, is_still=is_still)
     return align_some(given, inits)
-
-
-def _align_cropped(
-    model: Model | ShapeModel, views: Sequence[View], options: FitOptions, **given: Any
-) -> Result:
-    from cadalign.estimation import principal
-
-    principal.check_shiftable(views)
-    known = replace(options, principal_sigma=None).of_views
-
-    def align_at(shift: FloatArray) -> Result:
-        moved = [replace(each, camera=principal.shifted(each.camera, shift)) for each in views]
-        return align(model, moved, **known, **given)
-
-    sigmas = [view.sigma for view in views]
-    return principal.estimate_with_principal_point(align_at, options, sigmas)
 
 
 def _align_all(
@@ -274,14 +242,13 @@ def align_batch(
     ransac: RansacOptions | None = None,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
-    principal_sigma: float | None = FitOptions.principal_sigma,
     workers: int = 1,
 ) -> Results:
     """Align many objects of one kind; each as `align` does, bit for bit.
 
     Parameters
     ----------
-    model, loss, loss_scale, ransac, focal, focal_prior, principal_sigma
+    model, loss, loss_scale, ransac, focal, focal_prior
         As for `align`; every object has focal lengths of its own.
     objects : sequence of View or of sequences of View
         The views of every object.
@@ -323,7 +290,6 @@ def align_batch(
         "ransac": ransac,
         "focal": focal,
         "focal_prior": focal_prior,
-        "principal_sigma": principal_sigma,
     }
 
     def one(

@@ -49,7 +49,6 @@ _PLAIN = [
     "known_axis",
     "stretched_axes",
     "focal",
-    "principal_std",
 ]
 """Fields of a result that are numbers and words, in its JSON form as they are."""
 
@@ -74,7 +73,6 @@ class _Options(ForeignDocument):
     focal: str
     focal_prior: FocalPrior | Literal["usual"] | None
     stretch_sigma: Positive | None = None
-    principal_sigma: Positive | None = None  # older files lack it
 
 
 def _check_lengths(
@@ -189,7 +187,6 @@ class _Result(ForeignDocument):
     points_cam_covariance: list[Matrix] | None = None
     degrees_of_freedom: Positive | None = None
     component: int = 0
-    principal_std: tuple[NotNegative, NotNegative] | None = None
     sigma: NotNegative | None = None
     cost: float | None = None
     alternatives: tuple[_Alternative, ...] = ()

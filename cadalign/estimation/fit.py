@@ -41,7 +41,6 @@ def fit(
     known_axis: str = FitOptions.known_axis,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
-    principal_sigma: float | None = FitOptions.principal_sigma,
     ransac: RansacOptions | None = None,
     scores: npt.ArrayLike | None = None,
     symmetry: Symmetry | None = None,
@@ -88,10 +87,6 @@ def fit(
     focal_prior : FocalPrior, "usual" or None
         Prior on a focal length to be estimated, for example from `FocalPrior.from_exif`; by default
         that of usual lenses, `FocalPrior.of_usual_lenses`; None for none.
-    principal_sigma : float, optional
-        Standard deviation of the principal point about the camera's [px], of a photo that may be
-        cropped: two further unknowns. ``result.camera`` has the estimate, ``result.principal_std``
-        its standard deviation. By default it is taken as right.
     ransac : RansacOptions, optional
         Search for the alignment with the most inliers, and fit to these: for keypoints with
         outliers. ``result.inliers`` marks the inliers.
@@ -136,7 +131,7 @@ def fit(
     150.0
     """
     start = time.perf_counter()
-    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior, principal_sigma)
+    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior)
     chosen: tuple[Any, ...] = (method, sigma, loss, loss_scale, *shape, *lens)
     try:
         options = _checked_options(*chosen)
@@ -164,7 +159,6 @@ def fit_batch(
     known_axis: str = FitOptions.known_axis,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
-    principal_sigma: float | None = FitOptions.principal_sigma,
     ransac: RansacOptions | None = None,
     scores: Sequence[npt.ArrayLike] | None = None,
     symmetry: Symmetry | None = None,
@@ -184,7 +178,7 @@ def fit_batch(
         As for `fit`, for all problems; a sequence gives each problem its own.
     method, loss, loss_scale, stretch, stretch_sigma, known_axis, focal, focal_prior
         As for `fit`; every problem has a focal length of its own.
-    principal_sigma, ransac
+    ransac
         As for `fit`.
     scores : sequence of B (n_b,) float, optional
         As for `fit`, for each problem.
@@ -221,7 +215,7 @@ def fit_batch(
 
     per_problem = isinstance(sigma, list | tuple) or np.ndim(sigma) > 0  # type: ignore[arg-type]
     given: Any = 1.0 if per_problem else sigma
-    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior, principal_sigma)
+    shape, lens = (stretch, stretch_sigma, known_axis), (focal, focal_prior)
     options = FitOptions(method, given, loss, loss_scale, *shape, *lens)
     problems = pack_many(points_3d, points_2d, camera)
     sigmas: Sequence[Sigma] | None = None
@@ -233,7 +227,7 @@ def fit_batch(
     if len({(each.width, each.height) for each in problems.cameras}) == 1:
         options = options.for_camera(problems.cameras[0])
     is_solved_at_once = ransac is None and options.focal_prior != USUAL
-    is_solved_at_once &= principal_sigma is None and not options.estimates_in_rounds
+    is_solved_at_once &= not options.estimates_in_rounds
 
     @np.errstate(all="ignore")  # holds for one thread only
     def run(first: int, last: int) -> Results:
@@ -284,18 +278,7 @@ def _fit_one(
     start: float,
 ) -> Result:
     """Fit the only problem, which was begun at ``start`` [s]."""
-    camera = problems.camera(0)
-    options = options.for_camera(camera)
-    if options.principal_sigma is not None:
-        from cadalign.estimation.principal import estimate_with_principal_point, shifted
-
-        known = replace(options, principal_sigma=None)
-
-        def fit_at(shift: FloatArray) -> Result:
-            moved = pack_one(problems.points_3d, problems.points_2d, shifted(camera, shift))
-            return _fit_one(moved, known, ransac, scores, symmetry, start)
-
-        return estimate_with_principal_point(fit_at, options, [options.sigma])
+    options = options.for_camera(problems.camera(0))
     if ransac is None:
         solutions = solve_one(problems, options)
         result = result_of_solution(problems, solutions, options, time.perf_counter() - start)

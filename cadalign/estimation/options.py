@@ -80,9 +80,6 @@ class FitOptions(AlignmentOptions):
     focal_prior: PriorOption = USUAL
     """Prior on a focal length to be estimated: that of usual lenses, a `FocalPrior`, from EXIF data
     for example, or None."""
-    principal_sigma: float | None = None
-    """Standard deviation of the principal point about the camera's [px], of a photo that may be
-    cropped: estimates it, from keypoints of views of one camera. By default it is known."""
 
     def __post_init__(self) -> None:
         _check_known("method", self.method, METHODS)
@@ -90,9 +87,8 @@ class FitOptions(AlignmentOptions):
         _check_known("known_axis", self.known_axis, AXES)
         _check_known("focal", self.focal, FOCALS)
         _set_positive(self, "loss_scale")
-        for name in ("stretch_sigma", "principal_sigma"):
-            if getattr(self, name) is not None:
-                _set_positive(self, name)
+        if self.stretch_sigma is not None:
+            _set_positive(self, "stretch_sigma")
         if self.sigma is not None and not is_number(self.sigma):
             try:
                 np.ndim(self.sigma)
@@ -121,11 +117,9 @@ class FitOptions(AlignmentOptions):
             self.loss != "linear"
             or self.stretch_sigma is not None
             or (self.stretch is not None and len(self.stretched_axes) < 2)
-            or self.principal_sigma is not None
         ):
             raise InputError(
-                f"the method {self.method!r} supports neither loss, stretch, scale prior nor "
-                "principal point",
+                f"the method {self.method!r} supports neither loss, stretch nor scale prior",
                 where="method",
                 fix="use the method 'optimal', or leave these options at their defaults",
             )
@@ -186,7 +180,7 @@ class FitOptions(AlignmentOptions):
     @property
     def of_views(self) -> dict[str, Any]:
         """The options that `cadalign.align` takes, too, by their names."""
-        names = ("loss", "loss_scale", "focal", "focal_prior", "principal_sigma")
+        names = ("loss", "loss_scale", "focal", "focal_prior")
         return {name: getattr(self, name) for name in names}
 
     @property

@@ -284,7 +284,6 @@ class SingleBasis:
     numbers: tuple[int, ...] | None = None
     turn: FloatArray | None = None
     photos: frozenset[int] = frozenset()
-    principal_sigma: float | None = None
 
     @cached_property
     def evidence(self) -> Evidence:

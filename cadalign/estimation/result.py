@@ -299,10 +299,6 @@ def _text_of(result: ResultData) -> str:
     if result.focal == "estimate":
         prior = "" if result.focal_prior is None else f" (prior: {result.focal_prior})"
         lines.append(f"  focal length {result.camera.fx:.4g} px{known_to}{prior}")
-    if result.principal_std is not None:
-        x, y = result.principal_std
-        camera = result.camera
-        lines.append(f"  principal    ({camera.cx:.4g} +- {x:.2g}, {camera.cy:.4g} +- {y:.2g}) px")
     lines.extend(
         f"  also likely  ({other.relative_likelihood:.2g} x): scale "
         f"({', '.join(f'{value:.4g}' for value in other.alignment.scale)})"

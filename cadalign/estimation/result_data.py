@@ -68,8 +68,6 @@ class ResultData:
         The cameras' focal length was taken as right, or estimated.
     focal_prior : FocalPrior, optional
         Prior on the estimated focal length.
-    principal_std : (2,) float, optional
-        Standard deviations of the estimated principal point [px]; None where it was known.
     sigma : float, optional
         Standard deviation of the keypoints [px], given or estimated; None where each keypoint has
         its own.
@@ -107,7 +105,6 @@ class ResultData:
     stretched_axes: str = "yz"
     focal: str = "known"
     focal_prior: FocalPrior | None = None
-    principal_std: tuple[float, float] | None = None
     sigma: float | None = None
     cost: float | None = None
     alternatives: tuple[Alternative, ...] = ()

@@ -98,7 +98,6 @@ class FitFields(Document):
     known_axis: Text | UnsetType = UNSET
     focal: Literal["known", "estimate"] | UnsetType = UNSET
     focal_prior: FocalPriorFields | Literal["usual"] | UnsetType | None = UNSET
-    principal_sigma: Positive | UnsetType | None = UNSET
     shape_sigma: Positive | UnsetType = UNSET
     image: bool | UnsetType = UNSET
 

@@ -316,13 +316,13 @@ def test_pixels_beyond_the_lens_are_refused() -> None:
         ),
         (
             {"method": "aepnp", "loss": "huber"},
-            "method: the method 'aepnp' supports neither loss, stretch, scale prior nor "
-            "principal point; use the method 'optimal', or leave these options at their defaults",
+            "method: the method 'aepnp' supports neither loss, stretch nor scale prior; "
+            "use the method 'optimal', or leave these options at their defaults",
         ),
         (
             {"method": "epnp", "stretch": "none"},
-            "method: the method 'epnp' supports neither loss, stretch, scale prior nor "
-            "principal point; use the method 'optimal', or leave these options at their defaults",
+            "method: the method 'epnp' supports neither loss, stretch nor scale prior; "
+            "use the method 'optimal', or leave these options at their defaults",
         ),
     ],
 )

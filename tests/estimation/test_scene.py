@@ -492,14 +492,7 @@ def test_options_that_hold_for_no_scene_are_refused(
         "--overlay: draws one object, the file has several; "
         "give it with an object's observation.json, which is written without it"
     )
-    principal = "objects of one photo are aligned with a known principal point"
-    fix = "leave it out, or give a file for each object"
-    assert refusal_line(capsys, "fit", path, "--principal-sigma", 40) == (
-        f"--principal-sigma: {principal}; {fix}"
-    )
     data = json.loads(path.read_text())
-    path.write_text(json.dumps(data | {"fit": {"principal_sigma": 40}}))
-    assert refusal_line(capsys, "fit", path) == f"left: fit.principal_sigma: {principal}; {fix}"
     path.write_text(json.dumps(data | {"share": 5}))
     assert refusal_line(capsys, "fit", path) == (
         f"{path}: share: 5 is not what objects share; give some of focal, gravity, ground"

@@ -5,9 +5,6 @@ unknowns and by the data, from central differences of the equations themselves, 
 optimum: ``ds = -(dG/ds)^-1 dG/dd dd``. All that the objective holds counts: the determinant of what
 is integrated out, weights of robust losses, the lens at other focal lengths. Contours and depth
 images count by the points that they were matched with.
-
-An estimated principal point solves one equation more: half the derivative of the cost by it and its
-prior's are zero.
 """
 
 from __future__ import annotations
@@ -22,11 +19,10 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.errors import DegenerateError
-from cadalign.estimation.estimates import poses_of
 from cadalign.estimation.problems import focal_slopes, rays_of, whitening_of
-from cadalign.estimation.uncertainty.residuals import loss_slopes, whitening_matrices
+from cadalign.estimation.uncertainty.residuals import whitening_matrices
 from cadalign.geometry.camera import Camera
-from cadalign.solvers.joint.evidence import Evidence, State, log_focals_of, points_of, unpacked
+from cadalign.solvers.joint.evidence import Evidence, State, log_focals_of, unpacked
 from cadalign.solvers.joint.search import has_latent, reduced_row, sighted_points
 from cadalign.solvers.joint.system import Joint
 from cadalign.solvers.search import step_at
@@ -91,21 +87,6 @@ class SightedKeypoints:
         sightings = given._replace(rays=rays, whitening=whitening, slopes=slopes)
         return evidence._replace(sightings=sightings)
 
-    def forces(self, evidence: Evidence, state: State) -> FloatArray:
-        """Derivatives (k, 2) of half the cost by the keypoints' projections [1/px]."""
-        sightings, found = evidence.sightings, np.zeros(self.pixels.shape)
-        points = points_of(evidence.shape, state)[sightings.point[: len(found)]]
-        loss, bend = int(sightings.loss[0]), float(sightings.loss_scale[0])
-        given = zip(self.cameras, poses_of(evidence, state), strict=True)
-        for v, (camera, pose) in enumerate(given):
-            own, lens = self.image == v, _at_focal(camera, log_focals_of(evidence, state)[v])
-            in_camera = points[own] @ pose.rotation.T + pose.translation
-            residuals = lens.project(in_camera) - self.pixels[own]
-            forces = np.linalg.solve(self.covariances[own], residuals[..., None])[..., 0]
-            first, _ = loss_slopes((forces * residuals).sum(axis=1), loss, bend)
-            found[own] = first[:, None] * forces
-        return found
-
 
 class DataSlopes(NamedTuple):
     """Derivatives of u unknowns by the data of k keypoints.
@@ -119,12 +100,10 @@ class DataSlopes(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Place of the equations' evaluation; the principal point is ``shift`` (2,) off [px]."""
+    """Place of the equations' evaluation."""
 
     evidence: Evidence
     row: FloatArray
-    keypoints: SightedKeypoints
-    shift: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +113,6 @@ class JointOptimum:
     evidence: Evidence
     row: FloatArray  # the state
     keypoints: SightedKeypoints
-    principal_weight: float | None  # of the principal point's prior [px^-2]; None where it is known
 
     @classmethod
     def of(
@@ -143,7 +121,6 @@ class JointOptimum:
         state: State,
         cameras: Sequence[Camera],
         pixels: FloatArray,
-        principal_sigma: float | None,
     ) -> JointOptimum:
         """The optimum of evidence whose first sightings are of ``pixels`` (k, 2).
 
@@ -153,8 +130,7 @@ class JointOptimum:
         references = [_at_focal(*each) for each in zip(cameras, -logs, strict=True)]
         reduction, row = reduced_row(evidence, state)
         keypoints = SightedKeypoints.of(evidence, references, pixels)
-        weight = None if principal_sigma is None else principal_sigma**-2
-        return cls(reduction.evidence, row, keypoints, weight)
+        return cls(reduction.evidence, row, keypoints)
 
     @cached_property
     def state(self) -> State:
@@ -218,13 +194,9 @@ class JointOptimum:
         return (plus - minus) / (2 * unit)
 
     def _equations(self, place: _Place) -> FloatArray:
-        evidence, row, keypoints, shift = place
+        evidence, row = place
         system = Joint(evidence, has_latent(evidence))
-        step = step_at(system, row, evidence.shape.mean.size)[self._free]
-        if self.principal_weight is None:
-            return np.asarray(step)
-        forces = keypoints.forces(evidence, unpacked(evidence, row)).sum(axis=0)
-        return np.concatenate([step, forces + self.principal_weight * shift])
+        return np.asarray(step_at(system, row, evidence.shape.mean.size)[self._free])
 
     def _by_unknowns(self) -> FloatArray:
         distance = float(np.linalg.norm(self.state.poses[:, 9:], axis=1).mean())
@@ -238,9 +210,6 @@ class JointOptimum:
             elif k >= displaced:
                 unit *= float(spread[k - displaced])
             columns.append(self._slope(partial(self._with_unknown, k), unit))
-        if self.principal_weight is not None:
-            for axis in np.eye(2):
-                columns.append(self._slope(partial(self._with_principal, axis), _DIFFERENCE))
         return np.stack(columns, axis=1)
 
     def _by_data(self) -> FloatArray:
@@ -270,12 +239,6 @@ class JointOptimum:
             move_rigid(self.row[pose : pose + 12], step, row[pose : pose + 12])
         return self._at(row)
 
-    def _with_principal(self, axis: FloatArray, change: float) -> _Place:
-        shift = change * axis
-        keypoints = replace(self.keypoints, pixels=self.keypoints.pixels - shift)
-        evidence = keypoints.seen_in(self.evidence, self._log_focals)
-        return _Place(evidence, self.row, keypoints, shift)
-
     def _with_pixel(self, keypoint: int, axis: int, change: float) -> _Place:
         pixels = self.keypoints.pixels.copy()
         pixels[keypoint, axis] += change
@@ -291,14 +254,14 @@ class JointOptimum:
         mean = shape.mean.copy()
         mean[point, axis] += change
         evidence = self.evidence._replace(shape=shape._replace(mean=mean))
-        return _Place(evidence, self.row, self.keypoints, np.zeros(2))
+        return _Place(evidence, self.row)
 
     def _at(self, row: FloatArray) -> _Place:
         evidence = self.evidence
         if any(camera.distortion for camera in self.keypoints.cameras):
             logs = log_focals_of(evidence, unpacked(evidence, row))
             evidence = self.keypoints.seen_in(evidence, logs)
-        return _Place(evidence, row, self.keypoints, np.zeros(2))
+        return _Place(evidence, row)
 
     @cached_property
     def _log_focals(self) -> FloatArray:
@@ -312,4 +275,4 @@ class JointOptimum:
     def _seen_but(self, keypoint: int, keypoints: SightedKeypoints) -> _Place:
         """The keypoints with another one in the place of one of them."""
         evidence = keypoints.seen_in(self._here, self._log_focals, only=keypoint)
-        return _Place(evidence, self.row, keypoints, np.zeros(2))
+        return _Place(evidence, self.row)

@@ -281,8 +281,6 @@ class Basis:
     """From the first view's frame to that of the result (3, 3), where it is another."""
     photos: frozenset[int] = frozenset()
     """Views whose contour is that of a photo."""
-    principal_sigma: float | None = None
-    """Standard deviation of the principal point's prior [px], where it was estimated, too."""
 
 
 AnyBasis = Basis | SingleBasis

@@ -156,7 +156,7 @@ def _basis_of_fit(result: ResultData, options: FitOptions) -> Basis:
     evidence = with_sightings(evidence, own.inliers[np.argsort(rows, kind="stable")])
     pose = turned_alignment(own.alignment, camera.lens_from_camera.T)
     state = mean_state(evidence, pose.packed[None, :12], np.log(pose.scale))
-    return Basis(evidence, state, principal_sigma=options.principal_sigma)
+    return Basis(evidence, state)
 
 
 def _of_keypoints(result: ResultData, fitted: KeypointStatistics, exact: bool) -> Sensitivity:
@@ -225,7 +225,7 @@ def _of_evidence(result: ResultData, basis: AnyBasis, view: int) -> Sensitivity:
     kept = kept[np.argsort(rows[kept], kind="stable")]  # the order of the sightings
     pixels = np.concatenate(result.observed)[kept]
     cameras = [faced(each.camera, each.points_2d) for each in (result.views[k] for k in numbers)]
-    optimum = JointOptimum.of(evidence, state, cameras, pixels, basis.principal_sigma)
+    optimum = JointOptimum.of(evidence, state, cameras, pixels)
     image, slopes = numbers.index(view), optimum.slopes
     points = _points_by_unknowns(result, optimum)
     turn = cameras[image].lens_from_camera

@@ -9,7 +9,6 @@ import socket
 from collections.abc import Callable
 from functools import partial
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import uvicorn
@@ -22,7 +21,6 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.exporting import coco_of, glb_of, zipped_photo_set
 from cadalign.annotate.guard import Access, BoundedProtocol, Guard
 from cadalign.annotate.library import thumbnail_of
 from cadalign.annotate.locks import Claims
@@ -31,8 +29,7 @@ from cadalign.annotate.options import LOOPBACK
 from cadalign.annotate.page_state import page_state, worklist_state
 from cadalign.annotate.ranking import advice_state, ranking_state
 from cadalign.annotate.session import Session
-from cadalign.errors import CadalignError, InputError
-from cadalign.errors import quote as quoted
+from cadalign.errors import CadalignError, InputError, quote
 from cadalign.web import asset
 
 _LONGEST_NUMBER = 9  # digits
@@ -60,9 +57,6 @@ def make_app(session: Session, access: Access) -> ASGIApp:
         "/photo/{number:int}": routes.photo,
         "/worklist": routes.worklist,
         "/thumbnail/{number:int}": routes.thumbnail,
-        "/export/coco.json": routes.coco,
-        "/export/{number:int}.glb": routes.glb,
-        "/export/{form:str}.zip": routes.photo_set,
         "/mask/{number:int}": routes.mask,
         "/claim/{number:int}": routes.claim,
         "/library/{number:int}.jpg": routes.library,
@@ -165,21 +159,6 @@ class _Routes:
             raise InputError("the session has no library", where="library")
         return _kept(thumbnail_of(choice, request.path_params["number"]))
 
-    def coco(self, request: Request) -> Response:
-        data = json.dumps(coco_of(self._session)).encode()
-        return _as_file("keypoints.coco.json", data, "application/json")
-
-    def glb(self, request: Request) -> Response:
-        number, slot = _place(request)
-        data = glb_of(self._session, number, slot=slot)
-        observation = self._session.photo_state(number, slot).owner.files.observation
-        name = observation.with_suffix(".glb").name
-        return _as_file(name, data, "model/gltf-binary")
-
-    def photo_set(self, request: Request) -> Response:
-        form = request.path_params["form"]
-        return _as_file(f"{form}.zip", zipped_photo_set(self._session, form), "application/zip")
-
     def mask(self, request: Request) -> Response:
         mask = self._session.photo_state(*_place(request)).mask
         # Its opacity is what the page draws, in a colour of its own.
@@ -233,11 +212,6 @@ def _kept(thumbnail: bytes) -> Response:
     return Response(thumbnail, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
 
 
-def _as_file(name: str, data: bytes, media_type: str) -> Response:
-    headers = {"Content-Disposition": f"attachment; filename*=UTF-8''{quote(name)}"}
-    return Response(data, media_type=media_type, headers=headers)
-
-
 def _place(request: Request) -> tuple[int, int | None]:
     """The numbers of a photo, and of one of its objects if the address has it."""
     return request.path_params["number"], _number(request, "object")
@@ -248,7 +222,7 @@ def _number(request: Request, name: str) -> int | None:
     if given is None:
         return None
     if not given.isdecimal() or len(given) > _LONGEST_NUMBER:
-        raise InputError(f"{quoted(given)} is no number", where=name, fix="reload the page")
+        raise InputError(f"{quote(given)} is no number", where=name, fix="reload the page")
     return int(given)
 
 

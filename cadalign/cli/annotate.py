@@ -8,16 +8,14 @@ import threading
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from cadalign.annotate.options import LOOPBACK, FileOptions, SessionOptions
 from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
 from cadalign.cli.options import flag_of
-from cadalign.errors import DataError, InputError
-from cadalign.io.documents import read_json
-from cadalign.io.files import write_json, writing
+from cadalign.io.files import writing
 
 if TYPE_CHECKING:
     from cadalign.annotate.session import Session
@@ -46,12 +44,6 @@ class Annotate(FileOptions):
     """Address to listen on: this machine alone, or 0.0.0.0 for all of a network that you trust.
     Whoever has the printed address with its token can see and change everything, and it is not
     encrypted."""
-    export: Path | None = None
-    """Write what is marked so far to this file or folder, and serve no page. A single alignment is
-    exported by `cadalign export`."""
-    form: Literal["coco", "pix3d", "bop", "scan2cad", "kitti", "objectron"] = "coco"
-    """Form of --export: a file of COCO keypoints, or a new folder of a data set of photos as
-    `cadalign evaluate photos` reads it."""
     no_open: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the address instead of opening a browser."""
 
@@ -94,8 +86,6 @@ class Annotate(FileOptions):
         from cadalign.annotate.server import listen, make_app, serve
 
         options = self.session
-        if self.export is not None:
-            return _export(options, self.export, self.form)
         listener = listen(self.port, self.host)
         with ExitStack() as opened:
             opened.enter_context(listener)
@@ -135,43 +125,6 @@ class Annotate(FileOptions):
                     webbrowser.open(access.url)
                 serve(make_app(session, access), listener)
             return _save_and_say_where(session)
-
-
-def _export(options: SessionOptions, to: Path, form: str) -> int:
-    from cadalign.annotate.exporting import annotated_photos, coco_of
-    from cadalign.annotate.opening import open_session
-    from cadalign.export.aligned_object import write_photo_set
-
-    session = open_session(options)
-    if form == "coco":
-        _refuse_other_file(to, options)
-        data = coco_of(session)
-        write_json(to, data)
-        count = len(data["annotations"])
-        say(f"{to}: keypoints of {count} photos as COCO annotations")
-        return 0
-    with waiting("aligning (the first time after an installation takes a minute)"):
-        session.ready = True  # the first alignment compiles what is not
-        photos = annotated_photos(session)
-    problems = write_photo_set(to, photos, form)
-    for problem in problems:
-        say(f"Left out: {problem}")
-    count = len(photos) - len(problems)
-    say(f"{to}: {count} photos in the form of {form}")
-    return 0
-
-
-def _refuse_other_file(path: Path, options: SessionOptions) -> None:
-    """Refuse to write COCO annotations over a file without any, or over a detector's."""
-    known: Any = None
-    if path.is_file():
-        with suppress(DataError):
-            known = read_json(path)
-    is_coco = isinstance(known, dict) and "annotations" in known
-    is_read = options.detections is not None and options.detections.resolve() == path.resolve()
-    if path.exists() and (is_read or not is_coco):
-        what = f"{path} exists and is no earlier export"
-        raise InputError(what, where="--export", fix="give another name")
 
 
 def _save_and_say_where(session: Session) -> int:

@@ -1,25 +1,19 @@
-"""Work lists: natural order, states, thumbnails, filter and keys; detections and exports."""
+"""Work lists: natural order, states, thumbnails, filter and keys; detections."""
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from typing import Any
 
-import numpy as np
 import pytest
-import trimesh
 from playwright.sync_api import Browser
 from support.annotating import IDLE, Case, opened_page, place, place_of_pixel, wait
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.exporting import coco_of, glb_of
 from cadalign.annotate.page_state import page_state, worklist_state
 from cadalign.annotate.photos import FILE, WorkList
 from cadalign.annotate.session import Session
-from cadalign.cli import main
-from cadalign.datasets.detections.keypoint_files import read_image_keypoints
 from cadalign.errors import CadalignError
 
 pytestmark = pytest.mark.long
@@ -154,42 +148,6 @@ def test_photos_of_one_name_in_two_folders_are_told_apart(case: Case) -> None:
     expected = [{keypoint for keypoint, _ in case.clicks[n : 5 + n]} for n in (0, 1)]
     found = [{each.keypoint for each in photo.detected} for photo in fresh.photos]
     assert found == expected
-
-
-def test_annotations_are_exported_as_coco_and_glb(
-    case: Case, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder_of(case, "other.png", "skipped.png")
-    session = case.open(image=case.folder)
-    for image in (0, 1):
-        for keypoint, uv in case.clicks[image : 5 + image]:
-            place(session, keypoint, uv, image=image)
-    perform(session, 2, {"do": "mark", "mark": "skipped"})
-    data = coco_of(session)
-    assert [image["file_name"] for image in data["images"]] == ["other.png", "photo.png"]
-    to = case.folder.parent / "all.json"
-    command = ["annotate", str(case.folder), str(case.model), "--export", str(to)]
-    assert main([*command, "--camera", str(case.camera)]) == 0
-    assert json.loads(to.read_text()) == data
-    assert main([*command, "--camera", str(case.camera)]) == 0  # once more
-    capsys.readouterr()
-    kept = (case.folder / "other.json").read_bytes()
-    assert main([*command[:-1], str(case.folder / "other.json")]) == 1
-    assert "other.json exists and is no earlier export; give another" in capsys.readouterr().err
-    assert main([*command, "--detections", str(to)]) == 1
-    assert (case.folder / "other.json").read_bytes() == kept
-    assert json.loads(to.read_text()) == data
-    read = read_image_keypoints(to)
-    assert [each.image for each in read] == ["other.png", "photo.png"]
-    assert (read[0].scores > 0).tolist() == [True] * 5 + [False]
-    np.testing.assert_allclose(read[1].points_2d[1:], [uv for _, uv in case.clicks[1:6]])
-
-    scene = trimesh.load(io.BytesIO(glb_of(session, 1)), file_type="glb")
-    assert len(scene.geometry) > 0
-    perform(session, 1, {"do": "lengths", "height": 0.9, "sigma": 0.02})
-    assert glb_of(session, 1)[:4] == b"glTF"
-    with pytest.raises(CadalignError, match="no alignment yet"):
-        glb_of(session, 2)
 
 
 def test_keypoints_of_a_detector_are_taken_in_the_page(browser: Browser, case: Case) -> None:

@@ -1,9 +1,7 @@
 // Talks to the server: one request after the other, each answered with the whole state.
-import { h } from "../common/dom.js";
 
 const SILENT = "The server does not answer. Everything up to the last “Saved” is on disk.";
 const LONG = 1000; // without an answer, until the page says that it is waited for [ms]
-const KEPT = 60_000; // a file in memory, while the browser saves it [ms]
 
 export class Api {
   /**
@@ -144,25 +142,7 @@ export async function failureOf(address) {
   }
 }
 
-/** Save the file of an address, as the server names it; says why if there is none. */
-export async function download(address, tell) {
-  try {
-    const response = await fetch(address);
-    if (!response.ok) {
-      tell(await reasonOf(response));
-      return;
-    }
-    const name = /filename\*=UTF-8''(.*)/.exec(response.headers.get("Content-Disposition") ?? "");
-    const url = URL.createObjectURL(await response.blob());
-    h("a", { href: url, download: name ? decodeURIComponent(name[1]) : "" }).click();
-    setTimeout(() => URL.revokeObjectURL(url), KEPT);
-    tell("");
-  } catch {
-    tell(SILENT);
-  }
-}
-
 /** The address of what concerns an object of a photo. */
-export function addressOf(name, { image, object }, ending = "") {
-  return `${name}/${image}${ending}${object === null ? "" : `?object=${object}`}`;
+export function addressOf(name, { image, object }) {
+  return `${name}/${image}${object === null ? "" : `?object=${object}`}`;
 }

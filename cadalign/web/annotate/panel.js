@@ -1,11 +1,6 @@
 // The lower half: what the alignment is, what to mark next, and the list of pairs.
 import { button, h } from "../common/dom.js";
-import { addressOf, download } from "./api.js";
 import { EvidencePanel } from "./evidence_panel.js";
-
-const FORMS = [
-  ["pix3d", "Pix3D"], ["bop", "BOP"], ["scan2cad", "Scan2CAD"], ["kitti", "KITTI"], ["objectron", "Objectron"],
-];
 
 export class Panel {
   /** @param {object} handlers - act(action), select(pair), suggested(), mirror(pair), tell(text) */
@@ -217,40 +212,10 @@ export class Panel {
     );
     this.empty = h("p", { class: "soft" }, "No pairs yet.");
     this.table = h("table", {}, h("thead", {}, h("tr", {}, head)), this.rows);
-    this.glb = this.makeLink("Aligned model (GLB)");
-    const coco = this.makeLink("All keypoints (COCO)");
-    coco.href = "export/coco.json";
-    const exports = h("p", { class: "exports" }, "Export: ", coco, " ", this.glb, " ", this.makePhotoSet());
-    return h("div", { class: "scroll" }, exports, this.empty, this.table);
+    return h("div", { class: "scroll" }, this.empty, this.table);
   }
 
-  /** A link to a file that the server may refuse, which the page then says. */
-  makeLink(text) {
-    const link = h("a", {
-      onclick: (event) => {
-        event.preventDefault();
-        download(link.href, this.handlers.tell);
-      },
-    }, text);
-    return link;
-  }
-
-  /** A choice among the forms of data sets, and the link to all photos in that form. */
-  makePhotoSet() {
-    const link = this.makeLink("Data set (ZIP)");
-    const form = h(
-      "select",
-      { "aria-label": "Form of the data set", onchange: () => (link.href = `export/${form.value}.zip`) },
-      FORMS.map(([value, name]) => h("option", { value }, name)),
-    );
-    link.href = `export/${form.value}.zip`;
-    this.photoSet = h("span", { class: "photo-set" }, link, " as", form);
-    return this.photoSet;
-  }
-
-  showPairs({ pairs, shape, image, alignment }, selected) {
-    this.glb.hidden = alignment.status !== "done";
-    this.glb.href = addressOf("export", { image: image.number, object: image.object }, ".glb");
+  showPairs({ pairs, shape }, selected) {
     this.empty.hidden = pairs.length > 0;
     this.table.hidden = pairs.length === 0;
     const focus = this.rows.contains(document.activeElement) ? document.activeElement.dataset.key : null;

@@ -130,15 +130,6 @@ class ClickableModel:
         return np.array([point.xyz for point in self.samples])
 
     @cached_property
-    def light_scene(self) -> Scene:
-        """The mesh with at most as many faces as are displayed, for what need not be exact."""
-        mesh = self.scene.mesh
-        if len(mesh.faces) <= MOST_FACES:
-            return self.scene
-        small = simplify(mesh, max_faces=MOST_FACES)
-        return Scene(Mesh(small.vertices, small.faces))
-
-    @cached_property
     def displayed(self) -> tuple[Mesh, npt.NDArray[np.float32], BoolArray]:
         """The triangles that are displayed: simplified, of those in one place one for each side.
 

@@ -306,12 +306,10 @@ class OpenedModel:
             self._mirrored[keypoint] = self.cad.mirrored(self.registry[keypoint].xyz)
         return self._mirrored[keypoint]
 
-    def prepare(self, *, has_shape: bool) -> None:
+    def prepare(self) -> None:
         """Compute what takes seconds on millions of faces, which the first click would wait for."""
         _ = self.cad.scene.caster, self.cad.samples
         _ = self.cad.snap_points, self.cad.mirror_planes
-        if not has_shape:
-            _ = self.cad.light_scene.caster
 
     def write_keypoints(self, used: frozenset[int]) -> None:
         """Write the given keypoints and those in use; raises DataError on failure."""

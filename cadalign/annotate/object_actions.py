@@ -162,7 +162,7 @@ def model(state: PhotoState, *, category: Text, model: Text) -> ActionOutcome | 
     if new is old:
         return None
     if session.ready:
-        new.prepare(has_shape=session.shape.is_estimated)
+        new.prepare()
     carried = carry_keypoints(old.registry, new.registry, session.choice.ids_on(old.path))
     before = len(state.document.keypoints)
     owner.history = owner.history.changed(lambda document: _carried(document, carried))

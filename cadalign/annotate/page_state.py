@@ -17,7 +17,6 @@ from cadalign.annotate.object_actions import ActionOutcome
 from cadalign.annotate.objects import PhotoState, shown_objects
 from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.annotate.session import Session
-from cadalign.annotate.suggestion import name_of, next_best_text
 from cadalign.errors import CadalignError
 from cadalign.io.documents import read_json
 from cadalign.io.evidence import LENGTHS
@@ -98,7 +97,7 @@ def page_state(
                 "keypoint": suggestion.point.semantic_id,
                 "xyz": cad.to_display(suggestion.point.xyz).tolist(),
                 "uv": suggestion.uv,
-                "text": next_best_text(suggestion.next_best, name_of(suggestion)),
+                "text": suggestion.text,
             },
             "objects": [
                 _object(each) | {"is_current": each is state}

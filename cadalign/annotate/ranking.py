@@ -1,4 +1,4 @@
-"""Rankings for the page: evidence to add to an object's pairs, and a library's models by them."""
+"""Ranking of a library's models by the pairs of an object, for the page."""
 
 from __future__ import annotations
 
@@ -9,49 +9,8 @@ import numpy as np
 from cadalign.annotate.objects import filled
 from cadalign.annotate.problem import LEAST_PAIRS
 from cadalign.annotate.session import Session
-from cadalign.annotate.suggestion import evidence_text, how_text, left_text, name_of, present, rank
 from cadalign.errors import CadalignError
 from cadalign.retrieval.page import score_text
-
-_FOCAL = "With a known focal length, a mask, another photo and lengths are ranked here too."
-
-
-def advice_state(session: Session, number: int, *, slot: int | None = None) -> dict[str, Any]:
-    """Rank what could be added to an object's pairs, of the annotation of that ``revision``.
-
-    Nothing is ranked without an alignment by the pairs alone, for an object's own shape, and where
-    the focal length is estimated.
-    """
-    with session.lock:
-        state = session.photo_state(number, slot)
-        live, suggestion = session.live(state)
-        document, revision = state.document, state.owner.history.revision
-        pairs = document.complete_pairs
-        points_3d = np.array([point.xyz for point in state.model.points_of(pairs)])
-    answer: dict[str, Any] = {"revision": revision, "note": "", "now": "", "pieces": []}
-    result = live.result
-    if result is None or live.provisional or live.also_used or session.shape.is_estimated:
-        return answer
-    if not document.focal.known:
-        return answer | {"note": _FOCAL}
-    given = filled(pair.sigma for pair in pairs)
-    sigma = live.sigma * (np.ones(len(pairs)) if given is None else given)
-    points_2d = np.array([pair.uv for pair in pairs], dtype=float)
-    # Without the lock, for which the next click would wait.
-    ranked = rank(state.model.cad, (points_3d, points_2d, sigma), result, suggestion)
-    name = "" if suggestion is None else name_of(suggestion)
-    pieces = [
-        {
-            "kind": each.kind,
-            "what": evidence_text(each, name),
-            "left": left_text(each),
-            "how": how_text(each, state.owner.files.observation.name),
-            "worst": each.worst,
-        }
-        for each in ranked
-    ]
-    now = present(result)
-    return answer | {"now": "" if now is None else left_text(now), "pieces": pieces}
 
 
 def ranking_state(session: Session, number: int, *, slot: int | None = None) -> dict[str, Any]:

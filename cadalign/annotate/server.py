@@ -27,7 +27,7 @@ from cadalign.annotate.locks import Claims
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
 from cadalign.annotate.page_state import page_state, worklist_state
-from cadalign.annotate.ranking import advice_state, ranking_state
+from cadalign.annotate.ranking import ranking_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError, InputError, quote
 from cadalign.web import asset
@@ -37,7 +37,7 @@ _BYTES = "application/octet-stream"
 _BROWSER = "cadalign-browser"  # cookie that identifies the browser, for all of its tabs
 
 
-_OF_OBJECT = {"state": page_state, "advice": advice_state, "models": ranking_state}
+_OF_OBJECT = {"state": page_state, "models": ranking_state}
 """Plain data of one object of a photo, by the address."""
 
 

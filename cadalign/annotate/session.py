@@ -22,9 +22,8 @@ from cadalign.annotate.models import Models, ObjectShape
 from cadalign.annotate.objects import AnnotatedObject, PhotoState, shown_objects
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.problem import Known
-from cadalign.annotate.suggestion import Suggestion, suggest, warm_up_advice
+from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.errors import CadalignError, DegenerateError, InputError
-from cadalign.estimation.view import View
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.io.images import read_photo
 
@@ -74,9 +73,8 @@ class Session:
             joint = self.shape.is_estimated or not all(
                 state.observation().is_plain for state in marked
             )
-            has_shape = self.shape.is_estimated
             steps = [partial(_load_solvers, joint=joint)]
-            steps += [partial(model.prepare, has_shape=has_shape) for model in self.models.opened]
+            steps += [partial(model.prepare) for model in self.models.opened]
             for step in steps:
                 if self.ended.is_set():
                     return
@@ -128,7 +126,7 @@ class Session:
         return self._pixels[1]
 
     def live(self, state: PhotoState) -> tuple[LiveAlignment, Suggestion | None]:
-        """Compute the alignment and the next-best keypoint of the current annotation."""
+        """Compute the alignment and the next keypoint of the current annotation."""
         if not self.ready:
             return LiveAlignment(message="Solvers and model are being prepared."), None
         others = self._others_focal(state)
@@ -309,5 +307,3 @@ def _load_solvers(*, joint: bool) -> None:
     problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)
     points, pixels, camera = problem.points_3d, problem.points_2d, problem.camera
     warm_up(points, pixels, camera, joint=joint)
-    if not joint:
-        warm_up_advice(points, View(camera, pixels), problem.alignment)

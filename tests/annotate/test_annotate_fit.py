@@ -1,4 +1,4 @@
-"""The live alignment: its values, outliers among the pairs, and the next-best keypoint."""
+"""The live alignment: its values, outliers among the pairs, and the next keypoint."""
 
 from __future__ import annotations
 
@@ -16,22 +16,17 @@ from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.live import facts_of, live_alignment, missing_text, notes_of
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.models import ObjectShape
+from cadalign.annotate.models import KeypointRegistry, ObjectShape
 from cadalign.annotate.photos import FocalChoice, Intrinsics
 from cadalign.annotate.problem import Known, LiveProblem
-from cadalign.annotate.suggestion import (
-    UNKNOWNS,
-    NextBest,
-    find_next_best,
-    next_best_text,
-    updated_variances,
-)
+from cadalign.annotate.suggestion import Suggestion, suggest
 from cadalign.datasets import ModelKeypoint
 from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ImageEvidence
 from cadalign.io.observation import Observation
+from cadalign.render import visible_keypoints
 from cadalign.solvers.projection import projection_jacobian
 
 KNOWN = FocalChoice(known=True)
@@ -246,60 +241,43 @@ def refitted(problem: Problem, result: Any, candidate: np.ndarray, focal: str) -
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("focal", ["known", "estimate"])
+@pytest.mark.parametrize("choice", [KNOWN, UNKNOWN])
 @given(st.integers(0, 10_000))
 @settings(max_examples=15)
-def test_next_best_is_that_of_brute_force_refitting(focal: str, seed: int) -> None:
+def test_the_suggestion_is_that_of_brute_force_refitting(choice: FocalChoice, seed: int) -> None:
     problem = problem_of(seed, points=9, noise_px=0.5)
-    result = fit(problem.points_3d, problem.points_2d, problem.camera, focal=focal)
-    assert result.fisher_covariance is not None
+    live, focal = live_of(problem, choice=choice), "known" if choice.known else "estimate"
+    result = live.result
+    assume(result is not None and not live.message and live.sigma == 1.0)
     # The prediction is of first order: a focal length that is open by more than its own size, at
     # the end of its range, is beyond it.
     assume(result.std is not None and result.std.focal < 1)
-    rng = np.random.default_rng(seed + 1)
-    candidates = rng.uniform(-1, 1, (6, 3))
-    candidates = candidates[result.alignment.apply(candidates)[:, 2] > 0.5]
-    brute = np.array([refitted(problem, result, point, focal).diagonal() for point in candidates])
-    predicted = updated_variances(
-        candidates, result.camera, result.alignment, result.fisher_covariance, 1.0
-    )
-    np.testing.assert_allclose(predicted, brute, rtol=2e-3)
-    next_best = find_next_best(
-        candidates, result.camera, result.alignment, result.fisher_covariance, 1.0
-    )
-    assert next_best is not None
-    column = brute[:, next_best.unknown]
-    assert column[next_best.row] <= column.min() * (1 + 5e-3)
-    assert next_best.after < next_best.before
+    model, rng = ClickableModel(BOX), np.random.default_rng(seed + 1)
+    points = [
+        ModelKeypoint(f"corner {k}", tuple(xyz), k)
+        for k, xyz in enumerate(rng.permutation(BOX.vertices).tolist())
+    ]
+    scene = Wireframe.of_model(model).scene
+    xyz = np.array([point.xyz for point in points])
+    seen = visible_keypoints(scene, xyz, result.camera, result.alignment)
+    assume(np.count_nonzero(seen) > 1)
+    found = suggest(live, model, KeypointRegistry(points), (), STRETCHED)
+    assert found is not None
+    left = {
+        point.name: np.linalg.slogdet(refitted(problem, result, np.array(point.xyz), focal))[1]
+        for point in np.array(points, dtype=object)[seen]
+    }
+    assert left[found.point.name] <= min(left.values()) + 0.02
 
 
-def test_next_best_concerns_the_most_uncertain_unknown() -> None:
-    problem = problem_of(4, points=10, noise_px=1.0)
-    result = fit(problem.points_3d, problem.points_2d, problem.camera)
-    covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4, 0.0, 1e-4, 0.04])
-    next_best = find_next_best(problem.points_3d, problem.camera, result.alignment, covariance, 1.0)
-    assert next_best is not None
-    assert next_best.unknown == 8
-    assert next_best.before == pytest.approx(0.2)
-    distance = np.linalg.norm(result.alignment.translation)
-    covariance[5, 5] = (0.3 * distance) ** 2  # in shares of the distance
-    assert (
-        find_next_best(problem.points_3d, problem.camera, result.alignment, covariance, 1.0).unknown
-        == 5
-    )
-
-
-def test_equally_good_candidates_give_the_first() -> None:
-    problem = problem_of(4, points=10, noise_px=1.0)
-    result = fit(problem.points_3d, problem.points_2d, problem.camera)
-    same = np.repeat(problem.points_3d[:1], 5, axis=0)
-    next_best = find_next_best(same, problem.camera, result.alignment, result.covariance, 1.0)
-    assert next_best is not None
-    assert next_best.row == 0
-    assert (
-        find_next_best(same[:0], problem.camera, result.alignment, result.covariance, 1.0) is None
-    )
-    assert find_next_best(same, problem.camera, result.alignment, np.zeros((9, 9)), 1.0) is None
+def test_without_visible_keypoints_a_corner_is_suggested() -> None:
+    problem, model = problem_of(7, points=10, noise_px=0.5), ClickableModel(BOX)
+    live, hidden = live_of(problem), ModelKeypoint("inside", (0.0, 0.0, 0.0), 3)
+    found = suggest(live, model, KeypointRegistry([hidden]), (), STRETCHED)
+    assert found is not None
+    assert found.point.semantic_id is None
+    assert found.text.startswith("The marked corner: so far known to ± ")
+    assert suggest(LiveAlignment(), model, KeypointRegistry(), (), STRETCHED) is None
 
 
 # --- derivatives -----------------------------------------------------------------------------
@@ -382,11 +360,8 @@ def test_notes_name_alternatives_and_weak_stretches() -> None:
     assert notes_of(LiveAlignment(message="wait"), STRETCHED) == ()
 
 
-def test_text_names_point_and_gain() -> None:
-    assert next_best_text(NextBest(0, 8, 0.12, 0.034), "left arm") == (
-        "left arm: it would determine the stretch along z to ± 3.4 % instead of 12 %"
+def test_text_names_the_point_and_what_is_known_of_it() -> None:
+    point = ModelKeypoint("left arm", (0.0, 0.0, 0.0), 3)
+    assert Suggestion(point, (1.0, 2.0), 3.44).text == (
+        "left arm: so far known to ± 3.4 px; it would tell most"
     )
-    assert next_best_text(NextBest(0, 1, np.radians(4), np.radians(0.5)), "tip") == (
-        "tip: it would determine the rotation to ± 0.5° instead of 4°"
-    )
-    assert UNKNOWNS[9] == "the focal length"

@@ -29,7 +29,6 @@ from cadalign import ShapeModel
 from cadalign.annotate.actions import perform
 from cadalign.annotate.guard import Access
 from cadalign.annotate.page_state import page_state
-from cadalign.annotate.ranking import advice_state
 from cadalign.annotate.session import Session
 from cadalign.datasets import ModelKeypoints
 from cadalign.shapes.examples import Example
@@ -312,47 +311,6 @@ def test_keys_nudge_select_suggest_and_delete(opened: tuple[Driver, Case, Access
     expect(page.locator("dialog")).to_be_visible()
     page.keyboard.press("Escape")
     expect(page.locator("dialog")).not_to_be_visible()
-
-
-def test_what_to_add_next_is_ranked_once_the_pairs_rest(
-    opened: tuple[Driver, Case, Access],
-) -> None:
-    driver, case, _ = opened
-    page = driver.page
-    place_all(driver.session, case, count=6)
-    page.evaluate("annotator.api.refresh()")
-    driver.wait_for_state(lambda state: len(state["pairs"]) == 6)
-    shown = page.locator(".ranking:not(.stale) li")
-    expect(shown).to_have_count(4)
-    wanted = [
-        f"{each['what']}: {each['left']}" for each in advice_state(driver.session, 0)["pieces"]
-    ]
-    expect(shown).to_contain_text(wanted, use_inner_text=True)
-    assert "A mask of the object" in page.locator(".ranking").inner_text()
-
-    # It is hidden until it is told anew.
-    page.evaluate("annotator.askSoon = () => {}; annotator.act({ do: 'undo' })")
-    driver.wait_for_state(lambda state: fitted_pairs(state) == 5)
-    expect(page.locator(".ranking")).not_to_be_visible()
-    page.evaluate("annotator.ask()")
-    expect(shown).to_have_count(4)
-    wanted = [
-        f"{each['what']}: {each['left']}" for each in advice_state(driver.session, 0)["pieces"]
-    ]
-    expect(shown).to_contain_text(wanted, use_inner_text=True)
-
-    # An answer that comes after the next change is dropped.
-    page.evaluate("""async () => {
-        const ask = annotator.api.advice;
-        annotator.api.advice = async (image) => {
-            const answer = await ask.call(annotator.api, image);
-            await annotator.act({ do: 'redo' });
-            return answer;
-        };
-        await annotator.act({ do: 'undo' });
-        await annotator.ask();
-    }""")
-    expect(page.locator(".ranking")).not_to_be_visible()
 
 
 def test_both_views_can_be_used_by_the_keyboard_alone(

@@ -56,7 +56,7 @@ def act(access: Access, body: str = UNDO, **options: str) -> int:
     return ask(access, "/act/0", method="POST", body=body, **(defaults | options))[0]
 
 
-PATHS = ["/", "/annotate.js", "/annotate.css", "/model", "/photo/0", "/state/0", "/advice/0"]
+PATHS = ["/", "/annotate.js", "/annotate.css", "/model", "/photo/0", "/state/0"]
 
 
 @pytest.mark.long

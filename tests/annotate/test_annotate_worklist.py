@@ -141,13 +141,6 @@ def test_photos_of_one_name_in_two_folders_are_told_apart(case: Case) -> None:
         "begun"
     ]
     assert WorkList.open(out).marks == {"../left/img.png": "done"}
-    data = coco_of(again)
-    assert [image["file_name"] for image in data["images"]] == ["left/img.png", "right/img.png"]
-    (out / "found.json").write_text(json.dumps(data))
-    fresh = case.open(**options | {"out": case.folder, "detections": out / "found.json"})
-    expected = [{keypoint for keypoint, _ in case.clicks[n : 5 + n]} for n in (0, 1)]
-    found = [{each.keypoint for each in photo.detected} for photo in fresh.photos]
-    assert found == expected
 
 
 def test_keypoints_of_a_detector_are_taken_in_the_page(browser: Browser, case: Case) -> None:
@@ -162,15 +155,6 @@ def test_keypoints_of_a_detector_are_taken_in_the_page(browser: Browser, case: C
         assert session.photos[0].document.pairs[0].keypoint == keypoint
         page.keyboard.press("a")
         wait(page, f"{IDLE} && annotator.state.pairs.length === {len(case.clicks)}")
-        with page.expect_download() as coco:
-            page.get_by_role("link", name="All keypoints (COCO)").click()
-        assert json.loads(coco.value.path().read_text()) == coco_of(session)
-        with page.expect_download() as glb:
-            page.get_by_role("link", name="Aligned model (GLB)").click()
-        assert glb.value.suggested_filename == "photo.glb"
-        page.get_by_label("Form of the data set").select_option("kitti")
-        page.get_by_role("link", name="Data set (ZIP)").click()  # of an object that is tilted
-        wait(page, "annotator.layout.message.textContent.includes('choose another form')")
 
 
 def test_why_a_photo_cannot_be_shown_is_said(browser: Browser, case: Case) -> None:

@@ -129,9 +129,7 @@ class Keyboard:
 
     def _pairs(self) -> None:
         self.keys("a", then=f"{SETTLED} && annotator.state.alignment.status === 'done'")
-        self.wait("document.querySelectorAll('.ranking:not(.stale) li').length > 0")
         self.look("aligned")
-        self.disclose(".how summary")
         self.disclose(".keypoints-list > summary")
         self.look("details")
         self.keys("]")

@@ -39,16 +39,6 @@ export class Api {
     return this.enqueue((place) => ({ url: addressOf("state", place), options: {} }));
   }
 
-  /** What could be added to a photo's pairs, ranked; null without an answer. Nothing waits for it. */
-  async advice(place) {
-    try {
-      const response = await fetch(addressOf("advice", place));
-      return response.ok ? await response.json() : null;
-    } catch {
-      return null; // the next action reports that the server is gone
-    }
-  }
-
   /** The revision of what is shown, and whether another browser has changed it; null without one. */
   async claim() {
     try {

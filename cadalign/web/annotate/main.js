@@ -1,7 +1,6 @@
 // The annotator: photo on the left, model on the right, results below.
 import "../common/theme.css";
 import "./annotate.css";
-import { debounced } from "../common/dom.js";
 import { Api } from "./api.js";
 import { listen } from "./keys.js";
 import { ModelLibrary } from "./library.js";
@@ -24,7 +23,6 @@ const SIDES = {
   top: [0, 1, -0.001], bottom: [0, -1, -0.001],
 };
 const SNAP = 14; // reach of snapping clicks on the screen [px]
-const REST = 300; // without a change, until what to add next is ranked [ms]
 
 class App {
   constructor() {
@@ -38,7 +36,6 @@ class App {
       onWorking: (on) => this.layout.showWorking(on),
     });
     const act = (action, select) => this.act(action, select);
-    this.askSoon = debounced(() => this.ask(), REST);
     this.panel = new Panel({
       act,
       select: (pair) => this.select(pair),
@@ -156,7 +153,6 @@ class App {
     this.layout.show(state);
     this.objects.show(state);
     this.draw();
-    if (state.alignment.status === "done") this.askSoon();
     if (state.alignment.status === "preparing") setTimeout(() => this.api.refresh(), POLL);
   }
 
@@ -165,25 +161,6 @@ class App {
     this.model.show(this.state, this.selected);
     if (this.model.result) this.showResult(true);
     this.panel.show(this.state, this.selected);
-    this.panel.showRanking(this.ranked, this.isCurrent(this.ranked));
-  }
-
-  /** Ask what to add next, unless that is known; an answer that comes too late is dropped. */
-  async ask() {
-    if (this.isCurrent(this.ranked)) return;
-    const { number, object } = this.state.image;
-    const answer = await this.api.advice({ image: number, object });
-    const ranked = answer && { ...answer, number, object };
-    if (!this.isCurrent(ranked)) return;
-    this.ranked = ranked;
-    this.panel.showRanking(ranked, true);
-  }
-
-  /** Whether a ranking belongs to the annotation that is shown. */
-  isCurrent(ranked) {
-    const { image, revision } = this.state;
-    const isOfThis = ranked?.number === image.number && ranked.object === image.object;
-    return isOfThis && ranked.revision === revision;
   }
 
   /** Show what was changed in another page, and say so if it is another browser's. */

@@ -11,7 +11,6 @@ export class Panel {
     this.priors = this.makePriors();
     this.evidence = new EvidencePanel(handlers);
     this.advice = h("div", { class: "advice" });
-    this.ranking = h("div", { class: "ranking" });
     this.keypoints = h("ul", { class: "keypoints" });
     this.keypointsTitle = h("summary");
     this.details = h("details", { class: "keypoints-list" }, this.keypointsTitle, this.keypoints);
@@ -20,7 +19,7 @@ export class Panel {
       "section",
       { class: "panel", "aria-label": "Results" },
       card("Alignment", this.focal, this.priors, this.evidence.root, this.alignment),
-      card("Next keypoint", this.details, this.advice, this.ranking),
+      card("Next keypoint", this.details, this.advice),
       card("Pairs", this.makeTable()),
     );
     this.root.lastChild.classList.add("wide");
@@ -164,29 +163,6 @@ export class Panel {
         "It is marked by a dashed yellow ring on the model, and in the photo where it should be.",
       ),
       button("Use this model point", this.handlers.suggested, { title: "N" }),
-    );
-  }
-
-  /** Show what could be added, the most useful first; one that is out of date keeps its place. */
-  showRanking(ranked, current) {
-    this.ranking.classList.toggle("stale", !current);
-    if (!current) return;
-    const { pieces, note, now } = ranked;
-    const rows = pieces.map(({ kind, what, left, how }) =>
-      h(
-        "li",
-        { class: `piece-${kind}` },
-        h("span", {}, what),
-        ": ",
-        h("strong", {}, left),
-        how ? h("details", { class: "how" }, h("summary", {}, "How to add it"), how) : null,
-      ),
-    );
-    this.ranking.replaceChildren(
-      rows.length ? h("h3", {}, "What would help most") : "",
-      rows.length ? h("p", { class: "soft" }, `The largest standard deviation, now ${now}, with each:`) : "",
-      rows.length ? h("ol", {}, rows) : "",
-      note ? h("p", { class: "soft" }, note) : "",
     );
   }
 

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
     from cadalign.batch.fits import fit_many, stream_fits
     from cadalign.errors import CadalignError
     from cadalign.estimation.align import align, align_batch
-    from cadalign.estimation.detector_noise import DetectorNoise, calibrate_detector
     from cadalign.estimation.fit import fit, fit_batch
     from cadalign.estimation.focal import FocalPrior
     from cadalign.estimation.model import Model
@@ -46,7 +45,6 @@ __all__ = [
     "CadalignError",
     "Camera",
     "Contribution",
-    "DetectorNoise",
     "EvidenceSummary",
     "Example",
     "FocalPrior",
@@ -70,7 +68,6 @@ __all__ = [
     "align",
     "align_batch",
     "align_scene",
-    "calibrate_detector",
     "datasets",
     "errors",
     "evaluate",

@@ -24,7 +24,7 @@ import tyro
 from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.annotator import annotator
 from benchmarks.cameras import photo_lenses, scenes
-from benchmarks.cars import noise_of_detector, real_detections
+from benchmarks.cars import real_detections
 from benchmarks.clicks import clicks, outline_methods
 from benchmarks.coverage import coverage
 from benchmarks.evidence import evidence
@@ -65,7 +65,6 @@ USUAL: dict[str, Callable[..., Tables]] = {
     "ransac": ransac,
     "torch": torch_layer,
     "gradients": gradient_errors,
-    "noise": noise_of_detector,
 }
 ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "evidence": evidence,

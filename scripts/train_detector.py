@@ -7,8 +7,8 @@ One network is trained by heat maps alone, then goes on in five ways: by heat ma
 the mean shape, rigid, with stretch, and through the alignment of the learned shape; and by the
 Monte-Carlo loss over the posterior. All are judged on renders of models that they have not seen, by
 `cadalign.align` with the learned shape and sigmas from the spread of the heat maps. Writes
-detector/table.json, the keypoints of some images in the folder seen, car.shape and detector.noise,
-which `cadalign fit` takes, network.pt, and confusion.png: which keypoints the last network takes
+detector/table.json, the keypoints of some images in the folder seen and car.shape, which
+`cadalign fit` takes, network.pt, and confusion.png: which keypoints the last network takes
 for others.
 """
 
@@ -28,7 +28,7 @@ from rich.table import Table
 
 import cadalign
 from cadalign.arrays import FloatArray, IntArray
-from cadalign.datasets import ImageKeypoints, sample_models
+from cadalign.datasets import sample_models
 from cadalign.geometry.rotations import angle_between
 from cadalign.io.files import write_json
 from cadalign.metrics import box_iou_up_to_scale
@@ -251,7 +251,7 @@ def main(options: TrainOptions) -> None:
     print(f"{time.process_time() - spent:.0f} s of processor time", flush=True)
     show(rows)
     draw_confusion(options.out / "confusion.png", last, held_out, mirrored)
-    write(options.out, rows, last, spare, held_out, shape)
+    write(options.out, rows, last, held_out, shape)
 
 
 def show(rows: dict[str, dict[str, float]]) -> None:
@@ -268,21 +268,14 @@ def write(
     folder: Path,
     rows: dict[str, dict[str, float]],
     detector: KeypointDetector,
-    spare: RenderedViews,
     views: RenderedViews,
     shape: cadalign.ShapeModel,
 ) -> None:
-    """Write the table, and keypoints with their noise and shape for `cadalign fit`."""
+    """Write the table, and keypoints with their shape for `cadalign fit`."""
     (folder / "seen").mkdir(parents=True, exist_ok=True)
     write_json(folder / "table.json", rows)
     torch.save(detector.network.state_dict(), folder / "network.pt")
     shape.save(folder / f"{shape.category}.shape")
-    pixels, sigma = detector.predict(spare)
-    seen = [ImageKeypoints(p, 1 / s, ids=spare.ids) for p, s in zip(pixels, sigma, strict=True)]
-    true = [ImageKeypoints(p, ids=spare.ids) for p in spare.points_2d]
-    noise = cadalign.calibrate_detector(seen, true)
-    noise.save(folder / "detector.noise")
-    print(noise)
     pixels, sigma = detector.predict(views)
     lines = [
         {

@@ -21,7 +21,6 @@ from cadalign.datasets.detections.image_keypoints import (
 )
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
 from cadalign.errors import CadalignError, DataError, InputError
-from cadalign.estimation.detector_noise import opened_noise
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated
@@ -144,10 +143,9 @@ class FitRunOptions(ManyOptions):
         return Estimated(seen, result, {}, {})
 
     def contents(self) -> dict[str, Any]:
-        shape, noise = self.estimate.shape, self.estimate.noise
+        shape = self.estimate.shape
         category = None if shape is None else ShapeModel.open(shape).category
-        found = super().contents() | {"shapes": category}
-        return found if noise is None else found | {"noise": str(opened_noise(noise))}
+        return super().contents() | {"shapes": category}
 
 
 def _photo_doubt(view: ObservedImage) -> str:

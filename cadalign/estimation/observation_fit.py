@@ -35,9 +35,6 @@ class ObservationFit:
 
     sigma: float | None = None
     """Standard deviation of the keypoints [px]; by default the file's, or 1."""
-    noise: Path | None = None
-    """File of a detector's noise, from `cadalign.calibrate_detector`: standard deviations of the
-    keypoints by their scores and names, in the place of the file's."""
     similar: bool = False
     """Estimate sigma from the residuals: for a model that is only similar to the object. Its
     proportions are similar, too: --stretch-sigma is 0.2, unless the file or a flag says
@@ -107,16 +104,10 @@ class ObservationFit:
 
         None is to be estimated.
         """
-        given = "similar" if self.similar else "sigma"
-        noise, own = self.named("noise"), self.named(given)
-        if self.noise is not None:
-            if self.similar or self.sigma is not None:
-                self._refuse_both(f"{noise} has the standard deviations, which {own} gives", given)
-            return {}
         if self.similar:
             if self.sigma is not None:
-                sigma = self.named("sigma")
-                what = f"{own} estimates the standard deviation, which {sigma} gives"
+                similar, sigma = self.named("similar"), self.named("sigma")
+                what = f"{similar} estimates the standard deviation, which {sigma} gives"
                 self._refuse_both(what, "sigma")
             return {"sigma": None}
         if self.sigma is not None:
@@ -251,13 +242,7 @@ class ObservationFit:
             data = fill_xyz(data)
         with in_file(where):
             seen = Observation.from_dict(data, folder=folder)
-        found = changes.applied_to(seen, where)  # whose errors name options
-        if self.noise is None:
-            return found
-        from cadalign.estimation.detector_noise import with_noise
-
-        with in_file(where):
-            return with_noise(found, self.noise)
+        return changes.applied_to(seen, where)  # whose errors name options
 
     def fit(
         self,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Hashable, Sequence
-from dataclasses import InitVar, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -30,9 +30,6 @@ from cadalign.geometry.pixels import check_pixels
 from cadalign.geometry.rotations import nearest_rigid
 from cadalign.io.evidence import BeyondKeypoints
 from cadalign.io.images import ByteImage, read_grey, read_mask, read_photo
-
-if TYPE_CHECKING:
-    from cadalign.estimation.detector_noise import DetectorNoise
 
 _FILE_SCALE = 0.001  # of a 16-bit depth image: millimetres to metres
 _SYMMETRY_TOLERANCE = 1e-9
@@ -59,10 +56,7 @@ class View(BeyondKeypoints):
         Standard deviation of the keypoints, of each, or covariance of each [px]. None estimates one
         for all views that have none, by its likelihood under a weak prior about 2 px.
     scores : (n,) float, optional
-        Confidences of the keypoints, for a robust search and ``noise``.
-    noise : DetectorNoise, optional
-        Calibrated noise of the detector that found the keypoints, all that it found of the object:
-        ``sigma`` becomes what it says of their scores and ids.
+        Confidences of the keypoints, for a robust search.
     time : float, optional
         When the image was taken [s], for an estimate with a motion: views of one time share a pose.
     depth : (n,) or (h, w) float, or path, optional
@@ -124,10 +118,9 @@ class View(BeyondKeypoints):
     sigma: Sigma | None = 1.0
     scores: npt.ArrayLike | None = None
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
-    noise: InitVar[DetectorNoise | None] = field(default=None, kw_only=True)
     time: float | None = field(default=None, kw_only=True)
 
-    def __post_init__(self, noise: DetectorNoise | None) -> None:
+    def __post_init__(self) -> None:
         for name, value in _DEFAULTS.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
@@ -142,10 +135,6 @@ class View(BeyondKeypoints):
         object.__setattr__(self, "ids", ids)
         for name in ("sigma", "scores", "depth_sigma", "up_sigma_deg"):
             object.__setattr__(self, name, copied(getattr(self, name)))
-        if noise is not None:
-            known = None if self.is_numbered else self.keypoint_ids
-            sigma = noise.sigma(points, scores=self.scores, ids=known)
-            object.__setattr__(self, "sigma", sigma)
         if self.time is not None and not (is_number(self.time) and np.isfinite(self.time)):
             raise InputError(f"{quote(self.time)} is not a finite number", where="time")
         if self.depth is not None:

@@ -6,7 +6,6 @@ import json
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -17,14 +16,12 @@ import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign.arrays import FloatArray, instance_rng
-from cadalign.datasets import ImageKeypoints
 from cadalign.datasets import open as open_data
 from cadalign.datasets.photos.kitti import KittiLabel, read_labels
 from cadalign.datasets.photos.kitti_keypoints import (
     SIZE,
     TRACKS,
     car_bounds,
-    car_keypoints,
     car_shape,
     yaw_of_car,
 )
@@ -57,80 +54,6 @@ def _real_cars(folder: Path) -> Iterator[tuple[Any, cadalign.Camera, cadalign.Bo
 
 
 # Keypoints of a network ---------------------------------------------------------------------------
-
-
-def noise_of_detector(given: BenchmarkData) -> Tables:
-    """Coverage of the yaw of KITTI's cars with an hourglass network's keypoints, by their noise.
-
-    "left out" is calibrated without the block of 6 successive cars that it is used for; "without a
-    common shift" takes the errors' correlation as a shift of all keypoints, which the translation
-    follows.
-    """
-    folder = given.real("kitti_cars")
-    model = car_shape(folder)
-    seen, true, placed = [], [], []
-    for found, camera, box, _ in _real_cars(folder):
-        if found.scores is not None:
-            scores = np.where(found.scores >= _LEAST_SCORE, found.scores, 0.0)
-            seen.append(ImageKeypoints(found.points_2d, scores, names=found.names))
-            true.append(car_keypoints(model, box, camera))
-            placed.append((camera, box))
-    blocks = np.arange(len(seen)) // _BLOCK
-    without = []
-    for block in range(blocks[-1] + 1):
-        kept = np.flatnonzero(blocks != block)
-        pairs = [seen[k] for k in kept], [true[k] for k in kept]
-        without.append(cadalign.calibrate_detector(*pairs))
-    noise = cadalign.calibrate_detector(seen, true)
-    ways = {f"{sigma:g} px": [{"sigma": sigma}] * len(seen) for sigma in (1.0, 3.0, 5.0)}
-    ways["calibrated"] = [{"noise": noise}] * len(seen)
-    ways["left out"] = [{"noise": without[block]} for block in blocks]
-    ways["left out, without a common shift"] = [
-        {"noise": _without_shift(without[block])} for block in blocks
-    ]
-    rows = []
-    for name, fields in ways.items():
-        found = [
-            section.attempt(_yaw_of_view, model, *each)
-            for each in zip(seen, placed, fields, strict=True)
-            if (each[0].scores > 0).sum() >= _LEAST_KEYPOINTS
-        ]
-        errors, held = np.array([each for each in found if each is not None]).T
-        row = {"noise": name, "cars": len(errors), "yaw, deg": section.spread(errors)}
-        rows.append(row | {"95 % regions hold, %": section.percent(held)})
-    yield "Yaw of cars", rows
-
-
-def _without_shift(noise: cadalign.DetectorNoise) -> cadalign.DetectorNoise:
-    """The noise of each keypoint beside what all of an object have in common.
-
-    An unknown shift of all keypoints is one of the pose's translation, of which nothing else is
-    known.
-    """
-    share = np.sqrt(1 - noise.correlation)
-    return replace(noise, sigmas=share * np.asarray(noise.sigmas), correlation=0.0)
-
-
-def _yaw_of_view(
-    model: cadalign.ShapeModel,
-    seen: ImageKeypoints,
-    placed: tuple[cadalign.Camera, cadalign.Box],
-    fields: dict[str, Any],
-) -> tuple[float, bool]:
-    """Error of yaw [deg], and if the 95 % region holds the truth."""
-    camera, box = placed
-    kept = np.flatnonzero(seen.scores > 0)
-    ids, scores = [seen.names[row] for row in kept], seen.scores[kept]
-    result = cadalign.align(
-        model, cadalign.View(camera, seen.points_2d[kept], ids=ids, scores=scores, **fields)
-    )
-    forward = -result.alignment.rotation[:, 1]
-    moved = np.cross(np.eye(3), forward)  # by a turn about each axis
-    across = float((forward[[0, 2]] ** 2).sum())
-    slope = (moved[:, 0] * forward[2] - moved[:, 2] * forward[0]) / across
-    std = float(np.sqrt(slope @ result.covariance[:3, :3] @ slope))
-    error = _yaw_error(result.alignment.rotation, box.rotation)
-    return error, bool(np.radians(error) < result.radius(0.95) * std)
 
 
 def real_detections(given: BenchmarkData) -> Tables:

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cadalign.cli import main
@@ -74,3 +75,28 @@ def test_examples_of_formats_are_read(tmp_path: Path) -> None:
     model["keypoints"] = model["keypoints"][:1]  # the other one needs the mesh
     path.write_text(json.dumps(model), encoding="utf-8")
     assert ModelKeypoints.load(path).names == ("seat, front left",)
+
+
+def test_scores_of_a_detector_become_standard_deviations() -> None:
+    """The recipe of the how-to on detectors."""
+    (recipe,) = [b for b in blocks(DOCS / "how_to" / "detectors.md", "python") if "def cal" in b]
+    names: dict[str, Any] = {"np": np}
+    exec(compile(recipe, "detectors.md", "exec"), names)
+    rng = np.random.default_rng(1)
+    true = [rng.uniform(0, size, (10, 2)) for size in rng.uniform(50, 500, 400)]
+    scores = rng.uniform(0, 1, (400, 10))
+    for outliers, tolerance in ((0.0, 0.06), (0.1, 0.2)):  # outliers enlarge the box
+        found = []
+        for points, score in zip(true, scores, strict=True):
+            size = np.ptp(points, axis=0).max()
+            errors = rng.normal(size=(10, 2)) * (size * 0.06 * 0.25**score)[:, None]
+            is_outlier = rng.uniform(size=10) < outliers
+            errors[is_outlier] = rng.uniform(-0.8 * size, 0.8 * size, (is_outlier.sum(), 2))
+            found.append(points + errors)
+        line, share = names["calibrate"](found, true, scores)
+        assert share == pytest.approx(outliers, abs=0.03)
+        size = np.ptp(found[0], axis=0).max()
+        expected = size * 0.06 * 0.25 ** scores[0]
+        assert names["sigma_of"](found[0], scores[0], line) == pytest.approx(
+            expected, rel=tolerance
+        )

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from support.refusals import refusal_line
 
-from cadalign import Camera, DetectorNoise, FocalPrior, Library, Result, Results, ShapeModel
+from cadalign import Camera, FocalPrior, Library, Result, Results, ShapeModel
 from cadalign.datasets import (
     BlindPnP,
     Bop,
@@ -160,7 +160,7 @@ class Opened:
         *dict.fromkeys(each.read for each in READERS if each.read is not read_sequence),
         *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections, Objectron),
         *(KittiCars, Bop, PosedPhotos, Colmap, Bundler, BlindPnP, open_correspondences),
-        *(open_photos, ModelKeypoints.load, Result.load, Results.open, DetectorNoise.open),
+        *(open_photos, ModelKeypoints.load, Result.load, Results.open),
         *(FocalPrior.from_exif, photo_size),
     ],
 )

@@ -36,7 +36,7 @@ class PyrenderRenderer:
 
     A model with transparent parts, which OpenGL would need sorted, is drawn by ray casting wholly.
     A process has one OpenGL context, however many of these there are; a forked process must not
-    use its parent's, so start pools with "spawn" (or use loky). Where OpenGL's libraries are broken
+    use its parent's, so start pools with "spawn". Where OpenGL's libraries are broken
     the whole process may die: `make_renderer` tries it in another one first.
     """
 

@@ -22,7 +22,6 @@ HEAVY = {
     "cv2",
     "dask",
     "embreex",
-    "joblib",
     "matplotlib",
     "numba",
     "open3d",

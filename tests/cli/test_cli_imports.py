@@ -20,7 +20,7 @@ from cadalign.io.observation import Observation
 pytestmark = pytest.mark.long
 
 HEAVY = {
-    *("IPython", "OpenGL", "PIL", "cv2", "dask", "embreex", "joblib", "matplotlib"),
+    *("IPython", "OpenGL", "PIL", "cv2", "dask", "embreex", "matplotlib"),
     *("numba", "numpy", "open3d", "pandas", "pyarrow", "pycocotools", "pyrender", "rich"),
     *("scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
     *("starlette", "torch", "trimesh", "uvicorn"),

@@ -11,18 +11,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from support.forked import MAIN, Program, finished
+from support.squares import Squares
 
 from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.folder import RunFolder
@@ -34,62 +32,8 @@ from cadalign.evaluation.runs.parallel import (
 )
 from cadalign.evaluation.runs.run import Progress, execute, workers_of
 from cadalign.evaluation.runs.tables import ROW_GROUP, read_table, write_rows, write_tables
-from cadalign.evaluation.runs.work import AbortError, Columns, Plan, Rows, reason_of
+from cadalign.evaluation.runs.work import AbortError, Columns, Plan, reason_of
 from cadalign.io import files
-
-
-@dataclass(frozen=True)
-class Squares:
-    """An experiment that is quick and can be told to fail."""
-
-    raises: tuple[int, ...] = ()
-    kills: tuple[int, ...] = ()
-    kills_once: tuple[int, ...] = ()
-    full_disk: bool = False
-    dead_on_arrival: bool = False
-    scratch: Path | None = None
-
-    @property
-    def columns(self) -> Columns:
-        return (("task", int), ("square", float), ("reason", str))
-
-    @property
-    def timing_columns(self) -> Columns:
-        return (("task", int), ("process", int))
-
-    def warm_up(self) -> None:
-        if self.dead_on_arrival:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    def evaluate(self, tasks: Sequence[int]) -> Rows:
-        rows = []
-        for task in tasks:
-            if self.full_disk:
-                raise AbortError("no room")
-            if task in self.raises:
-                raise ValueError(f"cannot square {task}")
-            if task in self.kills:
-                os.kill(os.getpid(), signal.SIGKILL)
-            if task in self.kills_once and self.scratch is not None:
-                flag = self.scratch / f"killed_{task}"
-                if not flag.exists():
-                    flag.touch()
-                    os.kill(os.getpid(), signal.SIGKILL)
-            rows.append({"task": task, "square": float(task) ** 2, "reason": ""})
-        return Rows(rows, [{"task": task, "process": os.getpid()} for task in tasks])
-
-    def failure(self, task: int, reason: str) -> Rows:
-        rows = [{"task": task, "square": None, "reason": reason}]
-        return Rows(rows, [{"task": task, "process": 0}])
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _by_value() -> Iterator[None]:
-    """Worker processes cannot import test modules."""
-    module = sys.modules[__name__]
-    cloudpickle.register_pickle_by_value(module)
-    yield
-    cloudpickle.unregister_pickle_by_value(module)
 
 
 def run_squares(
@@ -129,32 +73,11 @@ def test_tasks_that_raise_become_failed_rows_and_spare_the_others(tmp_path: Path
     assert reason_of(ValueError()) == "ValueError"
 
 
-def test_there_are_no_more_processes_than_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-
-    def executor(*, max_workers: int, **rest: Any) -> ThreadPoolExecutor:
-        asked.append(max_workers)
-        return SilentPool(1)
-
-    monkeypatch.setattr("joblib.externals.loky.get_reusable_executor", executor)
-    chunks = [(0, [1, 2]), (1, [3])]
-    found = list(in_processes(Squares(), iter(chunks), count=100_000))
-    assert sorted(chunk for (chunk, _), _ in found) == [0, 1]
-    assert set(asked) == {2}
-
-
-class SilentPool(ThreadPoolExecutor):
-    """Threads in the place of loky's processes."""
-
-    def shutdown(self, wait: bool = True, **rest: Any) -> None:
-        super().shutdown(wait)
-
-
 @pytest.mark.long
-def test_a_task_that_kills_its_workers_becomes_a_failed_row(tmp_path: Path) -> None:
-    rows = run_squares(tmp_path, Squares(kills=(5,)), workers=2)
+def test_a_chunk_that_kills_its_workers_becomes_failed_rows(tmp_path: Path) -> None:
+    rows = run_squares(tmp_path, Squares(kills=(8,)), workers=2)
     failed = {row["task"]: row["reason"] for row in rows if row["square"] is None}
-    assert failed == {5: KILLED_REASON}
+    assert failed == dict.fromkeys(range(7, 14), KILLED_REASON)
     assert [row["task"] for row in rows] == list(range(100))
 
 

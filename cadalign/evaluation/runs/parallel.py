@@ -1,49 +1,50 @@
 """Workers of runs, here or on a cluster: chunks of tasks handed out, and deaths survived.
 
-The processes are joblib's (loky) or a Dask cluster's; both are used through the standard library's
-executor interface, so one loop serves both. A process that dies, by a segmentation fault, the
-system's out-of-memory killer or a signal, takes the chunks with it that were under way. These are
-then handed out again, one at a time, in halves and halves of halves where one dies again, until it
-is known which single task it is. A task that has killed its worker twice, all alone, becomes failed
-rows.
+Processes on this machine and a Dask cluster are used through the standard library's executor
+interface, so one loop serves both. A process that dies, by a segmentation fault, the system's
+out-of-memory killer or a signal, takes the chunks with it that were under way. These are then done
+again, one at a time; one that kills its worker then, too, becomes failed rows.
 """
 
 from __future__ import annotations
 
 import copy
 import logging
+import multiprocessing
 import os
 import pickle
+import signal
 import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
     Executor,
     Future,
+    ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from itertools import chain, islice
-from typing import Any, TypeVar, cast
+from functools import lru_cache, partial
+from types import ModuleType
+from typing import Any, ParamSpec, TypeVar
 
+from cadalign.arrays import worker_count
 from cadalign.errors import CadalignError, DataError
 from cadalign.evaluation.runs.work import AbortError, Experiment, Rows, reason_of
 from cadalign.io.files import printable
 
+P = ParamSpec("P")
+R = TypeVar("R")
 T = TypeVar("T")
 
-_STRIKES = 2
-_IDLE_SECONDS = 30
-_LOOK_AFTER_PARENT = 1.0  # seconds
 # Sums that several threads share are rounded in another order than those of one.
 _ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-KILLED_REASON = f"it killed its worker process {_STRIKES} times (a crash, or out of memory)"
+KILLED_REASON = "its chunk killed a worker process twice (a crash, or out of memory)"
 
 
 Chunk = tuple[int, Sequence[T]]
@@ -60,164 +61,180 @@ def in_this_process(
 
     Threads serve what lets go of the interpreter lock, such as drawing.
     """
+    call = partial(evaluate_chunk, experiment)
     if threads > 1:
+        experiment.warm_up()
         with ThreadPoolExecutor(threads) as pool:
-            yield from evaluate_on(lambda: pool, experiment, chunks, window=threads, deadly=())
+            yield from _evaluated(lambda: pool, call, experiment, chunks, window=threads)
         return
     for chunk in chunks:
-        yield chunk, evaluate_chunk(experiment, chunk[1])
+        yield chunk, call(chunk[1])
 
 
 def in_processes(
     experiment: Experiment[T], chunks: Iterable[Chunk[T]], *, count: int
 ) -> Evaluated[T]:
-    """Evaluate chunks in so many processes on this machine, joblib's; -1 for one for each core.
+    """Evaluate chunks in so many processes on this machine; -1 for one for each core."""
+    count = worker_count(count)
+    pools: list[_Processes] = []
 
-    There are no more processes than chunks, since each takes a moment to start.
-    """
-    from joblib import cpu_count
-    from joblib.externals.loky import get_reusable_executor
-
-    source = iter(chunks)
-    first = list(islice(source, cpu_count() if count < 0 else count))
-    count = max(1, len(first))
-    used: list[Executor] = []
-
-    def executor() -> Executor:
-        # A broken one is replaced; workers wait a while for more, then end by themselves.
-        pool = get_reusable_executor(
-            max_workers=count,
-            timeout=_IDLE_SECONDS,
-            env=_ENVIRONMENT,
-            initializer=_start,
-            initargs=(os.getpid(),),
-        )
-        used[:] = [pool]
-        return cast(Executor, pool)
+    def start() -> Executor:
+        pools.append(_Processes(count))
+        return pools[-1]
 
     try:
-        yield from evaluate_on(
-            executor,
-            experiment,
-            chain(first, source),
-            window=count + 1,
-            deadly=(BrokenProcessPool,),
+        yield from _evaluated_elsewhere(
+            start, experiment, chunks, window=count + 1, deadly=BrokenProcessPool
         )
     finally:
-        for pool in used:
-            pool.shutdown(wait=True, kill_workers=True)  # type: ignore[call-arg]
+        for pool in pools:
+            pool.kill()
 
 
-def _start(parent: int) -> None:
+class _Processes(ProcessPoolExecutor):
+    """Processes that end with this one, and that do not run its script again."""
+
+    def __init__(self, count: int) -> None:
+        context = multiprocessing.get_context("spawn")
+        super().__init__(count, mp_context=context, initializer=_start_worker)
+
+    def submit(self, function: Callable[P, R], /, *args: P.args, **options: P.kwargs) -> Future[R]:
+        """Hand out a call; a process is started where all are busy."""
+        try:
+            with _spawning():
+                return super().submit(function, *args, **options)
+        except OSError as error:  # no process can be started, or the pool is just breaking
+            raise BrokenProcessPool(reason_of(error)) from None
+
+    def kill(self) -> None:
+        """End the processes, whatever they are doing."""
+        processes = list((self._processes or {}).values())
+        self.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+@contextmanager
+def _spawning() -> Iterator[None]:
+    """Set what a new process is started with: one thread, and nothing of this one's script."""
+    main, kept = sys.modules["__main__"], {name: os.environ.get(name) for name in _ENVIRONMENT}
+    sys.modules["__main__"] = ModuleType("__main__")
+    os.environ.update(_ENVIRONMENT)
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
+        for name, value in kept.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start_worker() -> None:
     sys.stdout = sys.stderr  # what functions print is not the command's output
-    _end_with(parent)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # without a traceback from each
+    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _end_with(parent: int) -> None:
-    """End this worker once its parent is gone: a killed one has no chance to say so."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_LOOK_AFTER_PARENT)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
-def evaluate_on(
-    executor: Callable[[], Executor],
+def _evaluated_elsewhere(
+    start: Callable[[], Executor],
     experiment: Experiment[T],
     chunks: Iterable[Chunk[T]],
     *,
     window: int,
-    deadly: tuple[type[BaseException], ...],
+    deadly: type[Exception],
+) -> Evaluated[T]:
+    """Evaluate chunks on an executor of other processes; see `_evaluated`."""
+    pickled = _pickled(experiment)
+    living = partial(_living, start, pickled, deadly)
+    call = partial(_evaluate_pickled, pickled)
+    yield from _evaluated(living, call, experiment, chunks, window=window, deadly=(deadly,))
+
+
+def _evaluated(
+    start: Callable[[], Executor],
+    call: Callable[[Sequence[T]], Rows],
+    experiment: Experiment[T],
+    chunks: Iterable[Chunk[T]],
+    *,
+    window: int,
+    deadly: tuple[type[Exception], ...] = (),
 ) -> Evaluated[T]:
     """Evaluate chunks on an executor, ``window`` at a time.
 
-    ``executor`` gives one that works, and is asked again after every death; ``deadly`` is raised by
-    a future whose worker has died. Chunks are asked for only as fast as they are evaluated.
+    ``start`` gives one that works, and is asked again after every death; ``deadly`` is raised by a
+    future whose worker has died. Chunks are asked for only as fast as they are evaluated.
     """
-    _check_life(executor, experiment, deadly)
+    executor = start()
     source = iter(chunks)
     running: dict[Future[Rows], Chunk[T]] = {}
     suspects: list[Chunk[T]] = []
-    exhausted = False
     try:
         while True:
-            while not exhausted and not suspects and len(running) < window:
+            while not suspects and len(running) < window:
                 chunk = next(source, None)
                 if chunk is None:
-                    exhausted = True
                     break
                 try:
-                    future = executor().submit(evaluate_chunk, experiment, chunk[1])
+                    running[executor.submit(call, chunk[1])] = chunk
                 except deadly:
                     suspects.append(chunk)
-                    break
-                running[future] = chunk
             if not running and not suspects:
                 return
-            done = wait(running, return_when=FIRST_COMPLETED).done if running else ()
-            for future in done:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
                 chunk = running.pop(future)
                 try:
-                    yield chunk, future.result()
+                    yield chunk, _result(future, deadly)
                 except deadly:
                     suspects.append(chunk)
-                except (CadalignError, CancelledError):
-                    raise
-                except Exception as error:
-                    raise _cannot_work(reason_of(error)) from error
             if suspects and not running:
+                executor = start()
                 for chunk in suspects:
-                    yield chunk, _alone(executor, experiment, chunk[1], deadly)
+                    try:
+                        rows = _result(executor.submit(call, chunk[1]), deadly)
+                    except deadly:
+                        executor = start()
+                        failures = [experiment.failure(task, KILLED_REASON) for task in chunk[1]]
+                        rows = Rows.joined(failures)
+                    yield chunk, rows
                 suspects = []
     finally:
         for future in running:
             future.cancel()
 
 
-def _alone(
-    executor: Callable[[], Executor],
-    experiment: Experiment[T],
-    tasks: Sequence[T],
-    deadly: tuple[type[BaseException], ...],
-) -> Rows:
-    """Evaluate tasks with nothing else under way, to find out which of them kills its worker."""
-    for _ in range(_STRIKES if len(tasks) == 1 else 1):
-        try:
-            return executor().submit(evaluate_chunk, experiment, tasks).result()
-        except deadly:
-            _check_life(executor, experiment, deadly)
-    if len(tasks) == 1:
-        return experiment.failure(tasks[0], KILLED_REASON)
-    middle = len(tasks) // 2
-    halves = [tasks[:middle], tasks[middle:]]
-    return Rows.joined([_alone(executor, experiment, half, deadly) for half in halves])
+def _result(future: Future[R], deadly: tuple[type[Exception], ...]) -> R:
+    try:
+        return future.result()
+    except Exception as error:
+        if isinstance(error, (CadalignError, CancelledError, *deadly)):
+            raise
+        raise _cannot_work(reason_of(error)) from error
 
 
-def _check_life(
-    executor: Callable[[], Executor],
-    experiment: Experiment[T],
-    deadly: tuple[type[BaseException], ...],
-) -> None:
-    """Let one worker compile what all will need, and see that it lives."""
-    if deadly:
-        pickle.dumps(experiment)  # says which function cannot be sent, where an executor does not
-    for attempt in range(3):
+def _living(start: Callable[[], Executor], pickled: bytes, deadly: type[Exception]) -> Executor:
+    """Start an executor, of which one worker has compiled what all will need."""
+    for _ in range(3):  # someone may have killed it; not three times, though
+        executor = start()
         try:
-            executor().submit(experiment.warm_up).result()
-        except deadly as error:  # someone may have killed it; not three times, though
-            if attempt == 2:
-                raise CadalignError(
-                    f"worker processes die before they are given any task: {reason_of(error)}",  # type: ignore[arg-type]
-                    where="workers",
-                    fix="is there enough memory? Try fewer workers, or none (0) to see the error",
-                ) from None
-        except ImportError as error:
-            raise _cannot_work(str(error)) from error
-        else:
-            return
+            _result(executor.submit(_warm_up, pickled), (deadly,))
+            return executor
+        except deadly as error:
+            reason = reason_of(error)
+    raise CadalignError(
+        f"worker processes die before they are given any task: {reason}",
+        where="workers",
+        fix="is there enough memory? Try fewer workers, or none (0) to see the error",
+    )
 
 
 def _cannot_work(reason: str) -> CadalignError:
@@ -226,6 +243,25 @@ def _cannot_work(reason: str) -> CadalignError:
         where="workers",
         fix="cadalign must be installed there, in the same version as here",
     )
+
+
+def _pickled(experiment: Experiment[Any]) -> bytes:
+    """The experiment for other processes; raises InputError if these could not read it."""
+    return pickle.dumps(experiment)
+
+
+# One object for all chunks of a process: what it keeps at hand is not made anew.
+@lru_cache(maxsize=1)
+def _unpickled(pickled: bytes) -> Any:
+    return pickle.loads(pickled)
+
+
+def _warm_up(pickled: bytes) -> None:
+    _unpickled(pickled).warm_up()
+
+
+def _evaluate_pickled(pickled: bytes, tasks: Sequence[Any]) -> Rows:
+    return evaluate_chunk(_unpickled(pickled), tasks)
 
 
 def evaluate_chunk(experiment: Experiment[T], tasks: Sequence[T]) -> Rows:
@@ -309,13 +345,10 @@ def on_dask(
         # Named by chance: to name a chunk by its content takes longer than to evaluate it.
         executor = client.get_executor(pure=False)
         try:
-            yield from evaluate_on(
-                lambda: executor,
-                experiment,
-                chunks,
-                # Clusters grow, and a round trip may cost more than a chunk.
-                window=2 * threads + 2,
-                deadly=(KilledWorker,),
+            # Clusters grow, and a round trip may cost more than a chunk.
+            window = 2 * threads + 2
+            yield from _evaluated_elsewhere(
+                lambda: executor, experiment, chunks, window=window, deadly=KilledWorker
             )
         except Exception as error:
             if client.status == "running" and not isinstance(error, CancelledError):

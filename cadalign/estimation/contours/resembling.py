@@ -16,6 +16,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.estimation.contours.silhouettes import (
     CELLS,
+    COMPARED,
     TURNS,
     Atlas,
     FacedMask,
@@ -33,7 +34,6 @@ from cadalign.geometry.rotations import angle_between
 from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 
-_EVERY = 2  # rows and columns, of which one is compared
 _LINES = 16  # directions of what hides a part
 _HIDDEN_POWER = 0.1  # of the share that is left: to hide more is less likely
 _LEAST_HIDDEN = 0.03  # of the area, that a line hides
@@ -83,17 +83,16 @@ def resembling_poses(
     are not ``possible`` are left out.
     """
     view = FacedMask.of(mask, camera)
-    query, compared = view.outline, _Cells.of(view)
-    atlas = atlas_of(mesh, eye_of(mesh, query), is_cut=is_cut)
+    atlas = atlas_of(mesh, eye_of(mesh, view.outline), is_cut=is_cut)
     most = _MOST_AFFINE_CUT if is_cut else _MOST_AFFINE
-    cameras = _affine_cameras(atlas, query, most if possible is None else _WIDER * most)
+    cameras = _affine_cameras(atlas, view.outline, most if possible is None else _WIDER * most)
     rotations, places, scales = _poses_of(*cameras, atlas, free)
     is_left = np.ones(len(scales), dtype=bool)
     if possible is not None:
         is_left = possible(view.camera_from_facing @ rotations, scales)
     left = (each[is_left][:most] for each in (rotations, places, scales))
     poses = [Alignment(*each) for each in zip(*left, strict=True)]
-    found = [_resemblance(atlas, compared, pose, is_cut=is_cut) for pose in poses]
+    found = [_resemblance(atlas, view, pose, is_cut=is_cut) for pose in poses]
     found.sort(key=lambda each: -each.overlap)
     kept = distinct(((each.alignment, each) for each in found), count, symmetry)
     turn = view.camera_from_facing
@@ -101,24 +100,6 @@ def resembling_poses(
         Resembling(each.overlap, turned_alignment(each.alignment, turn), turn @ each.line)
         for each in kept
     ]
-
-
-class _Cells(NamedTuple):
-    """Cells (m,) of `FacedMask`, their rays (m, 3) and if they are seen (m,); one in `_EVERY`."""
-
-    mask: FloatArray
-    rays: FloatArray
-    is_seen: BoolArray
-    middle: FloatArray
-    cell: float
-
-    @classmethod
-    def of(cls, view: FacedMask) -> _Cells:
-        """The cells of so many rows and columns that stand for all."""
-        some = np.arange(CELLS**2).reshape(CELLS, CELLS)[::_EVERY, ::_EVERY].ravel()
-        middle = view.corner + view.cell * (CELLS - 1) / 2
-        mask = view.image.ravel()[some].astype(float)
-        return cls(mask, view.rays[some], view.is_seen[some], middle, view.cell)
 
 
 def _affine_cameras(atlas: Atlas, query: Whitened, most: int) -> tuple[FloatArray, FloatArray]:
@@ -186,20 +167,20 @@ def _stretches_of(matrices: FloatArray, free: BoolArray) -> FloatArray:
 @cache
 def _line_bins() -> IntArray:
     """Numbers (`_LINES`, m) of the cells' places along directions, all around."""
-    places = np.arange(0, CELLS, _EVERY) - (CELLS - 1) / 2
+    places = COMPARED - (CELLS - 1) / 2
     x, y = np.meshgrid(places, places)
     cosine, sine = around(_LINES).T[:, :, None]
     along = cosine * x.ravel() + sine * y.ravel()
     return np.asarray(np.rint(along + CELLS), dtype=np.int64)
 
 
-def _resemblance(atlas: Atlas, view: _Cells, pose: Alignment, *, is_cut: bool) -> Resembling:
+def _resemblance(atlas: Atlas, view: FacedMask, pose: Alignment, *, is_cut: bool) -> Resembling:
     """Compare a pose's silhouette with the mask.
 
     If it ``is_cut``, what the best line leaves of the silhouette, less where it leaves less.
     """
     origin, model_from_ray = model_rays(pose)
-    mask = view.mask
+    mask = view.inside
     seen = atlas.caster.covered(origin, view.rays @ model_from_ray.T) & view.is_seen
     both, total = mask[seen], float(mask.sum())
     if not is_cut:

@@ -30,6 +30,8 @@ CELLS = 80
 """Rows and columns of a silhouette's or a mask's image."""
 TURNS = 64
 """Turns at which silhouettes are compared."""
+COMPARED = np.arange(0, CELLS, 2)
+"""Rows and columns of a mask's image that are compared with what a pose covers."""
 
 _DIRECTIONS = 400  # over half of the sphere, 7 degrees apart
 _AFAR = 60.0  # distance of an eye whose rays are almost parallel, relative to half a box's diagonal
@@ -209,29 +211,27 @@ def _sampled(
 class FacedMask(NamedTuple):
     """A mask as a camera sees it that looks at its middle.
 
-    Cells of ``image`` (n, n) lie on the plane at depth 1, from ``corner`` (2,) on, with ``rays``
-    (n * n, 3) through them; those that ``is_seen`` (n * n,) marks lie in the photo.
+    The ``outline`` is its silhouette. Cells of its image lie on the plane at depth 1, a ``cell``
+    apart, about the ``middle`` (2,). Those of `COMPARED` have values ``inside`` (m,), ``rays``
+    (m, 3) through them, and lie in the photo where ``is_seen`` (m,).
     """
 
-    image: Image
-    is_seen: BoolArray
+    outline: Whitened
+    inside: FloatArray
     rays: FloatArray
-    corner: FloatArray
+    is_seen: BoolArray
+    middle: FloatArray
     cell: float
     camera_from_facing: FloatArray
-
-    @property
-    def outline(self) -> Whitened:
-        """The silhouette, to be compared with a model's."""
-        return _sampled(self.image, *_uncut(_cells(self.image)), self.corner, self.cell)
 
     @classmethod
     def of(cls, mask: FloatArray | BoolArray, camera: Camera) -> FacedMask:
         """The mask (h, w) of a camera."""
         inside: BoolArray = np.asarray(mask, dtype=np.float64) >= 0.5
         rows, columns = np.nonzero(inside)
-        some = slice(None, None, max(1, len(rows) // 20_000))
-        found, valid = camera.rays_where_valid(np.column_stack([columns, rows])[some].astype(float))
+        every = max(1, len(rows) // 20_000)
+        pixels = np.column_stack([columns, rows])[::every].astype(float)
+        found, valid = camera.rays_where_valid(pixels)
         seen = found[valid]
         axis = seen.mean(axis=0)
         axis /= np.linalg.norm(axis)
@@ -252,6 +252,8 @@ class FacedMask(NamedTuple):
         # Averages over a cell, where it holds several pixels.
         blur = max(cell * camera.fx / 3, 0.3)
         soft = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), blur)
-        image = sampled(np.pad(soft, 1), pixels + 1).reshape(CELLS, CELLS)
-        is_seen = camera.contains(pixels)
-        return cls(image.astype(np.float32), is_seen, rays, corner, cell, turn)
+        image = sampled(np.pad(soft, 1), pixels + 1).reshape(CELLS, CELLS).astype(np.float32)
+        outline = _sampled(image, *_uncut(_cells(image)), corner, cell)
+        some = (CELLS * COMPARED[:, None] + COMPARED).ravel()
+        compared = image.ravel()[some].astype(float), rays[some], camera.contains(pixels)[some]
+        return cls(outline, *compared, corner + cell * (CELLS - 1) / 2, cell, turn)

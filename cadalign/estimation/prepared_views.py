@@ -26,7 +26,7 @@ from cadalign.estimation.result import Result
 from cadalign.estimation.result_parts import Stated, Statistics, ViewResult
 from cadalign.estimation.view import View
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.box import Box, are_on_a_line
+from cadalign.geometry.box import are_on_a_line
 from cadalign.geometry.camera import Camera, needs_facing
 from cadalign.io.evidence import Size
 from cadalign.solvers.constants import LEAST_POINTS
@@ -197,12 +197,8 @@ def starts_by_one_view(
 
     One view determines the pose: the only one with keypoints or, without any, that of the largest
     mask. The object is enlarged about its camera until it is seen amid the masks of the others.
-    A single view of a mask and a depth image has such starts, too: its pose by the mask alone,
-    enlarged until the depths agree. There are none for other views. Raises CadalignError if that
-    view alone has no estimate.
+    There are none for other views. Raises CadalignError if that view alone has no estimate.
     """
-    if len(views) == 1:
-        return [[start] for start in _starts_by_depths(views[0], align_some)]
     if any(view.cam_from_rig is None for view in views):
         return []
     seen = [number for number, view in enumerate(views) if len(view.keypoint_ids)]
@@ -224,36 +220,16 @@ def starts_by_one_view(
         middle = np.argwhere(masks[number]).mean(axis=0)[None, ::-1]
         middles.append((own, _camera_of(views[number], known).normalize(middle)[0]))
     starts: list[list[Alignment | None]] = []
-    for pose, box in _likely(alone):
+    turn = camera[:3, :3].T
+    likely = [(alone.alignment, alone.box)]
+    likely += [(each.alignment, each.box) for each in alone.alternatives]
+    for pose, box in likely[:_MOST_STARTS]:
         factor = _factor_amid(box.center, middles)
         if factor > 0:
-            starts.append([_enlarged(pose, factor, camera), *[None] * (len(views) - 1)])
+            shift = turn @ (factor * pose.translation - camera[:3, 3])
+            enlarged = Alignment(turn @ pose.rotation, shift, factor * pose.scale)
+            starts.append([enlarged, *[None] * (len(views) - 1)])
     return starts
-
-
-def _likely(alone: Result) -> list[tuple[Alignment, Box]]:
-    """The estimate of one view and its alternatives, of which so many are starts."""
-    found = [(alone.alignment, alone.box)]
-    return (found + [(each.alignment, each.box) for each in alone.alternatives])[:_MOST_STARTS]
-
-
-def _enlarged(pose: Alignment, factor: float, camera: FloatArray) -> Alignment:
-    """A camera's alignment, enlarged about it, in the frame that the camera's pose (4, 4) is of."""
-    turn, shift = camera[:3, :3].T, factor * pose.translation - camera[:3, 3]
-    return Alignment(turn @ pose.rotation, turn @ shift, factor * pose.scale)
-
-
-def _starts_by_depths(view: View, align_some: Align) -> list[Alignment]:
-    """Starts of a view whose mask determines the pose, and whose depth image the size."""
-    if not (view.has_mask_alone and view.shows_surface):
-        return []
-    from cadalign.estimation.contours.depth import factors_by_depths  # with OpenCV and embree
-
-    alone = align_some([replace(view, depth=None, cam_from_rig=None)], [None])
-    camera = np.eye(4) if view.cam_from_rig is None else np.asarray(view.cam_from_rig)
-    poses = [pose for pose, _ in _likely(alone)]
-    factors = zip(poses, factors_by_depths(alone.mesh(), view, poses), strict=True)
-    return [_enlarged(pose, factor, camera) for pose, factor in factors if factor > 0]
 
 
 def _factor_amid(center: FloatArray, middles: Sequence[tuple[FloatArray, FloatArray]]) -> float:

@@ -63,10 +63,9 @@ class View(BeyondKeypoints):
         Depths of the keypoints, their z in the camera's frame, also of a wide lens, or an image of
         such depths that is registered to the photo, as an array or as a 16-bit PNG [model units, or
         the unit in which the object's size is wanted]; NaN where unknown, in an image also 0. An
-        image is sampled robustly at the keypoints and, with a mask and a mesh, over the visible
-        surface; beside a photo its steps show the outline. Keypoints that the object itself hides
-        are told apart by the model's mesh; without one, only those that lie some ``depth_sigma``
-        behind what is seen.
+        image is sampled robustly at the keypoints. Those that the object itself hides are told
+        apart by the model's mesh; without one, only those that lie some ``depth_sigma`` behind what
+        is seen.
     depth_sigma : float or (n,) float
         Standard deviation of the depths, relative; by default 0.01, 1 %.
     depth_scale : float, optional
@@ -150,6 +149,9 @@ class View(BeyondKeypoints):
             self._keep("image", _photo(self.image, camera))
         if self.depth_image is not None:
             as_positive(self.depth_sigma, name="depth_sigma")
+            if not len(points):
+                what, fix = "counts at keypoints, and there are none", "give some, or leave it away"
+                raise InputError(what, where="depth", fix=fix)
         else:
             as_one_or_each(
                 self.depth_sigma, name="depth_sigma", count=len(points), entries="keypoints"
@@ -194,13 +196,6 @@ class View(BeyondKeypoints):
     def has_mask_alone(self) -> bool:
         """True if a mask, and no keypoint, says where the object is."""
         return self.mask is not None and not len(self.keypoint_ids)
-
-    @property
-    def shows_surface(self) -> bool:
-        """True if the depths of the surface count: those about keypoints count at these."""
-        if self.depth_image is None:
-            return False
-        return self.mask is not None or (self.image is not None and not len(self.keypoint_ids))
 
     @property
     def mask_image(self) -> FloatArray | BoolArray | None:

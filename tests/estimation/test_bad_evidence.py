@@ -47,6 +47,10 @@ def changed(pose: np.ndarray, rows: slice | int, columns: slice | int, factor: f
             "give the mask of this image, in its size, one channel",
         ),
         (
+            lambda: View(CAMERA, mask=BODY, depth=np.ones((480, 640))),
+            "depth: counts at keypoints, and there are none; give some, or leave it away",
+        ),
+        (
             lambda: View(CAMERA, PIXELS, image=np.dstack([NOTHING / 1.0] * 4)),
             "image: float64 of shape (480, 640, 4), expected an RGB image (h, w, 3) of uint8; "
             "give (255 * image[..., :3]).round().astype(np.uint8)",

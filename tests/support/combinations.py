@@ -44,7 +44,6 @@ EVIDENCE = {
     "mask": "mask",
     "depth": "depth at the keypoints",
     "depth image": "depth image",
-    "surface": "depth image and mask",
     "gravity": "gravity (`up`)",
     "camera height": "gravity and camera height",
     "size": "known length (`Size`)",
@@ -308,9 +307,9 @@ def _evidence(
     """What the first view tells beside its keypoints."""
     kind, fields = cell.evidence, {}
     mask, depth = _images(tuple(truth.scale.tolist()))
-    if kind in ("mask", "surface", "rig, mask", "motion, mask", "everything"):
+    if kind in ("mask", "rig, mask", "motion, mask", "everything"):
         fields["mask"] = mask
-    if kind in ("depth image", "surface", "everything"):
+    if kind in ("depth image", "everything"):
         fields |= {"depth": depth, "depth_sigma": _DEPTH_SIGMA}
     elif kind == "depth":
         noise = 1 + _DEPTH_SIGMA * rng.normal(size=len(points))

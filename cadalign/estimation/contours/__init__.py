@@ -27,10 +27,6 @@ def refine_with_images(
     """
     refined: list[Refined] = []
     found = list(minima)
-    if any(view.shows_surface for view in views):
-        from cadalign.estimation.contours.depth import fit_depths
-
-        found = fit_depths(model, prior, views, found)
     if any(view.mask is not None for view in views):
         from cadalign.estimation.contours.fit import fit_masks
 

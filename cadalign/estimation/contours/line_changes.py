@@ -1,4 +1,4 @@
-"""Places along a line where the colours or depths of a photo change from the object to others.
+"""Places along a line where the colours of a photo change from the object to others.
 
 The statistics of region-based tracking: M. Stoiber, M. Pfanne, K. H. Strobl, R. Triebel,
 A. Albu-Schaeffer, "SRT3D: A sparse region-based 3D object tracking approach for the real world",
@@ -24,10 +24,6 @@ _LEAST_SIDE = 2.0  # steps on either side of an edge
 _QUANTUM = 3.0  # variance of three channels by their quantisation and a little noise
 _NEIGHBOUR = 0.45  # weight of a neighbour's log likelihoods
 _STRAY = 1e-3  # probability of a crossing anywhere on a line, beside its colours
-_DEPTH_EDGE = 1.0  # [px], standard deviation of the place of a depth image's step
-_NEARER = 0.05  # relative, and in standard deviations, of the depth of what hides the outline
-_NEARER_SIGMAS = 5.0
-_BESIDE = 3  # steps inside of the outline, whose depths tell if it is hidden
 
 
 def bins_of(colors: ByteImage) -> IntArray:
@@ -114,14 +110,12 @@ def crossings_of(logs: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.where(is_told, places, 0.0), np.where(is_told, 1 / safe, np.inf)
 
 
-def edges_of(
-    colors: FloatArray, valid: BoolArray, step: float, least: float = _QUANTUM
-) -> FloatArray:
+def edges_of(colors: FloatArray, valid: BoolArray, step: float) -> FloatArray:
     """Log likelihoods (S, 2 K + 1) of a change of the colours (S, 2 K + 1, c) at each step.
 
     On both sides of the change the colours are constant but for noise of unknown level: with the
     sum E of squares about both means, the likelihood is E to the power of -n / 2 for n pixels. A
-    ``step`` is so many pixels long. The ``least`` variance of the noise is that of c channels.
+    ``step`` is so many pixels long.
     """
     weights = valid.astype(np.float64)
     values = weights[..., None] * colors
@@ -134,40 +128,9 @@ def edges_of(
     squares = (values * colors).sum(axis=(1, 2))
     # A line of which one side is unknown has no edge.
     error = squares[:, None] - np.where(usable, between, np.inf).min(axis=1, keepdims=True)
-    error = np.where(usable, squares[:, None] - between, error) + least * total
+    error = np.where(usable, squares[:, None] - between, error) + _QUANTUM * total
     found = -total * min(step, 1.0) / 2 * np.log(np.maximum(error, 1e-9))
     return np.where(usable.any(axis=1, keepdims=True), found, 0.0)
-
-
-def steps_of(depths: FloatArray, valid: BoolArray, step: float, sigma: float) -> FloatArray:
-    """Log likelihoods (S, 2 K + 1) of a change of depths (S, 2 K + 1), as `edges_of`.
-
-    Depths have the relative standard deviation ``sigma``, and are NaN where none is known. The
-    places of their steps are less accurate than those of colours.
-    """
-    known = valid & np.isfinite(depths)
-    logs = edges_of(np.log(np.where(known, depths, 1.0))[..., None], known, step, sigma**2)
-    steps = step * np.arange(logs.shape[1]) / _DEPTH_EDGE
-    spread = np.exp(-((steps[:, None] - steps) ** 2) / 2)
-    likely = np.exp(logs - np.logaddexp.reduce(logs, axis=1, keepdims=True))
-    return np.asarray(np.log(likely @ (spread / spread.sum(axis=1, keepdims=True)) + _STRAY))
-
-
-def are_hidden(depths: FloatArray, far: FloatArray, sigma: float) -> BoolArray:
-    """Tell lines (S,) whose outline another thing hides: just inside of it something is nearer.
-
-    ``depths`` (S, 2 K + 1) are along the lines, the outline is ``far`` (S,). An estimate may be too
-    far as a whole, so that the median of the lines says what is near.
-    """
-    middle = depths.shape[1] // 2
-    beside = depths[:, middle - _BESIDE : middle]
-    known: BoolArray = np.asarray(np.isfinite(beside).any(axis=1))
-    if not known.any():
-        return known
-    ratios = np.full(len(far), np.nan)
-    ratios[known] = np.nanmedian(beside[known], axis=1) / far[known]
-    least = (1 - max(_NEARER, _NEARER_SIGMAS * sigma)) * np.nanmedian(ratios)
-    return np.asarray(ratios < least)
 
 
 def _sums_before(values: FloatArray) -> FloatArray:

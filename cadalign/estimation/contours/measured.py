@@ -1,13 +1,13 @@
 """Evidence of what was measured at points of a surface, and estimates with it.
 
-What rims, lines across an outline and depth images measure at points of surfaces is evidence as any
-other: these points stand between the keypoints and the box's corners.
+What rims and lines across an outline measure at points of surfaces is evidence as any other: these
+points stand between the keypoints and the box's corners.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotati
 from cadalign.solvers.joint.covariance import information_of, scaled_information
 from cadalign.solvers.joint.evidence import (
     Evidence,
-    Planes,
     Shape,
     Sightings,
     State,
@@ -39,15 +38,15 @@ Shown = TypeVar("Shown")
 class Measured(NamedTuple):
     """Points of a surface in one view, with their modes, and what was measured at each.
 
-    ``mean`` (n, 3) and ``modes`` (K, n, 3) are as in `Shape`. ``table`` has a row for each point,
-    whose number follows. ``own`` (k, n, 3) are further modes of the shape, that move these points
-    alone.
+    ``mean`` (n, 3) and ``modes`` (K, n, 3) are as in `Shape`. ``sightings`` has a row for each
+    point, whose number follows. ``own`` (k, n, 3) are further modes of the shape, that move these
+    points alone.
     """
 
     mean: FloatArray
     modes: FloatArray
-    table: Sightings | Planes
-    own: FloatArray | None = None
+    sightings: Sightings
+    own: FloatArray
 
 
 class Place(NamedTuple):
@@ -130,7 +129,7 @@ def shift_to(place: FloatArray, other: FloatArray) -> FloatArray:
 class Sought(NamedTuple, Generic[Shown]):
     """Evidence, of so many keypoints, and the surface that is sought in ``views``.
 
-    These are contours of masks, photos or depths.
+    These are contours of masks or photos.
     """
 
     evidence: Evidence
@@ -205,25 +204,22 @@ def _with_measured(
     def moved(points: IntArray) -> IntArray:
         return np.where(points >= keypoints, points + total, points)
 
-    tables: dict[str, list[Any]] = {
-        name: [table._replace(point=moved(table.point))]
-        for name, table in (("sightings", evidence.sightings), ("planes", evidence.planes))
-    }
+    planes = evidence.planes._replace(point=moved(evidence.planes.point))
+    sightings = [evidence.sightings._replace(point=moved(evidence.sightings.point))]
     first = keypoints
-    for number, (points, own_modes, table, own) in enumerate(measured):
+    for number, (points, own_modes, rows, own) in enumerate(measured):
         there = slice(first, first + len(points))
         mean[there] = points
         modes[: len(own_modes), there] = own_modes  # none for a rigid surface
-        if own is not None:
-            place = last + number * len(own) % further
-            modes[place : place + len(own), there] = own
-        name = "sightings" if isinstance(table, Sightings) else "planes"
-        tables[name].append(table._replace(point=np.arange(there.start, there.stop)))
+        place = last + number * len(own) % further
+        modes[place : place + len(own), there] = own
+        sightings.append(rows._replace(point=np.arange(there.start, there.stop)))
         first = there.stop
     return evidence._replace(
         shape=Shape(mean, modes, np.insert(shape.spread, room, 0.0)),
         offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
-        **{name: stacked(parts) for name, parts in tables.items()},
+        planes=planes,
+        sightings=stacked(sightings),
     )
 
 

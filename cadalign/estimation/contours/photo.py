@@ -22,7 +22,6 @@ from cadalign.estimation.contours.measured import (
     with_displacement_modes,
 )
 from cadalign.estimation.contours.photo_lines import (
-    MeasuredDepths,
     Outline,
     PhotoPyramid,
     photo_of,
@@ -156,7 +155,7 @@ def fit_photos(
     """
     cameras = minima[0].lenses.cameras
     photos = [
-        photo_of(number, cameras[number], cast(ByteImage, view.image), _depth_of(view))
+        photo_of(number, cameras[number], cast(ByteImage, view.image))
         for number, view in enumerate(views)
         if view.image is not None and view.mask is None
     ]
@@ -185,11 +184,6 @@ def fit_photos(
         for view, own in {**found, **left_out}.items()
     ]
     return Refined(refined, summaries, warnings, photos=frozenset(found))
-
-
-def _depth_of(view: View) -> MeasuredDepths | None:
-    depths = view.depth_image
-    return None if depths is None else MeasuredDepths(depths, float(cast(float, view.depth_sigma)))
 
 
 def _weak(found: dict[int, OutlineSupport]) -> list[str]:
@@ -265,11 +259,7 @@ def _lacking(best: list[_Candidate], photos: list[PhotoPyramid]) -> list[tuple[P
     if not best:
         return [(photos[0], "it shows no part of the model's outline")]
     supports = best[0].supports
-    alike = [
-        k
-        for k, each in enumerate(supports)
-        if each.contrast < _LEAST_CONTRAST and photos[k].depth is None
-    ]
+    alike = [k for k, each in enumerate(supports) if each.contrast < _LEAST_CONTRAST]
     if alike:
         return [(photos[k], "the object has the colours of what is around it") for k in alike]
     shares = [each.share for each in supports]

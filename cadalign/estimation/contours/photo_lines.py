@@ -1,6 +1,6 @@
 """Lines across a model's outline in a photo, and the places where they leave the object.
 
-`line_changes.py` has the statistics of the colours and depths along each line.
+`line_changes.py` has the statistics of the colours along each line.
 """
 
 from __future__ import annotations
@@ -21,13 +21,11 @@ from cadalign.estimation.contours.contour import (
     without_steep,
 )
 from cadalign.estimation.contours.line_changes import (
-    are_hidden,
     bins_of,
     changes_of,
     crossings_of,
     edges_of,
     regions_of,
-    steps_of,
     with_neighbours,
 )
 from cadalign.estimation.contours.sampling import colors_at
@@ -47,38 +45,12 @@ _EDGE_STEP = 1.0  # [px], of lines that are long enough for edges of other thing
 _SMALLEST = 64  # [px], of a side of the smallest copy of a photo
 
 
-def _cells_at(
-    image: FloatArray | BoolArray, points: FloatArray, outside: float
-) -> FloatArray | BoolArray:
-    """Values (...) of the cells of an image (h, w) that hold points (..., 2), or ``outside``."""
-    height, width = image.shape
-    columns, rows = np.moveaxis(np.rint(points).astype(int), -1, 0)
-    held = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    found = image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
-    return np.where(held, found, outside)
-
-
-class MeasuredDepths(NamedTuple):
-    """Depths (h, w), NaN where none is known, and their relative standard deviation."""
-
-    depths: FloatArray
-    sigma: float
-
-    def at(self, points: FloatArray) -> FloatArray:
-        """Depths (...) of the pixels that hold points (..., 2)."""
-        return np.asarray(_cells_at(self.depths, points, np.nan), dtype=np.float64)
-
-
 class PhotoPyramid(NamedTuple):
-    """A photo in view number ``image``, and copies of it, each half as wide as the last.
-
-    Its ``depth`` image shows steps where the object ends.
-    """
+    """A photo in view number ``image``, and copies of it, each half as wide as the last."""
 
     image: int
     camera: Camera
     levels: tuple[ByteImage, ...]
-    depth: MeasuredDepths | None = None
 
     def colors(self, points: FloatArray, step: float) -> ByteImage:
         """Colours (n, 3) at pixels (n, 2), of details larger than a step [px]."""
@@ -101,9 +73,7 @@ class PhotoPyramid(NamedTuple):
         return min(int(np.log2(max(step, 1.0))), len(self.levels) - 1)
 
 
-def photo_of(
-    image: int, camera: Camera, pixels: ByteImage, depth: MeasuredDepths | None = None
-) -> PhotoPyramid:
+def photo_of(image: int, camera: Camera, pixels: ByteImage) -> PhotoPyramid:
     """A photo (h, w, 3) with its smaller copies."""
     levels = [np.array(pixels, order="C")]  # kernels are compiled anew for read-only arrays
     while min(levels[-1].shape[:2]) > _SMALLEST:
@@ -112,7 +82,7 @@ def photo_of(
         even = levels[-1][: 2 * size[1], : 2 * size[0]]
         smaller = cv2.resize(even, size, interpolation=cv2.INTER_AREA)
         levels.append(np.asarray(smaller, dtype=np.uint8))
-    return PhotoPyramid(image, camera, tuple(levels), depth)
+    return PhotoPyramid(image, camera, tuple(levels))
 
 
 class Silhouette(NamedTuple):
@@ -120,7 +90,7 @@ class Silhouette(NamedTuple):
 
     The cell (0, 0) of ``inside`` (h, w) lies at the pixel ``corner``, neighbours ``cell`` [px]
     apart. The ``contour`` has samples on the rims, whose ``points`` (S, 3) lie on the triangles
-    ``face`` (S,), so ``far`` (S,) along the optical axis.
+    ``face`` (S,).
     """
 
     inside: BoolArray
@@ -130,7 +100,6 @@ class Silhouette(NamedTuple):
     across: FloatArray
     points: FloatArray
     face: IntArray
-    far: FloatArray
 
     @property
     def size(self) -> float:
@@ -144,7 +113,12 @@ class Silhouette(NamedTuple):
 
     def at(self, points: FloatArray) -> BoolArray:
         """Tell if pixels (..., 2) lie inside."""
-        return np.asarray(_cells_at(self.inside, (points - self.corner) / self.cell, False))
+        height, width = self.inside.shape
+        cells = np.rint((points - self.corner) / self.cell).astype(int)
+        columns, rows = np.moveaxis(cells, -1, 0)
+        held = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+        found = self.inside[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+        return np.asarray(found & held)
 
 
 def silhouette_of(
@@ -172,8 +146,7 @@ def silhouette_of(
     kept = rims.found & within.all(axis=1)
     if not kept.any():
         return None
-    points = rims.points[kept]
-    found = on_rim.taken(kept), across[kept], points, rims.face[kept], pose.apply(points)[:, 2]
+    found = on_rim.taken(kept), across[kept], rims.points[kept], rims.face[kept]
     return Silhouette(inside, corner, cell, *found)
 
 
@@ -248,17 +221,11 @@ def outline_of(photo: PhotoPyramid, silhouette: Silhouette, reach: float) -> Out
     colors = photo.colors(pixels.reshape(-1, 2), step).reshape(*pixels.shape[:2], 3)
     valid = _on_own_side(photo, silhouette, pixels)
     logs = changes_of(odds[bins_of(colors)], valid)
-    hidden = np.zeros(len(logs), dtype=bool)
-    if photo.depth is not None:
-        depths, sigma = photo.depth.at(pixels), photo.depth.sigma
-        logs += steps_of(depths, valid, step, sigma)
-        hidden = are_hidden(depths, silhouette.far, sigma)
     if step <= _EDGE_STEP:
         logs += edges_of(colors.astype(np.float64), valid, step)
         logs = with_neighbours(logs, contour.neighbours(np.ones(len(logs), dtype=bool)))
     places, variances = crossings_of(logs)
-    sigmas = step * np.sqrt(np.where(hidden, np.inf, variances))
-    return Outline(silhouette, np.where(hidden, 0.0, step * places), sigmas, contrast, reach)
+    return Outline(silhouette, step * places, step * np.sqrt(variances), contrast, reach)
 
 
 def _colors_beside(

@@ -388,7 +388,7 @@ def with_contours(
         noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
         agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
         rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)
-        table = rows.table._replace(loss=np.full_like(rows.table.loss, LINEAR))
-        measured.append(rows._replace(table=table))
+        sightings = rows.sightings._replace(loss=np.full_like(rows.sightings.loss, LINEAR))
+        measured.append(rows._replace(sightings=sightings))
     joined = sought.joined(Place.of(state, len(measured)), measured)
     return joined.evidence, joined.state

@@ -187,36 +187,6 @@ class TestPhoto:
         assert np.median(errors) < 0.4
         assert max(errors) < 2.0
 
-    def test_steps_of_a_depth_image_show_the_outline(self) -> None:
-        shown, rng = scene(1), np.random.default_rng(1)
-        depth = cast_geometry(Scene(shown.mesh), CAMERA, shown.truth).depth
-        measured = np.where(shown.mask, depth, 4.0) * rng.normal(1, 0.003, depth.shape)
-        measured[rng.random(depth.shape) < 0.05] = np.nan
-        known = {"depth": measured, "depth_sigma": 0.003}
-        grey = np.clip(rng.normal(128, 5, shown.pixels.shape), 0, 255).astype(np.uint8)
-        clicks = shown.aligned(**known)
-        found = shown.aligned(**known, image=grey)
-        assert not any("image" in text for text in found.warnings)
-        assert shown.error(found) < 0.5 * shown.error(clicks)
-
-    def test_what_a_depth_image_shows_before_the_object_hides_its_outline(self) -> None:
-        shown = scene(1)
-        depth = cast_geometry(Scene(shown.mesh), CAMERA, shown.truth).depth
-        measured, pixels = np.where(shown.mask, depth, 4.0), shown.pixels.copy()
-        rows, columns = np.nonzero(shown.mask)
-        right = int(np.quantile(columns, 0.75))
-        covered = slice(rows.min() - 20, rows.max() + 20), slice(right, right + 120)
-        measured[covered], pixels[covered] = 2.0, (60, 60, 190)
-        rows = np.flatnonzero(shown.clicks[:, 0] < right)
-        seen = View(CAMERA, shown.clicks[rows], ids=rows.tolist(), sigma=CLICK_PX, image=pixels)
-        model = shown.model(stretch="none")
-        found = align(model, replace(seen, depth=measured, depth_sigma=0.003))
-        alone = align(model, seen)
-        (photo,) = (each for each in found.evidence if each.kind == "photo")
-        (blind,) = (each for each in alone.evidence if each.kind == "photo")
-        assert shown.error(found) < 0.5
-        assert photo.count < blind.count
-
     def test_counts_beside_the_mask_of_another_view(self) -> None:
         shown = scene(1)
         clicked = View(CAMERA, shown.clicks, sigma=CLICK_PX)

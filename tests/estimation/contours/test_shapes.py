@@ -56,31 +56,6 @@ def test_a_learned_shape_is_better_with_a_mask(
     assert np.mean(joint) > np.mean(alone)
 
 
-def test_depth_over_a_learned_surface_counts_as_similar(
-    bottles: tuple[AnnotatedModel, ...], shape: ShapeModel
-) -> None:
-    model = bottles[0]
-    rng = np.random.default_rng(5)
-    scene, points = Scene(model.load_mesh()), model.keypoints.xyz
-    shown = sample_view(scene, points, CAMERA, rng=rng, min_visible=6, roll=10.0)
-    truth = shown.cam_from_model
-    pixels = CAMERA.project(truth.apply(points[shown.visible]))
-    pixels += rng.normal(0, 1, pixels.shape)
-    seen = cast_geometry(scene, CAMERA, truth)
-    depth = np.where(seen.mask, seen.depth * (1 + 0.005 * rng.normal(size=seen.depth.shape)), 6.0)
-    ids = model.keypoints.ids[shown.visible].tolist()
-    view = View(CAMERA, pixels, ids=ids, mask=seen.mask, depth=depth, depth_sigma=0.005)
-    result = align(shape, view)
-    of_depth = next(each for each in result.evidence if each.kind == "depth")
-    assert of_depth.count > 30
-    assert of_depth.rms_sigmas < 1.5  # the surface's own error is part of sigma
-    lengths = np.ptp(result.bounds, axis=0) * result.alignment.scale
-    errors = np.log(lengths / np.ptp(scene.bounds, axis=0))
-    assert np.abs(errors).max() < 0.1
-    assert np.linalg.norm(result.alignment.translation - truth.translation) < 0.05
-    assert not any("contradict" in text for text in result.warnings)
-
-
 def test_a_learned_shape_without_meshes_is_told_what_to_do() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (8, 3))

@@ -105,9 +105,6 @@ def test_matches_of_a_run_are_exported_as_fits_are(case: Case, tmp_path: Path) -
     out = ["--out", str(run), "--no-picture"]
     assert main(["retrieve", *case.arguments, *out]) == 0
     assert main(["export", str(run), "--to", str(tmp_path / "all.glb")]) == 0
-    assert main(["export", str(run), "--to", str(tmp_path / "k"), "--format", "coco"]) == 0
-    written = json.loads((tmp_path / "k" / "keypoints.json").read_text())
-    assert len(written["annotations"]) == 20
 
 
 def test_a_query_that_fails_is_a_row(

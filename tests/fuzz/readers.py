@@ -168,7 +168,7 @@ _OBSERVATION = {
             "sigma": 1.0,
             "semantic_id": k,
             "name": f"corner {k}",
-            "confidence": 0.5,
+            "score": 0.5,
         }
         for k, (xyz, uv) in enumerate(
             zip(_POINTS.tolist(), _CAMERA.project(_POSE.apply(_POINTS)).tolist(), strict=True)

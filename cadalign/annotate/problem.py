@@ -178,6 +178,8 @@ class LiveProblem:
     @property
     def is_by_mask(self) -> bool:
         """True if the search begins at what the mask of the only view allows."""
+        if self.exact is None:
+            return False
         view = self.views[0]
         few = len(self.views) == 1 and len(view.keypoint_ids) < LEAST_JOINT_PAIRS
         return few and view.mask is not None and self.init is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from cadalign.errors import DegenerateError, InputError
 from cadalign.evaluation.simulation import Problem
 from cadalign.geometry.mesh import Mesh
 from cadalign.io.evidence import ImageEvidence
+from cadalign.io.images import write_image
 from cadalign.io.observation import Observation
 from cadalign.render import visible_keypoints
 from cadalign.solvers.projection import projection_jacobian
@@ -108,6 +110,24 @@ def test_clicks_without_a_stated_noise_have_it_found_beside_other_evidence(
         noted = {"sigma": sigma, "ids": np.arange(8), "evidence": upright}
         seen = Observation(*given, **noted, fit_options=options)
         assert LiveProblem.of(Known(STRETCHED, BOX), seen).noise == expected
+
+
+@pytest.mark.parametrize("pairs", [1, 2])
+def test_a_similar_model_needs_pairs_beside_a_mask(tmp_path: Path, pairs: int) -> None:
+    problem = problem_of(3, points=8)
+    mask = np.zeros((problem.camera.height, problem.camera.width), dtype=np.uint8)
+    mask[200:280, 250:400] = 255
+    write_image(tmp_path / "mask.png", mask)
+    seen = Observation(
+        problem.points_3d[:pairs],
+        problem.points_2d[:pairs],
+        problem.camera,
+        ids=np.arange(pairs),
+        evidence=ImageEvidence(mask=tmp_path / "mask.png"),
+    )
+    live = LiveProblem.of(Known(ObjectShape(sigma=0.05), BOX), seen)
+    with pytest.raises(DegenerateError, match="give at least 3 keypoints"):
+        live.align()
 
 
 def test_standard_deviations_scale_with_the_residuals() -> None:

@@ -203,7 +203,7 @@ def _align_all(
     if not minima:
         raise no_pose_error(problem, model, ransac)
     has_mesh = isinstance(model, Model) and model.mesh is not None
-    if has_mesh and any(len(each.evidence.planes.point) for each in minima):
+    if has_mesh and any(len(each.evidence.image_depths.point) for each in minima):
         from cadalign.estimation.contours.covered import without_covered  # with OpenCV and embree
 
         minima = without_covered(cast(Model, model), problem, minima)

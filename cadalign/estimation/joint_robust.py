@@ -13,9 +13,16 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray, IntArray, read_only
 from cadalign.estimation.options import MINIMAL_SOLVERS, RansacOptions
 from cadalign.estimation.starts import Start, Starts, in_rig, starts_of
-from cadalign.estimation.uncertainty.evidence import plane_distances, seen_in_cameras
+from cadalign.estimation.uncertainty.evidence import image_depths_at, seen_in_cameras
 from cadalign.solvers.constants import CAUCHY, LINEAR, SAMPLE_SIZES
-from cadalign.solvers.joint.evidence import Evidence, State, kept_rows, log_focals_of, points_of
+from cadalign.solvers.joint.evidence import (
+    DEPTH_LOSS_SCALE,
+    Evidence,
+    State,
+    kept_rows,
+    log_focals_of,
+    points_of,
+)
 from cadalign.solvers.joint.search import keypoints_of, refine_joint, score_state, search_joint
 from cadalign.solvers.ransac import rigid_hypotheses
 
@@ -133,8 +140,8 @@ def without_hidden(found: JointConsensus) -> list[JointConsensus]:
     single depths are right is an estimate, as likely as it leaves few depths out: a hidden keypoint
     lies anywhere within the object's depth behind what is seen.
     """
-    planes = found.evidence.planes
-    if not len(planes.point):
+    depths = found.evidence.image_depths
+    if not len(depths.point):
         return [found]
     beside = found.score - score_state(found.evidence, found.state)  # of keypoints left out
     if not np.isfinite(beside):
@@ -145,13 +152,13 @@ def without_hidden(found: JointConsensus) -> list[JointConsensus]:
         poses = state.poses.copy()
         poses[:, 9:] *= factor
         state = state._replace(poses=poses, log_scales=state.log_scales + math.log(factor))
-        shown, settled = np.zeros(len(planes.point), dtype=bool), None
+        shown, settled = np.zeros(len(depths.point), dtype=bool), None
         for _ in range(_ROUNDS):
             limits, again = hidden_limits(found.evidence, state)
             if (again == shown).all() or again.sum() < min(LEAST_SEEN, len(again)):
                 break
             shown = again
-            evidence = found.evidence._replace(planes=kept_rows(planes, shown))
+            evidence = found.evidence._replace(image_depths=kept_rows(depths, shown))
             cost, state, _, _ = refine_joint(evidence, _ITERATIONS, state)
             if not cost < np.inf:
                 break
@@ -164,12 +171,12 @@ def without_hidden(found: JointConsensus) -> list[JointConsensus]:
 
 def _likely_sizes(found: JointConsensus) -> list[float]:
     """Factors of the size at which the depths of keypoints agree, the best first."""
-    planes = found.evidence.planes
-    expected = plane_distances(found.evidence, found.state)
-    factors = np.append(1.0, planes.depth / expected)
+    depths = found.evidence.image_depths
+    expected = image_depths_at(found.evidence, found.state)
+    factors = np.append(1.0, depths.value / expected)
     factors = factors[factors > 0]
-    errors = (factors[:, None] * expected - planes.depth) * planes.weight
-    scale, limits = planes.loss_scale**2, hidden_limits(found.evidence, found.state)[0]
+    errors = (factors[:, None] * expected - depths.value) * depths.weight
+    scale, limits = DEPTH_LOSS_SCALE**2, hidden_limits(found.evidence, found.state)[0]
     costs = np.where(errors < limits, scale * np.log1p(errors**2 / scale), limits**2).sum(axis=1)
     order = np.argsort(costs, kind="stable")
     likely = order[costs[order] < costs[order[0]] + _UNLIKELY_SIZE]
@@ -182,10 +189,10 @@ def hidden_limits(evidence: Evidence, state: State) -> tuple[FloatArray, BoolArr
     They are those of what hides a keypoint anywhere within the depth of all. Also tells which
     depths (m,) do not exceed them.
     """
-    planes, expected = evidence.planes, plane_distances(evidence, state)
-    densities = np.ptp(expected) * planes.weight / math.sqrt(2 * math.pi)
+    depths, expected = evidence.image_depths, image_depths_at(evidence, state)
+    densities = np.ptp(expected) * depths.weight / math.sqrt(2 * math.pi)
     limits = np.sqrt(np.maximum(2 * np.log(np.maximum(densities, 1.0)), _HIDDEN**2))
-    return limits, (expected - planes.depth) * planes.weight < limits
+    return limits, (expected - depths.value) * depths.weight < limits
 
 
 def cost_of_hidden(limits: FloatArray, shown: BoolArray) -> float:

@@ -19,11 +19,10 @@ from cadalign.estimation.view import View
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
-from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.joint.evidence import (
     Evidence,
+    ImageDepths,
     Offsets,
-    Planes,
     Rig,
     Shape,
     Sightings,
@@ -37,9 +36,8 @@ _RADIUS = 2  # of the window about a keypoint [px]
 _GAP = 4.0  # between surfaces in a window [sigma]
 _LEAST_PIXELS = 3  # of a surface in a window
 _LEAST_OF_PLANE = 6  # pixels of one whose slope is told
-_LOSS_SCALE = 3.0  # a keypoint that something hides has the depth of what hides it
 _PLAIN = FitOptions()
-TABLES = ("sightings", "directions", "offsets", "planes")
+TABLES = ("sightings", "directions", "offsets", "image_depths")
 """Evidence by rows, each with the ``image`` of its view, -1 for what is of none."""
 
 
@@ -87,7 +85,7 @@ def evidence_of(
         lenses.focals(),
         directions,
         offsets,
-        _sampled_planes(prior.components[0], rows, views),
+        _image_depths(prior.components[0], rows, views),
         scale_priors(prior, _is_metric(offsets, views, frames)),
     )
 
@@ -175,36 +173,19 @@ def _rig(views: Sequence[View], frames: Sequence[int] | None) -> Rig:
     return Rig(np.array(rows), np.array(frames, dtype=np.int64))
 
 
-def _sampled_planes(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> Planes:
-    """Depths of the keypoints ``rows`` of every view that its depth image holds.
-
-    They count under Cauchy's loss: a keypoint may be hidden by something nearer.
-    """
-    tables = []
+def _image_depths(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> ImageDepths:
+    """Depths of the keypoints ``rows`` of every view that its depth image holds."""
+    none, no_value = np.empty(0, dtype=np.int64), np.empty(0)
+    tables = [ImageDepths(none, none, no_value, no_value)]
     for number, view in enumerate(views):
         if view.depth_image is None:
             continue
         relative = float(cast(float, view.depth_sigma))
         found, deviations = sample_depth(view.depth_image, view.pixels, sigma=relative)
         known = np.isfinite(found)
-        point, depth = np.array(rows[number], dtype=np.int64)[known], found[known]
-        count = len(point)
-        tables.append(
-            Planes(
-                point,
-                np.full(count, number),
-                np.tile([0.0, 0.0, 1.0], (count, 1)),
-                np.zeros((count, 2)),
-                depth,
-                1.0 / np.hypot(deviations[known], shape.spread[point]),
-                np.full(count, CAUCHY),
-                np.full(count, _LOSS_SCALE),
-            )
-        )
-    if not tables:
-        none, no_value = np.empty(0, dtype=np.int64), np.empty(0)
-        directions = np.empty((0, 3)), np.empty((0, 2))
-        return Planes(none, none, *directions, no_value, no_value, none, no_value)
+        point = np.array(rows[number], dtype=np.int64)[known]
+        weight = 1.0 / np.hypot(deviations[known], shape.spread[point])
+        tables.append(ImageDepths(point, np.full(len(point), number), found[known], weight))
     return stacked(tables)
 
 

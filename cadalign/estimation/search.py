@@ -187,7 +187,7 @@ def _is_bare(evidence: Evidence) -> bool:
         evidence.sightings.point,
         evidence.directions.image,
         evidence.offsets.image,
-        evidence.planes.image,
+        evidence.image_depths.image,
     )
     return bool(evidence.scales.free.all()) and not any(map(len, told))
 

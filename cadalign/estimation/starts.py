@@ -147,8 +147,8 @@ def _sized(evidence: Evidence, poses: FloatArray, log_scales: FloatArray) -> _St
 
 def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> float:
     """Median of measured over predicted lengths; NaN where nothing is measured."""
-    sightings, planes, mean = evidence.sightings, evidence.planes, evidence.shape.mean
-    offsets = evidence.offsets
+    sightings, mean = evidence.sightings, evidence.shape.mean
+    sampled, offsets = evidence.image_depths, evidence.offsets
 
     def seen(point: IntArray, image: IntArray) -> FloatArray:
         turns = poses[evidence.rig.pose[image]]
@@ -157,10 +157,9 @@ def _size_factor(evidence: Evidence, poses: FloatArray, scale: FloatArray) -> fl
 
     has_depth = sightings.depths[:, 1] > 0
     depths = seen(sightings.point[has_depth], sightings.image[has_depth])[:, 2]
-    distances = (seen(planes.point, planes.image) * planes.normal).sum(axis=1)
     ratios = [
         sightings.depths[has_depth, 0] / depths,
-        planes.depth / distances,
+        sampled.value / seen(sampled.point, sampled.image)[:, 2],
         offsets.value / distances_of(evidence, poses, mean * scale),
     ]
     told = np.concatenate(ratios)
@@ -268,7 +267,7 @@ def _metric_starts(evidence: Evidence, own: Sequence[_Start]) -> list[_Start]:
 
 
 def _rows_of(evidence: Evidence) -> _Rows:
-    sightings, planes, shape = evidence.sightings, evidence.planes, evidence.shape
+    sightings, sampled, shape = evidence.sightings, evidence.image_depths, evidence.shape
     u, v = sightings.rays.T
     zeros, ones = np.zeros_like(u), np.ones_like(u)
     a, b, c = sightings.whitening.T
@@ -276,13 +275,13 @@ def _rows_of(evidence: Evidence) -> _Rows:
         np.stack([a, b, -(a * u + b * v)], axis=1),
         np.stack([zeros, c, -c * v], axis=1),
         np.stack([zeros, zeros, ones], axis=1),
-        planes.normal,
+        np.tile([0.0, 0.0, 1.0], (len(sampled.point), 1)),
     ]
-    right = [zeros, zeros, sightings.depths[:, 0], planes.depth]
-    weights = [(c > 0).astype(float), (c > 0).astype(float), sightings.depths[:, 1], planes.weight]
-    point = np.concatenate([np.tile(sightings.point, 3), planes.point])
-    image = np.concatenate([np.tile(sightings.image, 3), planes.image])
-    is_ray = np.concatenate([np.ones(2 * len(u)), np.zeros(len(u) + len(planes.point))])
+    right = [zeros, zeros, sightings.depths[:, 0], sampled.value]
+    weights = [(c > 0).astype(float), (c > 0).astype(float), sightings.depths[:, 1], sampled.weight]
+    point = np.concatenate([np.tile(sightings.point, 3), sampled.point])
+    image = np.concatenate([np.tile(sightings.image, 3), sampled.image])
+    is_ray = np.concatenate([np.ones(2 * len(u)), np.zeros(len(u) + len(sampled.point))])
     weight, normal = np.concatenate(weights), np.concatenate(normals)
     kept = weight > 0
     cameras, normal = evidence.rig.cam_from_rig[image[kept]], normal[kept]

@@ -15,8 +15,8 @@ from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
     Focals,
+    ImageDepths,
     Offsets,
-    Planes,
     Rig,
     ScalePriors,
     Shape,
@@ -78,15 +78,8 @@ def evidence_of(
         np.array([1.0, 2.0, 2.0, -3.0]),
         np.array([10.0, 20.0, 20.0, 10.0]),
     )
-    planes = Planes(
-        np.array([2, 6]),
-        np.array([0, 1]),
-        rng.normal(size=(2, 3)) + [0.0, 0.0, 3.0],
-        0.4 * rng.normal(size=(2, 2)),
-        np.array([4.0, 5.0]),
-        np.array([30.0, 20.0]),
-        np.full(2, loss),
-        np.full(2, 2.0),
+    depths = ImageDepths(
+        np.array([2, 6]), np.array([0, 1]), np.array([4.0, 5.0]), np.array([30.0, 20.0])
     )
     precision = rng.normal(size=(3, 3))
     scales = ScalePriors(np.ones(3), precision @ precision.T, ScalePrior(3.0, width))
@@ -98,7 +91,7 @@ def evidence_of(
         np.full(focals, 30.0),
     )
     rig = Rig(cameras, np.array(poses))
-    return Evidence(shape, sightings, rig, lenses, up, offsets, planes, scales)
+    return Evidence(shape, sightings, rig, lenses, up, offsets, depths, scales)
 
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
@@ -267,7 +260,7 @@ def test_eliminated_displacements_equal_modes_of_the_same_deviation() -> None:
     evidence = seen_from(evidence, state_of(5, 1))
     evidence = evidence._replace(
         offsets=Offsets(*(column[:0] for column in evidence.offsets)),
-        planes=Planes(*(column[:0] for column in evidence.planes)),
+        image_depths=ImageDepths(*(column[:0] for column in evidence.image_depths)),
     )
     as_modes = evidence._replace(
         shape=Shape(

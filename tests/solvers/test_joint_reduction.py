@@ -13,8 +13,8 @@ from cadalign.solvers.joint.evidence import (
     Directions,
     Evidence,
     Focals,
+    ImageDepths,
     Offsets,
-    Planes,
     Rig,
     ScalePriors,
     Shape,
@@ -75,9 +75,7 @@ def evidence(rank: int) -> Evidence:
         Focals(np.full(1, -1), NO_VALUE, NO_VALUE, NO_VALUE, NO_VALUE),
         Directions(np.empty((0, 3)), np.empty((0, 3)), NONE, np.empty((0, 3, 3))),
         Offsets(NONE.reshape(0, 2), NONE, np.empty((0, 3)), NO_VALUE, NO_VALUE),
-        Planes(
-            *(NONE, NONE, np.empty((0, 3)), np.empty((0, 2))), *(NO_VALUE, NO_VALUE, NONE, NO_VALUE)
-        ),
+        ImageDepths(NONE, NONE, NO_VALUE, NO_VALUE),
         ScalePriors(np.zeros(3), np.zeros((3, 3)), ScalePrior(0.0, 0.0)),
     )
 

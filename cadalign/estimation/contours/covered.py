@@ -12,7 +12,7 @@ from cadalign.estimation.model import Model
 from cadalign.estimation.search import JointProblem, Minimum
 from cadalign.estimation.uncertainty.evidence import seen_in_cameras
 from cadalign.geometry.alignment import model_rays
-from cadalign.solvers.joint.evidence import Evidence, Planes, State, kept_rows, points_of
+from cadalign.solvers.joint.evidence import Evidence, ImageDepths, State, kept_rows, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state
 
 _ROUNDS = 6
@@ -34,20 +34,21 @@ def without_covered(model: Model, problem: JointProblem, minima: list[Minimum]) 
     likely = [each for each in minima if not each.score > first.score + _UNLIKELY]
     found: dict[tuple[bytes, float], Minimum] = {}
     for each in likely[:_MOST_COVERED]:
-        whole = problem.evidence(each.evidence.shape, each.lenses).planes
+        whole = problem.evidence(each.evidence.shape, each.lenses).image_depths
         uncovered = _uncovered(each, whole, surface)
-        planes = uncovered.evidence.planes
-        found.setdefault((planes.point.tobytes(), round(uncovered.score, 3)), uncovered)
+        depths = uncovered.evidence.image_depths
+        found.setdefault((depths.point.tobytes(), round(uncovered.score, 3)), uncovered)
     return sorted(found.values(), key=lambda minimum: minimum.score)
 
 
-def _uncovered(minimum: Minimum, whole: Planes, surface: Surface) -> Minimum:
-    """The minimum by those of the ``whole`` planes that the surface does not hide.
+def _uncovered(minimum: Minimum, whole: ImageDepths, surface: Surface) -> Minimum:
+    """The minimum by those of the ``whole`` depths that the surface does not hide.
 
     Where another object hides a keypoint, the depths' robust loss allows for it.
     """
-    evidence, state, own = minimum.evidence._replace(planes=whole), minimum.state, minimum.evidence
-    had = set(zip(own.planes.image.tolist(), own.planes.point.tolist(), strict=True))
+    own = minimum.evidence.image_depths
+    evidence, state = minimum.evidence._replace(image_depths=whole), minimum.state
+    had = set(zip(own.image.tolist(), own.point.tolist(), strict=True))
     rows = zip(whole.image.tolist(), whole.point.tolist(), strict=True)
     shown = np.array([row in had for row in rows])
     # What the score has beside its evidence and the depths that were left out, of keypoints.
@@ -58,7 +59,7 @@ def _uncovered(minimum: Minimum, whole: Planes, surface: Surface) -> Minimum:
         if again.sum() < LEAST_SEEN or (again == shown).all():
             break
         shown = again
-        some = evidence._replace(planes=kept_rows(whole, shown))
+        some = evidence._replace(image_depths=kept_rows(whole, shown))
         cost, moved, _, _ = refine_joint(some, _ITERATIONS, state)
         score = beside + score_state(some, moved)
         if not np.isfinite(score):
@@ -69,18 +70,18 @@ def _uncovered(minimum: Minimum, whole: Planes, surface: Surface) -> Minimum:
 
 
 def _is_covered(evidence: Evidence, state: State, surface: Surface) -> BoolArray:
-    """Marks the planes (m,) of keypoints that lie behind the surface."""
-    planes, posed = evidence.planes, surface.at(evidence.shape, state)
-    points = points_of(evidence.shape, state)[planes.point]
-    seen = seen_in_cameras(evidence, state, points, planes.image)
+    """Marks the depths (m,) of keypoints that lie behind the surface."""
+    depths, posed = evidence.image_depths, surface.at(evidence.shape, state)
+    points = points_of(evidence.shape, state)[depths.point]
+    seen = seen_in_cameras(evidence, state, points, depths.image)
     covered = np.zeros(len(points), dtype=bool)
     for number, pose in enumerate(poses_of(evidence, state)):
-        rows = np.flatnonzero(planes.image == number)
+        rows = np.flatnonzero(depths.image == number)
         if not len(rows):
             continue
         origin, model_from_ray = model_rays(pose)
         rays = seen[rows] / seen[rows, 2:]
         face, depth = posed.caster.first_hits(origin, rays @ model_from_ray.T)
-        nearer = (seen[rows, 2] - depth) * planes.weight[rows]
+        nearer = (seen[rows, 2] - depth) * depths.weight[rows]
         covered[rows] = (face >= 0) & (nearer > _COVERED)
     return covered

@@ -204,7 +204,7 @@ def _with_measured(
     def moved(points: IntArray) -> IntArray:
         return np.where(points >= keypoints, points + total, points)
 
-    planes = evidence.planes._replace(point=moved(evidence.planes.point))
+    depths = evidence.image_depths
     sightings = [evidence.sightings._replace(point=moved(evidence.sightings.point))]
     first = keypoints
     for number, (points, own_modes, rows, own) in enumerate(measured):
@@ -218,7 +218,7 @@ def _with_measured(
     return evidence._replace(
         shape=Shape(mean, modes, np.insert(shape.spread, room, 0.0)),
         offsets=evidence.offsets._replace(ends=moved(evidence.offsets.ends)),
-        planes=planes,
+        image_depths=depths._replace(point=moved(depths.point)),
         sightings=stacked(sightings),
     )
 

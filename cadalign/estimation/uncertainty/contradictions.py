@@ -18,9 +18,9 @@ from cadalign.estimation.starts import starts_of
 from cadalign.estimation.uncertainty.evidence import (
     Piece,
     count_equations,
+    image_depths_at,
     measured_factor,
     pieces_of,
-    plane_distances,
     redundancy_of,
     told_by,
     without,
@@ -68,7 +68,8 @@ def warnings_of(
     """
     contradicting = _contradictions(evidence, state, cost)
     warnings = [*_wrong_units(evidence, state, contradicting), *contradicting]
-    if not contradicting and not evidence.sightings.loss.any() and not evidence.planes.loss.any():
+    is_robust = evidence.sightings.loss.any() or len(evidence.image_depths.point)
+    if not contradicting and not is_robust:
         warnings += misfits(cost, redundancy_of(evidence), tails)
     return tuple(warnings)
 
@@ -80,7 +81,7 @@ def _contradictions(evidence: Evidence, state: State, cost: float) -> tuple[str,
     if len(every) < 2 or not pieces:
         return ()
     evidence, state = reduced(evidence, state)
-    if len(evidence.planes.point):
+    if len(evidence.image_depths.point):
         evidence = _without_hidden(evidence, state)
         cost, state, _, _ = refine_joint(evidence, 10 * _REFITTING, state)
     if len(pieces) > _MOST_TESTED:  # those of the largest own cost
@@ -114,7 +115,7 @@ def _determines_its_pose(evidence: Evidence, piece: Piece) -> bool:
         return False
     rig, sightings = evidence.rig, evidence.sightings
     others = (sightings.image == piece.view) & ~told_by(sightings)["keypoints"]
-    depths = (evidence.planes.image == piece.view).any()
+    depths = (evidence.image_depths.image == piece.view).any()
     return (rig.pose == rig.pose[piece.view]).sum() == 1 and not others.any() and not depths
 
 
@@ -132,13 +133,13 @@ def _is_suspicious(
 
 def _without_hidden(evidence: Evidence, state: State) -> Evidence:
     """The evidence without depths that differ from most of their image: of something else."""
-    planes, expected = evidence.planes, plane_distances(evidence, state)
+    depths, expected = evidence.image_depths, image_depths_at(evidence, state)
     kept = np.ones(len(expected), dtype=bool)
-    for view in np.unique(planes.image):
-        rows = planes.image == view
-        factor = np.median(planes.depth[rows] / expected[rows])
-        kept[rows] = (np.abs(planes.depth / factor - expected) * planes.weight)[rows] < _HIDDEN
-    return evidence._replace(planes=kept_rows(planes, kept))
+    for view in np.unique(depths.image):
+        rows = depths.image == view
+        factor = np.median(depths.value[rows] / expected[rows])
+        kept[rows] = (np.abs(depths.value / factor - expected) * depths.weight)[rows] < _HIDDEN
+    return evidence._replace(image_depths=kept_rows(depths, kept))
 
 
 def _as_likely(best: _Trial, suspects: Sequence[_Trial], noise: float) -> list[_Trial]:

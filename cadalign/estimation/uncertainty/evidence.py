@@ -60,7 +60,7 @@ def pieces_of(evidence: Evidence) -> list[Piece]:
     """All pieces, view by view."""
     rig, offsets = evidence.rig, evidence.offsets
     told = {kind: evidence.sightings.image[on] for kind, on in told_by(evidence.sightings).items()}
-    told["depth"] = np.append(told["depth"], evidence.planes.image)
+    told["depth"] = np.append(told["depth"], evidence.image_depths.image)
     told["gravity"] = evidence.directions.image
     told["camera height"] = offsets.image[offsets.image >= 0]
     told["rig"] = np.flatnonzero(np.bincount(rig.pose)[rig.pose] > 1)
@@ -98,8 +98,8 @@ def without(evidence: Evidence, state: State, piece: Piece) -> tuple[Evidence, S
         return evidence._replace(rig=rig), state._replace(poses=np.vstack([state.poses, own]))
     hidden = told_by(sightings)[kind] & (sightings.image == view)
     if kind == "depth":
-        planes = kept_rows(evidence.planes, evidence.planes.image != view)
-        evidence = evidence._replace(planes=planes)
+        depths = kept_rows(evidence.image_depths, evidence.image_depths.image != view)
+        evidence = evidence._replace(image_depths=depths)
         sightings = sightings._replace(depths=np.where(hidden[:, None], 0.0, sightings.depths))
     else:
         whitening = np.where(hidden[:, None], 0.0, sightings.whitening)
@@ -113,7 +113,7 @@ def count_equations(evidence: Evidence) -> int:
     told = {kind: int(rows.sum()) for kind, rows in told_by(evidence.sightings).items()}
     count = 2 * told["keypoints"] + told["mask"] + told["depth"]
     count += 2 * len(evidence.directions.image) + len(evidence.offsets.weight)
-    count += len(evidence.planes.weight) + len(evidence.shape.modes)
+    count += len(evidence.image_depths.weight) + len(evidence.shape.modes)
     if has_scale_prior(evidence.scales):
         count += int(np.linalg.matrix_rank(evidence.scales.precision))
     return count
@@ -207,22 +207,19 @@ def _depths(
     """Expected and measured depths of a view (n,), with the inverse standard deviations."""
     sightings = evidence.sightings
     rows = told_by(sightings)["depth"] & (sightings.image == view)
-    expected, others = plane_distances(evidence, state), evidence.planes.image == view
+    expected, others = image_depths_at(evidence, state), evidence.image_depths.image == view
     return (
         np.concatenate([_sighted(evidence, state, rows)[:, 2], expected[others]]),
-        np.concatenate([sightings.depths[rows, 0], evidence.planes.depth[others]]),
-        np.concatenate([sightings.depths[rows, 1], evidence.planes.weight[others]]),
+        np.concatenate([sightings.depths[rows, 0], evidence.image_depths.value[others]]),
+        np.concatenate([sightings.depths[rows, 1], evidence.image_depths.weight[others]]),
     )
 
 
-def plane_distances(evidence: Evidence, state: State) -> FloatArray:
-    """Expected depths (m,) at which rays meet the evidence's planes."""
-    planes = evidence.planes
-    points = points_of(evidence.shape, state)[planes.point]
-    seen = seen_in_cameras(evidence, state, points, planes.image)
-    ratios = np.exp(log_focals_of(evidence, state))[planes.image]
-    rays = np.column_stack([planes.ray / ratios[:, None], np.ones(len(ratios))])
-    return np.asarray((seen * planes.normal).sum(axis=1) / (rays * planes.normal).sum(axis=1))
+def image_depths_at(evidence: Evidence, state: State) -> FloatArray:
+    """Depths (m,) that a state has in the place of the evidence's image depths."""
+    depths = evidence.image_depths
+    points = points_of(evidence.shape, state)[depths.point]
+    return seen_in_cameras(evidence, state, points, depths.image)[:, 2]
 
 
 def _of_gravity(evidence: Evidence, state: State, view: int) -> EvidenceSummary:

@@ -8,7 +8,7 @@ and ``e = -spread^2 D' L^-T (whitened residual)`` follows.
 Coefficients and displacements that are integrated out leave a log determinant. Its slope h_q by
 the point of each equation is that of `cadalign.solvers.projection.slope_of_row`, in the rig's frame
 with the response y_q of the point; the derivative by a turn is ``X_i x h_q + y_q x a_q``, and
-stretch and focal length scale the rows as well. The equations of directions, offsets and planes
+stretch and focal length scale the rows as well. The equations of directions, offsets and depths
 move with the coefficients alone.
 """
 
@@ -209,7 +209,7 @@ def add_log_determinant(evidence: Evidence, state: State, equations: JointEquati
 
 @kernel
 def _add_block_slopes(evidence: Evidence, state: State, arrow: Arrow, factor: FloatArray) -> None:
-    """Add half the derivatives that directions, offsets and planes give.
+    """Add half the derivatives that directions, offsets and depths give.
 
     A residual is linear in the coefficients, so that the derivative of its row by these, along
     their response to it, is the change of the row as they move by the response.

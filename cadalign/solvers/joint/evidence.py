@@ -103,22 +103,21 @@ class Offsets(NamedTuple):
     weight: FloatArray
 
 
-class Planes(NamedTuple):
-    """Planes in a camera that points X lie in: each meets a pixel's ray at a measured depth.
+class ImageDepths(NamedTuple):
+    """Depths ``value`` (D,) of points in views by depth images, where something may hide them.
 
-    They lie across ``normal`` (N, 3) and meet the rays (u / r, v / r, 1) at ``depth`` (N,), with
-    ``ray`` (N, 2) for (u, v) and the view's relative focal length r. ``point``, ``image``, ``loss``
-    and ``loss_scale`` are as in `Sightings`; ``weight`` (N,) is the inverse deviation of depths.
+    ``point`` and ``image`` (D,) are as in `Sightings`, ``weight`` (D,) are the inverse standard
+    deviations. They count under Cauchy's loss: what hides a point has another depth.
     """
 
     point: IntArray
     image: IntArray
-    normal: FloatArray
-    ray: FloatArray
-    depth: FloatArray
+    value: FloatArray
     weight: FloatArray
-    loss: IntArray
-    loss_scale: FloatArray
+
+
+DEPTH_LOSS_SCALE = 3.0
+"""Length [sigma] at which the loss of image depths begins to bend."""
 
 
 class ScalePriors(NamedTuple):
@@ -142,7 +141,7 @@ class Evidence(NamedTuple):
     focals: Focals
     directions: Directions
     offsets: Offsets
-    planes: Planes
+    image_depths: ImageDepths
     scales: ScalePriors
 
 

@@ -1,6 +1,6 @@
 """Residuals of all evidence and their derivatives, which the normal equations are made of.
 
-Sightings write rows of one pose. Directions, offsets and planes are equations about one pose and
+Sightings write rows of one pose. Directions, offsets and depths are equations about one pose and
 the border: a row (6 + b,) of derivatives by the pose, the log focals, the log scales and the
 coefficients, and a residual, which is linear in the coefficients. Displacements don't count.
 """
@@ -13,9 +13,17 @@ import numpy as np
 
 from cadalign.arrays import FloatArray, IntArray
 from cadalign.compile import borrowing, inlined, kernel
+from cadalign.solvers.constants import CAUCHY
 from cadalign.solvers.evidence import beyond, fall_of_weight, loss_and_root, weigh_error
 from cadalign.solvers.joint.arrow import Arrow, add_row, border_start
-from cadalign.solvers.joint.evidence import Evidence, Sightings, State, exp_of, stretched_point
+from cadalign.solvers.joint.evidence import (
+    DEPTH_LOSS_SCALE,
+    Evidence,
+    Sightings,
+    State,
+    exp_of,
+    stretched_point,
+)
 from cadalign.solvers.linalg import cross, dot, triple
 from cadalign.solvers.projection import ray_slopes, see, shift, turn, turn_back, write_motion
 
@@ -192,24 +200,24 @@ class BlockEquation(NamedTuple):
 @inlined
 def count_block_equations(evidence: Evidence) -> int:
     """Number of the equations that `write_block_row` writes."""
-    directions, offsets, planes = evidence.directions, evidence.offsets, evidence.planes
-    return int(3 * directions.image.shape[0] + offsets.value.shape[0] + planes.point.shape[0])
+    directions, offsets, depths = evidence.directions, evidence.offsets, evidence.image_depths
+    return int(3 * directions.image.shape[0] + offsets.value.shape[0] + depths.value.shape[0])
 
 
 @kernel
 def write_block_row(evidence: Evidence, state: State, q: int, row: FloatArray) -> BlockEquation:
-    """Write derivatives (6 + b,) of the residual of direction, offset or plane number ``q``.
+    """Write derivatives (6 + b,) of the residual of direction, offset or depth number ``q``.
 
     Directions come first, with three equations each.
     """
     row[:] = 0.0
     offset = q - 3 * evidence.directions.image.shape[0]
-    plane = offset - evidence.offsets.value.shape[0]
-    if plane >= 0:
-        pose, residual = _write_plane(evidence, state, plane, row)
-        loss, loss_scale = evidence.planes.loss[plane], evidence.planes.loss_scale[plane]
-        cost, root = loss_and_root(loss, loss_scale, residual * residual)
-        fall = fall_of_weight(loss, loss_scale, root, root * root * residual * residual)
+    depth = offset - evidence.offsets.value.shape[0]
+    if depth >= 0:
+        pose, residual = _write_depth(evidence, state, depth, row)
+        cost, root = loss_and_root(CAUCHY, DEPTH_LOSS_SCALE, residual * residual)
+        weighted = root * root * residual * residual
+        fall = fall_of_weight(CAUCHY, DEPTH_LOSS_SCALE, root, weighted)
         return BlockEquation(pose, residual, cost, root, fall)
     if offset >= 0:
         pose, residual = _write_offset(evidence, state, offset, row)
@@ -270,38 +278,25 @@ def _write_offset(evidence: Evidence, state: State, j: int, row: FloatArray) -> 
 
 
 @inlined
-def _write_plane(evidence: Evidence, state: State, j: int, row: FloatArray) -> tuple[int, float]:
-    """Write the equation of a point in a plane known in a camera; pose and residual.
-
-    The residual is ``normal . X / normal . ray - depth`` of the point X in the camera's frame, the
-    depth at which the ray meets the plane through it.
-    """
-    planes, rig = evidence.planes, evidence.rig
+def _write_depth(evidence: Evidence, state: State, j: int, row: FloatArray) -> tuple[int, float]:
+    """Write the equation of a point's depth in a view; pose and residual."""
+    depths, rig = evidence.image_depths, evidence.rig
     scale = exp_of(state.log_scales)
-    v, i, weight = planes.image[j], planes.point[j], planes.weight[j]
+    v, i, weight = depths.image[j], depths.point[j], depths.weight[j]
     camera, pose = rig.cam_from_rig[v], state.poses[rig.pose[v]]
-    x, y, z = triple(planes.normal[j])
-    group = evidence.focals.group[v]
-    tilt = x * planes.ray[j, 0] + y * planes.ray[j, 1]
-    if group >= 0:
-        tilt *= np.exp(-state.log_focals[group])
-    along = z + tilt
-    normal = x / along, y / along, z / along
     point = (
         scale[0] * _undisplaced(evidence, state, i, 0),
         scale[1] * _undisplaced(evidence, state, i, 1),
         scale[2] * _undisplaced(evidence, state, i, 2),
     )
     rotated = turn(pose, point)
-    met = dot(normal, shift(camera, turn(camera, shift(pose, rotated))))
-    by_rig = turn_back(camera, (weight * normal[0], weight * normal[1], weight * normal[2]))
+    _, _, depth = shift(camera, turn(camera, shift(pose, rotated)))
+    by_rig = turn_back(camera, (0.0, 0.0, weight))
     by_turn, by_model = cross(rotated, by_rig), turn_back(pose, by_rig)
-    if group >= 0:
-        row[6 + group] = weight * met * tilt / along
     for k in range(3):
         row[k], row[3 + k] = by_turn[k], by_rig[k]
         _add_shape(evidence, state, i, k, by_model[k], row)
-    return rig.pose[v], (met - planes.depth[j]) * weight
+    return rig.pose[v], (depth - depths.value[j]) * weight
 
 
 @inlined

@@ -229,7 +229,7 @@ def whole_state(reduction: Reduction, whole: Shape, state: State) -> State:
 def used_points(evidence: Evidence) -> BoolArray:
     """True for the points (m,) that a piece of evidence names."""
     used, ends = sighted_points(evidence), evidence.offsets.ends
-    used[evidence.planes.point] = used[ends[ends >= 0]] = True
+    used[evidence.image_depths.point] = used[ends[ends >= 0]] = True
     return used
 
 

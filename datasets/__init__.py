@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from cadalign.datasets.photos.bop import Bop
     from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, PhotoSummary
     from cadalign.datasets.photos.kitti import KittiCars
-    from cadalign.datasets.photos.objectron import Objectron
     from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
     from cadalign.datasets.photos.scan2cad import Scan2CAD
     from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
     from cadalign.datasets.sfm.blind_pnp import BlindPnP
-    from cadalign.datasets.sfm.bundler import Bundler
     from cadalign.datasets.sfm.colmap import Colmap
     from cadalign.datasets.sfm.correspondences import Correspondences, CorrespondenceSet
     from cadalign.io.meshes.files import check_solid, flat_axes, load_mesh
@@ -46,7 +44,6 @@ __all__ = [
     "AnnotatedModel",
     "BlindPnP",
     "Bop",
-    "Bundler",
     "CadModel",
     "Circle",
     "Colmap",
@@ -58,7 +55,6 @@ __all__ = [
     "KittiCars",
     "ModelKeypoint",
     "ModelKeypoints",
-    "Objectron",
     "Pascal3D",
     "Pascal3DDetections",
     "Photo",

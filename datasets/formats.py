@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.datasets.photos import bop, kitti, objectron, pascal3d, pix3d, posed_photos, scan2cad
+from cadalign.datasets.photos import bop, kitti, pascal3d, pix3d, posed_photos, scan2cad
 from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat
 from cadalign.datasets.photos.photo import Photo
 from cadalign.datasets.photos.placed import placed_objects
-from cadalign.datasets.sfm import blind_pnp, bundler, colmap
+from cadalign.datasets.sfm import blind_pnp, colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
 from cadalign.errors import DataError, InputError, all_left_out, unknown
-from cadalign.io.files import as_path, open_input, writing
+from cadalign.io.files import as_path, writing
 
 PHOTO_FORMATS = (
     scan2cad.FORMAT,
@@ -26,7 +25,6 @@ PHOTO_FORMATS = (
     pascal3d.FORMAT,
     pascal3d.DETECTIONS,
     posed_photos.FORMAT,
-    objectron.FORMAT,
 )
 """The known formats, in the order in which they are looked for."""
 
@@ -40,7 +38,7 @@ def open_photos(
     ----------
     path : str or path-like
         The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Bop`, `KittiCars`,
-        `Pascal3D`, `Pascal3DDetections`, `PosedPhotos`, `Objectron`.
+        `Pascal3D`, `Pascal3DDetections`, `PosedPhotos`.
     formats : sequence of PhotoFormat
         The formats that are looked for, in this order.
 
@@ -82,9 +80,8 @@ def write_photos(
 
     Each object becomes a photo of its own. Poses, keypoints, cameras and photos are read back as
     they were given, and masks where the form has them. Forms without a stretch (Pix3D, BOP) have
-    the stretched mesh as the model; KITTI has boxes that stand upright alone; Objectron the
-    model's box in place of the model. Written lengths are metres (`Truth.metres`) or, in BOP,
-    millimetres.
+    the stretched mesh as the model; KITTI has boxes that stand upright alone. Written lengths are
+    metres (`Truth.metres`) or, in BOP, millimetres.
 
     Parameters
     ----------
@@ -92,7 +89,7 @@ def write_photos(
         A new or empty folder.
     photos : iterable of Photo
     form : str
-        The `PhotoFormat.name` of a format with a writer: pix3d, bop, scan2cad, kitti, objectron.
+        The `PhotoFormat.name` of a format with a writer: pix3d, bop, scan2cad, kitti.
     formats : sequence of PhotoFormat
         The formats that are known.
 
@@ -143,32 +140,24 @@ class _Format:
     load: Callable[[Path], CorrespondenceSet]  # makes the set of a folder
     sought: str  # the files of this format, for messages
     layouts: tuple[tuple[str, ...], ...]
-    """Patterns of the files below a folder, which all belong to one of the layouts."""
-    header: bytes = b""  # the first bytes of each file
+    """The files below a folder, which all belong to one of the layouts."""
 
     def fit(self, folder: Path) -> int:
         """2 for a folder that holds all files of a layout, 1 for some of them, 0 for none."""
         best = 0
         for layout in self.layouts:
-            files = [[file for file in folder.glob(name) if file.is_file()] for name in layout]
-            if all(any(_begins_with(file, self.header) for file in found) for found in files):
+            files = [(folder / name).is_file() for name in layout]
+            if all(files):
                 return 2
             best = max(best, int(any(files)))
         return best
 
 
-_BUNDLER_HEADER = b"# Bundle file"  # many a program calls its log something.out
 _FORMATS = {
     "colmap": _Format(
         colmap.Colmap,
         "cameras, images and points3D (.bin or .txt; also in sparse/0, sparse or 0)",
         colmap.LAYOUTS,
-    ),
-    "bundler": _Format(
-        bundler.Bundler,
-        "bundle.out (also in bundle, or one *.out)",
-        tuple((pattern,) for pattern in bundler.PATTERNS),
-        header=_BUNDLER_HEADER,
     ),
     "blind-pnp": _Format(
         blind_pnp.BlindPnP,
@@ -189,8 +178,8 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
     Parameters
     ----------
     path : str or path-like
-        A folder, as `Colmap`, `Bundler` or `BlindPnP` takes it, or Bundler's file.
-    format : {"auto", "colmap", "bundler", "blind-pnp"}
+        A folder, as `Colmap` or `BlindPnP` takes it.
+    format : {"auto", "colmap", "blind-pnp"}
         ``auto`` goes by the names of the files.
 
     Raises
@@ -213,11 +202,6 @@ def open_correspondences(path: str | os.PathLike[str], *, format: str = AUTO) ->
 
 
 def _recognize(root: Path) -> str:
-    if root.is_file():
-        if _begins_with(root, _BUNDLER_HEADER):
-            return "bundler"
-        what = f"not a Bundler file: it does not begin with {_BUNDLER_HEADER.decode()!r}"
-        raise DataError(what, where=str(root), fix="for other formats, give the folder")
     if not root.is_dir():
         fix = "give the folder of the correspondences"
         raise DataError("no such folder", where=str(root), fix=fix)
@@ -232,8 +216,3 @@ def _recognize(root: Path) -> str:
         what = f"the folder holds files of {' and '.join(found)}"
         raise DataError(what, where=str(root), fix="say which format to read")
     return found[0]
-
-
-def _begins_with(file: Path, header: bytes) -> bool:
-    with open_input(file, most=sys.maxsize) as stream:
-        return stream.read(len(header)) == header

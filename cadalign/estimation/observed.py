@@ -180,7 +180,7 @@ def views_from(
 
     Parameters
     ----------
-    images : Colmap, Bundler or another mapping
+    images : Colmap or another mapping
         The reconstruction's photos, of `cadalign.datasets`.
     keypoints : mapping of str to ((n, 2) float, sequence of n ids or None)
         For each photo used, by its name: pixels of the object's keypoints, integers being pixel

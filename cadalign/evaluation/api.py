@@ -42,7 +42,7 @@ def evaluate(
     root : str or path-like, optional
         The dataset, for experiments that have one: a folder in KeypointNet's layout
         (``keypointnet``, ``retrieval``, ``unseen``, ``tracks``), a data set of photos
-        (``photos``), or a COLMAP, Bundler or blind-PnP model (``correspondences``).
+        (``photos``), or a COLMAP or blind-PnP model (``correspondences``).
     experiment : {"keypointnet", "correspondences", "retrieval", "unseen", "photos",
         "tracks", "simulate", "demo"}
         Or one that was registered; see `cadalign.evaluation.registry`.

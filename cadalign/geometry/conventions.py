@@ -1,6 +1,6 @@
 """Axes and pixel centres of other programs, and their conversion: the only place for either.
 
-OpenGL's camera (also NeRF's and Bundler's) looks along -z with y up, where cadalign's looks along
+OpenGL's camera (also NeRF's) looks along -z with y up, where cadalign's looks along
 +z with y down. Its image begins at the border of the corner pixel, as COLMAP's does, where
 cadalign's begins at the pixel's centre, `PIXEL_CENTRE` from there in x and y.
 """

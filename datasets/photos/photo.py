@@ -187,9 +187,8 @@ class Photo:
 
     name: str
     """The photo's name within its data set; no other has it."""
-    image: Path | Callable[[], ByteImage] | None
-    """The image's file, or the function that reads it, such as a frame of a video; None where it is
-    not there."""
+    image: Path | None
+    """The image's file; None where it is not there."""
     camera: Camera | None
     """Its camera, `Camera.without_focal` where the focal length is unknown; None where not even the
     image's size is."""
@@ -214,7 +213,7 @@ class Photo:
         """Read the photo's pixels, (h, w, 3) uint8; raises DataError if there are none."""
         if self.image is None:
             raise DataError("the image of this photo is not there", where=self.name)
-        return read_photo(self.image) if isinstance(self.image, Path) else self.image()
+        return read_photo(self.image)
 
 
 def existing(path: Path) -> Path | None:

@@ -23,7 +23,7 @@ from benchmarks import section
 from benchmarks.section import COMMAND, BenchmarkData, Row, Tables, Used
 from cadalign import Camera, RansacOptions
 from cadalign.batch.experiment import LARGEST_CHUNK
-from cadalign.datasets import Bundler, Colmap, Correspondences, KeypointNet, write_sample_dataset
+from cadalign.datasets import Colmap, Correspondences, KeypointNet, write_sample_dataset
 from cadalign.evaluation.experiments.keypointnet import KeypointNetOptions
 from cadalign.evaluation.instances.correspondences import errors_of, spoil
 from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
@@ -269,12 +269,8 @@ def ransac(
     outliers : tuple[float, ...]
         Shares of outliers among the image points.
     """
-    colmap, bundler = given.needed("colmap"), given.needed("bundler")
-    models = {"COLMAP": list(Colmap(colmap)), "Bundler": list(Bundler(bundler))}
-    rows = [
-        _row(name, images, share, draws) for name, images in models.items() for share in outliers
-    ]
-    yield "Robust search", rows
+    images = list(Colmap(given.needed("colmap")))
+    yield "Robust search", [_row("COLMAP", images, share, draws) for share in outliers]
 
 
 def _row(name: str, images: list[Correspondences], share: float, draws: int) -> Row:

@@ -48,8 +48,6 @@ class BenchmarkData:
     """Folder in KeypointNet's layout, with splits; some sections need it, others use it."""
     colmap: Path | None = _DATA and _DATA / "sfm" / "maupertuis_colmap"
     """Folder of a COLMAP model."""
-    bundler: Path | None = _DATA and _DATA / "sfm" / "balbianello"
-    """Folder of a Bundler model."""
     seed: int = 0
     """Seed of random problems."""
     out: Path = Path("bench")

@@ -7,7 +7,6 @@ import pickle
 
 import numpy as np
 import pytest
-from support.files import write_json
 from support.photo_data import write_bop, write_photo, write_scan2cad, write_text
 from support.photo_sets import WRITERS
 
@@ -95,12 +94,6 @@ def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):
         cadalign.datasets.open(tmp_path)
     for each in PHOTO_FORMATS:
         assert each.signature in str(caught.value)
-
-
-def test_annotations_of_other_kinds_are_not_taken_for_objectron(tmp_path):
-    write_json(tmp_path / "annotations" / "chair.json", [{"class_id": "03001627"}])
-    with pytest.raises(DataError, match="no data set of photos is recognised"):
-        cadalign.datasets.open(tmp_path)
 
 
 @pytest.mark.parametrize("bad", ["[" * 9999 + "]" * 9999, '"\\ud800"', "1e999", "9" * 5000, "nul"])

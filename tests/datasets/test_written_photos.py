@@ -100,7 +100,7 @@ def depth(photo: Photo) -> float:
     return float(corners(photo)[:, 2].min())
 
 
-@pytest.mark.parametrize("form", ["toy", "pix3d", "bop", "scan2cad", "objectron"])
+@pytest.mark.parametrize("form", ["toy", "pix3d", "bop", "scan2cad"])
 @pytest.mark.parametrize("source", ["Pix3D", "BOP", "Scan2CAD", "PASCAL3D+"])
 def test_a_data_set_comes_back_from_another_form(tmp_path: Path, source: str, form: str) -> None:
     given = cadalign.datasets.open(WRITERS[source](tmp_path / "given"))
@@ -182,7 +182,7 @@ def test_what_cannot_be_written_at_all_is_refused(tmp_path: Path) -> None:
     given = cadalign.datasets.open(write_scan2cad(tmp_path / "given"))
     with pytest.raises(InputError, match="unknown form 'toy'") as caught:
         write_photos(tmp_path / "new", given, "toy")
-    assert "known are scan2cad, pix3d, bop, kitti, objectron" in str(caught.value)
+    assert "known are scan2cad, pix3d, bop, kitti" in str(caught.value)
     with pytest.raises(InputError, match="photos: there is no object to write"):
         write_photos(tmp_path / "new", [], "bop")
     with pytest.raises(DataError, match="the folder is not empty"):

@@ -27,7 +27,7 @@ from cadalign import (
     fit,
     fit_batch,
 )
-from cadalign.datasets import Bundler, Colmap
+from cadalign.datasets import Colmap
 from cadalign.errors import DegenerateError, InputError, NoConsensusError
 from cadalign.estimation import focal_search
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, sample_limit
@@ -591,25 +591,6 @@ def test_structure_from_motion_with_scales_drawn_at_random(real_data: Path) -> N
                 weak += 1
                 assert off < 5 * result.std.focal  # the lens is no pinhole, which its noise is not
     assert (strong, weak) == (9, 3)
-
-
-@pytest.mark.long
-def test_structure_from_motion_through_lenses(real_data: Path) -> None:
-    rng = np.random.default_rng(0)
-    for image in Bundler(real_data / "sfm" / "balbianello"):
-        c = image.camera
-        camera = Camera.without_focal(c.width, c.height, cx=c.cx, cy=c.cy, distortion=c.distortion)
-        scale = np.array([1.0, *rng.uniform(0.5, 2, 2)])
-        result = fit(
-            image.points_3d / scale,
-            image.points_2d,
-            camera,
-            focal="estimate",
-            focal_prior=None,
-            sigma=None,
-        )
-        assert result.camera.fx == pytest.approx(c.fx, rel=0.01)
-        np.testing.assert_allclose(result.alignment.scale, scale, rtol=0.01)
 
 
 # --- refusals ---------------------------------------------------------------------------------

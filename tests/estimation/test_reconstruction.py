@@ -9,22 +9,21 @@ import numpy as np
 import pytest
 
 from cadalign import Model, align, views_from
-from cadalign.datasets import Bundler, Colmap, CorrespondenceSet
+from cadalign.datasets import Colmap
 from cadalign.errors import InputError
 
 
-def opened(name: str) -> CorrespondenceSet:
+def opened() -> Colmap:
     if "CADALIGN_DATA" not in os.environ:
         pytest.skip("CADALIGN_DATA is not set")
-    root = Path(os.environ["CADALIGN_DATA"]) / "sfm"
+    root = Path(os.environ["CADALIGN_DATA"]) / "sfm" / "maupertuis_colmap"
     if not root.is_dir():
         pytest.skip(f"{root} does not exist")
-    return Colmap(root / name) if "colmap" in name else Bundler(root / name)
+    return Colmap(root)
 
 
-@pytest.mark.parametrize("name", ["maupertuis_colmap", "balbianello"])
-def test_points_of_the_scene_are_aligned_in_its_frame(name: str) -> None:
-    images = opened(name)
+def test_points_of_the_scene_are_aligned_in_its_frame() -> None:
+    images = opened()
     first, second = images[0], images[1]
     # The points that the fewest pixels of error have in both photos stand for an object.
     ids = [each.point_ids if each.point_ids is not None else None for each in (first, second)]
@@ -52,7 +51,7 @@ def test_points_of_the_scene_are_aligned_in_its_frame(name: str) -> None:
 
 
 def test_bad_keypoints_are_named() -> None:
-    images = opened("maupertuis_colmap")
+    images = opened()
     name = images.ids[0]
     with pytest.raises(InputError, match="no image"):
         views_from(images, {"nowhere.jpg": ([[1.0, 2.0]], [0])})

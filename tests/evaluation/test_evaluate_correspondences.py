@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from cadalign.cli import main
-from cadalign.datasets import BlindPnP, Bundler, Colmap, Correspondences, open_correspondences
+from cadalign.datasets import BlindPnP, Colmap, Correspondences, open_correspondences
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.fit import fit
 from cadalign.estimation.options import RansacOptions
@@ -99,14 +99,6 @@ def quat_wxyz(rotation: np.ndarray) -> list[float]:
     return np.linalg.eigh(matrix)[1][:, -1].tolist()
 
 
-def write_bundler(file: Path) -> Path:
-    """Write a Bundler model of one photo without points."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    camera = "500 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 0\n"
-    file.write_text(f"# Bundle file v0.3\n1 0\n{camera}")
-    return file
-
-
 def write_pickles(folder: Path, names: tuple[str, ...]) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for name in names:
@@ -140,12 +132,6 @@ class TestFormats:
         write_colmap(tmp_path / below)
         assert isinstance(open_correspondences(tmp_path), Colmap)
 
-    @pytest.mark.parametrize("name", ["bundle.out", "bundle/bundle.out", "house.out"])
-    def test_bundler_is_recognised_wherever_its_loader_looks(self, tmp_path, name):
-        file = write_bundler(tmp_path / name)
-        assert isinstance(open_correspondences(tmp_path), Bundler)
-        assert isinstance(open_correspondences(file), Bundler)
-
     @pytest.mark.parametrize("below", ["", "preprocessed"])
     @pytest.mark.parametrize("names", [("matches", "R", "t"), ("p2d", "p3d", "R_gt", "t_gt")])
     def test_blind_pnp_is_recognised_wherever_its_loader_looks(self, tmp_path, below, names):
@@ -156,21 +142,16 @@ class TestFormats:
     def test_a_format_can_be_named(self, colmap, format):
         assert open_correspondences(colmap, format=format).ids == ("0.jpg", "1.jpg")
 
-    def test_a_log_is_not_taken_for_a_bundler_file(self, tmp_path):
-        write_colmap(tmp_path)
-        (tmp_path / "job.out").write_text("started\n")
-        assert isinstance(open_correspondences(tmp_path), Colmap)
-
     def test_an_empty_folder_is_refused_and_says_what_was_sought(self, tmp_path):
-        with pytest.raises(DataError, match=r"known format.*points3D.*bundle\.out.*matches\.pkl"):
+        with pytest.raises(DataError, match=r"known format.*points3D.*matches\.pkl"):
             open_correspondences(tmp_path)
 
     def test_two_formats_in_one_folder_are_refused_unless_one_is_named(self, tmp_path):
         write_colmap(tmp_path)
-        write_bundler(tmp_path / "bundle.out")
-        with pytest.raises(DataError, match="files of colmap and bundler"):
+        write_pickles(tmp_path, ("matches", "R", "t"))
+        with pytest.raises(DataError, match="files of colmap and blind-pnp"):
             open_correspondences(tmp_path)
-        assert isinstance(open_correspondences(tmp_path, format="bundler"), Bundler)
+        assert isinstance(open_correspondences(tmp_path, format="blind-pnp"), BlindPnP)
 
     def test_of_an_incomplete_model_the_missing_file_is_named(self, tmp_path):
         write_colmap(tmp_path)
@@ -178,14 +159,12 @@ class TestFormats:
         with pytest.raises(DataError, match=r"points3D\.txt is missing"):
             open_correspondences(tmp_path)
 
-    def test_another_file_is_refused(self, colmap):
-        with pytest.raises(DataError, match="not a Bundler file"):
+    def test_a_missing_folder_a_file_and_an_unknown_format_are_refused(self, tmp_path, colmap):
+        with pytest.raises(DataError, match="no such folder"):
             open_correspondences(colmap / "images.txt")
-
-    def test_a_missing_folder_and_an_unknown_format_are_refused(self, tmp_path):
         with pytest.raises(DataError, match="no such folder"):
             open_correspondences(tmp_path / "nowhere")
-        with pytest.raises(InputError, match="known are auto, colmap, bundler, blind-pnp"):
+        with pytest.raises(InputError, match="known are auto, colmap, blind-pnp"):
             open_correspondences(tmp_path, format="nerf")
 
 
@@ -535,10 +514,9 @@ class TestCommand:
 
 
 @needs_data
-@pytest.mark.parametrize("name", ["maupertuis_colmap", "balbianello"])
 class TestRealModels:
     @pytest.mark.long
-    def test_the_robust_optimum_succeeds_where_others_do_not(self, name, tmp_path):
+    def test_the_robust_optimum_succeeds_where_others_do_not(self, tmp_path):
         options = CorrespondenceOptions(
             ANY,
             outliers=(0.0, 0.5),
@@ -552,7 +530,7 @@ class TestRealModels:
             ),
         )
         folder = RunFolder(tmp_path / "run")
-        run(Path(str(DATA)) / "sfm" / name, folder.path, options)
+        run(Path(str(DATA)) / "sfm" / "maupertuis_colmap", folder.path, options)
         found = {(s["outliers"], s.method): s for s in summarize(Run.open(folder.path))}
         for share in (0.0, 0.5):
             assert found[share, "ransac-optimal"]["success"] == 1
@@ -565,12 +543,12 @@ class TestRealModels:
         assert found[0.5, "aepnp-paper"]["success"] == 0
 
     @pytest.mark.long
-    def test_at_80_percent_outliers_four_points_suffice_and_six_do_not(self, name, tmp_path):
+    def test_at_80_percent_outliers_four_points_suffice_and_six_do_not(self, tmp_path):
         options = CorrespondenceOptions(
             ANY, outliers=(0.8,), draws=2, methods=("ransac-aepnp", "ransac-optimal")
         )
         folder = RunFolder(tmp_path / "run")
-        run(Path(str(DATA)) / "sfm" / name, folder.path, options)
+        run(Path(str(DATA)) / "sfm" / "maupertuis_colmap", folder.path, options)
         six, four = summarize(Run.open(folder.path))
         assert four["success"] == 1
         assert six["success"] < 0.5

@@ -212,7 +212,7 @@ def test_on_photos_and_correspondences(real_data: Path) -> None:
     assert table[table.method == "joint"].status.tolist().count("ok") == 2
     assert set(table.method) == {"joint", "linear"}
     table = cadalign.evaluate(
-        real_data / "sfm/balbianello",
+        real_data / "sfm/maupertuis_colmap",
         "correspondences",
         outliers=[0.0],
         draws=1,

@@ -103,7 +103,7 @@ def test_every_experiment_with_functions_takes_it(real_data: Path) -> None:
             {"methods": ["shape"], "categories": ["mug"], "max_models": 2},
         ),
         (
-            real_data / "sfm/balbianello",
+            real_data / "sfm/maupertuis_colmap",
             "correspondences",
             {"methods": ["aepnp"], "draws": 1, "max_images": 1, "outliers": [0.0]},
         ),

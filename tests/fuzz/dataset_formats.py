@@ -14,7 +14,7 @@ from fuzz.format import Format
 from PIL import Image
 from scipy.io import savemat
 from support.gltf_files import write_gltf
-from support.photo_data import matrix_text, message, read_whole, write_photo, write_text
+from support.photo_data import matrix_text, read_whole, write_photo, write_text
 from support.photo_sets import WRITERS
 
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
@@ -50,7 +50,6 @@ _CHANGED = {
     ),
     "KITTI": ("cars.json",),
     "PASCAL3D+": ("Annotations/chair_pascal/1.mat", "CAD/chair.mat"),
-    "Objectron": ("annotations/cup/batch-1/3.json",),
 }
 
 
@@ -93,22 +92,6 @@ def _write_detections(folder: Path) -> Path:
     savemat(root / "annot" / "valid.mat", {"annot": lists}, do_compression=True)
     write_photo(root / "images" / "a.jpg")
     return root / "annot" / "valid.mat"
-
-
-def _write_protobuf(folder: Path) -> Path:
-    """A frame of Objectron's protocol buffers."""
-    keypoints = [
-        (2, message((1, number), (3, message((1, 0.5), (2, 0.4), (3, 1.0))))) for number in range(9)
-    ]
-    camera = message((5, 320), (6, 240), (8, [2.0] * 16), (9, np.eye(4).ravel().tolist()))
-    found = message(
-        (1, 1), (2, "cup"), (4, np.eye(3).ravel().tolist()), (5, [0.0, 0.0, -2.0]), (6, [1.0] * 3)
-    )
-    frame = message((1, 0), (2, message((1, 1), *keypoints, (3, 0.9))), (3, camera))
-    path = folder / "set" / "annotations" / "cup" / "batch-1" / "3.pbdata"
-    path.parent.mkdir(parents=True)
-    path.write_bytes(message((1, found), (2, frame)))
-    return path
 
 
 def _write_car_shape(changed: str) -> Callable[[Path], Path]:
@@ -262,7 +245,6 @@ FORMATS = (
         for name in ("car_tracks.json", "meanShape_2.txt", "vectors2.txt")
     ),
     Format("PASCAL3D+ detections", _write_detections, lambda path: read_whole(path.parents[1])),
-    Format("Objectron pbdata", _write_protobuf, lambda path: read_whole(path.parents[3])),
     Format("shape", _write_shape, ShapeModel.open),
     Format("forged shape", _write_shape, ShapeModel.open, _seal_shape),
     Format(

@@ -22,7 +22,6 @@ import cadalign
 from cadalign import Alignment, Camera, FocalPrior, Library, Result, fit
 from cadalign.datasets import (
     BlindPnP,
-    Bundler,
     Colmap,
     KeypointNet,
     ModelKeypoints,
@@ -238,10 +237,6 @@ _MODEL_KEYPOINTS = {
 _CAMERAS = "# cameras\n1 PINHOLE 64 48 60 60 32 24\n2 OPENCV 64 48 60 60 32 24 .1 0 0 0\n"
 _IMAGES = "1 1 0 0 0 0 0 3 1 a.jpg\n10 10 1 20 20 2 5 5 -1\n2 .5 .5 .5 .5 0 0 3 2 b.jpg\n\n"
 _SCENE_POINTS = "1 0.1 0.2 0.3 255 0 0 0.5 1 0\n2 -.1 .2 .1 0 0 255 0.1 1 1 2 0\n"
-_BUNDLER = (
-    "# Bundle file v0.3\n1 2\n60 0 0\n1 0 0\n0 1 0\n0 0 1\n0 0 -3\n"
-    ".1 .2 .3\n255 0 0\n1 0 0 5 5\n-.1 .2 .3\n0 0 0\n1 0 1 -5 5\n"
-)
 
 
 def _colmap_text(changed: str) -> Callable[[Path], Path]:
@@ -369,11 +364,6 @@ FORMATS = {
                 lambda path: _drain(Colmap(path.parent)),
             )
             for name in ("cameras", "images", "points3D")
-        ),
-        Format(
-            "bundler",
-            _text("bundle.out", _BUNDLER),
-            lambda path: _drain(Bundler(path, sizes=(64, 48))),
         ),
         Format("blind pnp", _write_blind_pnp, lambda path: _drain(BlindPnP(path.parent))),
         Format("fit", _write_fit, _read_fit),

@@ -18,12 +18,10 @@ from cadalign import Camera, FocalPrior, Library, Result, Results, ShapeModel
 from cadalign.datasets import (
     BlindPnP,
     Bop,
-    Bundler,
     Colmap,
     KeypointNet,
     KittiCars,
     ModelKeypoints,
-    Objectron,
     Pascal3D,
     Pascal3DDetections,
     Pix3D,
@@ -39,7 +37,6 @@ from cadalign.datasets.photos.bop_files import read_bop_results
 from cadalign.datasets.photos.dataset import read_list, read_table
 from cadalign.datasets.photos.kitti import read_labels
 from cadalign.datasets.photos.mat_files import read_structs
-from cadalign.datasets.photos.objectron_files import read_sequence
 from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.datasets.sfm.unpickling import load_pickle
 from cadalign.errors import CadalignError, DataError, InputError
@@ -80,7 +77,6 @@ READERS = [
     *same(".json", read=read_table),
     *same(".txt", read=lambda path: read_matrix(path, (3, 3))),
     *same(".txt", read=lambda path: read_labels(path, tracking=False)),
-    *same(".pbdata", ".json", read=read_sequence),
     *same(".csv", read=read_bop_results),
 ]
 
@@ -157,9 +153,9 @@ class Opened:
 @pytest.mark.parametrize(
     "read",
     [
-        *dict.fromkeys(each.read for each in READERS if each.read is not read_sequence),
-        *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections, Objectron),
-        *(KittiCars, Bop, PosedPhotos, Colmap, Bundler, BlindPnP, open_correspondences),
+        *dict.fromkeys(each.read for each in READERS),
+        *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections),
+        *(KittiCars, Bop, PosedPhotos, Colmap, BlindPnP, open_correspondences),
         *(open_photos, ModelKeypoints.load, Result.load, Results.open),
         *(FocalPrior.from_exif, photo_size),
     ],

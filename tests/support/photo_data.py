@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -168,36 +167,6 @@ def write_bop(root: Path, *, photos: int = 2, images: bool = True) -> np.ndarray
     write_json(root / "models" / "models_info.json", {"1": entry})
     write_text(root / "models" / "obj_000001.ply", TETRAHEDRON_PLY)
     return pose
-
-
-# --- protocol buffers ------------------------------------------------------------------------
-
-
-def varint(value: int) -> bytes:
-    """A protocol buffer's varint."""
-    found = bytearray()
-    while True:
-        byte, value = value & 0x7F, value >> 7
-        found.append(byte | (0x80 if value else 0))
-        if not value:
-            return bytes(found)
-
-
-def field(number: int, value: Any) -> bytes:
-    """One field: int as varint, float as 32 bits, text, bytes of a message, or packed floats."""
-    if isinstance(value, bool | int):
-        return varint(number << 3) + varint(int(value))
-    if isinstance(value, float):
-        return varint(number << 3 | 5) + struct.pack("<f", value)
-    if isinstance(value, list):
-        value = struct.pack(f"<{len(value)}f", *value)
-    data = value.encode() if isinstance(value, str) else value
-    return varint(number << 3 | 2) + varint(len(data)) + data
-
-
-def message(*fields: tuple[int, Any]) -> bytes:
-    """A message of fields."""
-    return b"".join(field(number, value) for number, value in fields)
 
 
 # --- damage ----------------------------------------------------------------------------------

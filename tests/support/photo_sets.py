@@ -214,34 +214,11 @@ def _write_record(path: Path, found: dict[str, Any]) -> None:
     savemat(path, {"record": record})
 
 
-def write_objectron(root: Path) -> Path:
-    """One frame of a cup."""
-    alignment = pose(0, scale=SIDES)
-    cv_from_sensor = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    # The upright photo is 240 x 320; the sensor's world has y up.
-    rotation = cv_from_sensor.T @ alignment.rotation
-    shift = cv_from_sensor.T @ alignment.translation
-    projection = [2.0, 0, 0, 0, 0, 2.6, 0, 0, 0, 0, -1, -0.002, 0, 0, -1, 0]
-    keypoints = [{"id": k, "point2d": {"x": 0.5, "y": 0.5, "depth": 1.0}} for k in range(9)]
-    camera = {
-        "imageResolutionWidth": 320, "imageResolutionHeight": 240, "projectionMatrix": projection,
-        "viewMatrix": np.eye(4).ravel().tolist(),
-    }  # fmt: skip
-    found = {"id": 1, "category": "cup", "rotation": rotation.ravel().tolist(),
-             "translation": shift.tolist(), "scale": SIDES.tolist()}  # fmt: skip
-    annotations = [{"objectId": 1, "keypoints": keypoints, "visibility": 0.9}]
-    frame = {"frameId": 0, "annotations": annotations, "camera": camera}
-    path = root / "annotations" / "cup" / "batch-1" / "3.json"
-    write_json(path, {"objects": [found], "frameAnnotations": [frame]})
-    return root
-
-
 WRITERS = {
     "Pix3D": write_pix3d,
     "BOP": write_bop,
     "Scan2CAD": write_scan2cad,
     "KITTI": write_kitti,
     "PASCAL3D+": write_pascal3d,
-    "Objectron": write_objectron,
 }
 """What writes a data set of each kind."""

@@ -51,9 +51,9 @@ class CorrespondenceOptions(FunctionOptions):
     experiment = "correspondences"
 
     path: Annotated[Path, tyro.conf.Positional]
-    """Folder of a COLMAP or Bundler model, or of a blind-PnP data set's split."""
+    """Folder of a COLMAP model, or of a blind-PnP data set's split."""
     _: KW_ONLY
-    format: Literal["auto", "colmap", "bundler", "blind-pnp"] = "auto"
+    format: Literal["auto", "colmap", "blind-pnp"] = "auto"
     """Format of the folder; auto goes by the names of the files."""
     outliers: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
     """Shares of the image points that are moved, from 0 to less than 1."""

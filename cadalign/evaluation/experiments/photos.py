@@ -66,7 +66,7 @@ COLUMNS: Columns = (
 class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
-    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP, KITTI or Objectron. Keypoints
+    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP or KITTI. Keypoints
     are the annotated or detected ones; where there are none, visible points of the model's mesh are
     projected with the true pose, with noise, and called simulated. The model's width (x) is given,
     as one image leaves size open; with depth, or a shape model in metres, it is estimated. The

@@ -73,7 +73,7 @@ def sight(target: PhotoTarget, protocol: Protocol, options: KeypointOptions) -> 
         raise LeftOutError("no model is annotated for the object")
     model = cad.model.load_keypoints()
     marks = target.found.keypoints
-    if marks is not None and model is not None and not protocol.marks_are_truth:
+    if marks is not None and model is not None:
         source = ANNOTATED if marks.scores is None else DETECTED
         names, pixels = _marked(target.found, model, options.min_score)
     else:

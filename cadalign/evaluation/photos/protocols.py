@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 from cadalign.datasets.photos.bop import Bop
 from cadalign.datasets.photos.kitti import KittiCars
-from cadalign.datasets.photos.objectron import Objectron
 from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.posed_photos import PosedPhotos
@@ -146,7 +145,6 @@ class Protocol:
     """Standard deviation of its keypoints as a share of the longer side of the object's rectangle:
     networks' heatmaps have 64 cells."""
     sigma_of_width: float | None = None  # the same as a share of the image's width
-    marks_are_truth: bool = False  # its keypoints are projections of the truth: noise is added
 
 
 _EXACT = Protocol((VIEWPOINT, BOP, NINE_DOF), RIGID, up_axis="z")
@@ -159,7 +157,6 @@ _PROTOCOLS = {
     KittiCars.kind: Protocol((VIEWPOINT, KITTI), SHAPE, up_axis="z"),
     Pascal3D.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
     Pascal3DDetections.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
-    Objectron.kind: Protocol((VIEWPOINT, NINE_DOF), STRETCHED, marks_are_truth=True),
 }
 _OTHER = Protocol((VIEWPOINT, NINE_DOF), PRIOR)
 

@@ -59,7 +59,6 @@ OWN = {
     "Scan2CAD": {"rotation_error_deg", "box_iou", "scan2cad_aligned", "scan2cad_aligned_axes"},
     "KITTI": {"yaw_error_deg", "depth_error_relative", "iou_3d", "iou_bev"},
     "PASCAL3D+": {"rotation_error_deg"},
-    "Objectron": {"rotation_error_deg", "translation_cm", "box_iou"},
 }
 """Some metrics of each data set's own."""
 
@@ -100,14 +99,14 @@ class TestTruth:
     def test_is_found_from_the_keypoints_alone(self, tmp_path: Path, kind: str) -> None:
         """Where models are exact, keypoints too: what methods are given fits the truth."""
         WRITERS[kind](tmp_path / "data")
-        method = "stretched" if kind in ("Scan2CAD", "Objectron") else "rigid"
+        method = "stretched" if kind == "Scan2CAD" else "rigid"
         found = done(tmp_path / "data", tmp_path / "run", methods=(method,), simulated_noise_px=0.0)
         for row in rows_of(found, method):
             assert row["status"] == "ok", row["reason"]
             assert row["rotation_error_deg"] < 1.0
             assert row["rms_px"] < 0.6
             assert row["source"] == {"KITTI": "detected"}.get(
-                kind, "simulated" if kind in ("BOP", "Objectron") else "annotated"
+                kind, "simulated" if kind == "BOP" else "annotated"
             )
 
 

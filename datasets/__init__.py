@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         CORRESPONDENCE_FORMATS,
         open_correspondences,
         open_photos,
-        write_photos,
     )
     from cadalign.datasets.formats import open_photos as open  # noqa: F401
     from cadalign.datasets.models.keypointnet import AnnotatedModel, KeypointNet
@@ -80,7 +79,6 @@ __all__ = [
     "open_photos",
     "read_image_keypoints",
     "sample_models",
-    "write_photos",
     "write_sample_dataset",
 ]
 

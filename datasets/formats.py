@@ -1,21 +1,18 @@
-"""Formats of photos and of correspondences: which one lies in a folder, opening and writing it."""
+"""Formats of photos and of correspondences: which one lies in a folder, and opening it."""
 
 from __future__ import annotations
 
 import os
-import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from cadalign.datasets.photos import bop, kitti, pascal3d, pix3d, posed_photos, scan2cad
-from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat
-from cadalign.datasets.photos.photo import Photo
-from cadalign.datasets.photos.placed import placed_objects
+from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.sfm import blind_pnp, colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
-from cadalign.errors import DataError, InputError, all_left_out, unknown
-from cadalign.io.files import as_path, writing
+from cadalign.errors import DataError, InputError
+from cadalign.io.files import as_path
 
 PHOTO_FORMATS = (
     scan2cad.FORMAT,
@@ -29,9 +26,7 @@ PHOTO_FORMATS = (
 """The known formats, in the order in which they are looked for."""
 
 
-def open_photos(
-    path: str | os.PathLike[str], *, formats: Sequence[PhotoFormat] = PHOTO_FORMATS
-) -> PhotoDataset:
+def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     """Open the data set of photos that lies in a folder, whichever format it has.
 
     Parameters
@@ -39,8 +34,6 @@ def open_photos(
     path : str or path-like
         The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Bop`, `KittiCars`,
         `Pascal3D`, `Pascal3DDetections`, `PosedPhotos`.
-    formats : sequence of PhotoFormat
-        The formats that are looked for, in this order.
 
     Returns
     -------
@@ -61,76 +54,12 @@ def open_photos(
     folder = as_path(path)
     if "\0" in str(path) or not folder.is_dir():
         raise DataError("no such folder", where=repr(str(path)), fix="give a data set's folder")
-    for each in formats:
+    for each in PHOTO_FORMATS:
         if each.is_here(folder):
             return each.open(folder)
     what = "no data set of photos is recognised in this folder"
-    fix = f"known are: {'; '.join(each.signature for each in formats)}"
+    fix = f"known are: {'; '.join(each.signature for each in PHOTO_FORMATS)}"
     raise DataError(what, where=str(folder), fix=fix)
-
-
-def write_photos(
-    path: str | os.PathLike[str],
-    photos: Iterable[Photo],
-    form: str,
-    *,
-    formats: Sequence[PhotoFormat] = PHOTO_FORMATS,
-) -> tuple[InputError, ...]:
-    """Write photos as a data set that `open_photos` reads: from annotations, or another data set.
-
-    Each object becomes a photo of its own. Poses, keypoints, cameras and photos are read back as
-    they were given, and masks where the form has them. Forms without a stretch (Pix3D, BOP) have
-    the stretched mesh as the model; KITTI has boxes that stand upright alone. Written lengths are
-    metres (`Truth.metres`) or, in BOP, millimetres.
-
-    Parameters
-    ----------
-    path : str or path-like
-        A new or empty folder.
-    photos : iterable of Photo
-    form : str
-        The `PhotoFormat.name` of a format with a writer: pix3d, bop, scan2cad, kitti.
-    formats : sequence of PhotoFormat
-        The formats that are known.
-
-    Returns
-    -------
-    tuple of InputError
-        Why some of the objects were left out: they lack something, or the form cannot hold them.
-
-    Raises
-    ------
-    InputError
-        If the form is unknown, or there is no object that it can hold.
-    DataError
-        If the folder has files or cannot be written to, or a photo cannot be read.
-
-    Examples
-    --------
-    >>> write_photos("pix3d", cadalign.datasets.open("lmo"), "pix3d")  # doctest: +SKIP
-    ()
-    """
-    folder = as_path(path)
-    writers = {each.name: each.write for each in formats if each.write is not None}
-    if form not in writers:
-        raise unknown("form", form, writers)
-    photos = list(photos)
-    count = sum(len(photo.objects) for photo in photos)
-    if not count:
-        raise InputError("there is no object to write", where="photos")
-    with writing(folder):
-        if folder.exists() and any(folder.iterdir()):
-            raise DataError("the folder is not empty", where=str(folder), fix="give a new one")
-        folder.mkdir(parents=True, exist_ok=True)
-    problems: list[InputError] = []
-    try:
-        problems += writers[form](folder, placed_objects(photos, problems))
-        if len(problems) == count:
-            raise all_left_out(problems)
-    except BaseException:  # what is half written would be in the way of another try
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    return tuple(problems)
 
 
 @dataclass(frozen=True)

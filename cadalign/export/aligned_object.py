@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -11,15 +10,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from cadalign.arrays import FloatArray, as_floats, as_points, as_positive
-from cadalign.datasets.formats import PHOTO_FORMATS, write_photos
-from cadalign.datasets.photos.photo import (
-    CadModel,
-    NamedPoints,
-    Photo,
-    PhotoKeypoints,
-    PhotoObject,
-    Truth,
-)
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import extent
@@ -63,11 +53,6 @@ class ExportView:
             object.__setattr__(self, "image", Path(self.image))
         points = as_floats(self.points_2d, name="points_2d", shape=(len(self.ids), 2))
         object.__setattr__(self, "points_2d", points)
-
-    @property
-    def image_name(self) -> str:
-        """The photo's file name; empty where it is no file."""
-        return self.image.name if isinstance(self.image, Path) else ""
 
     def read_image(self) -> ByteImage | None:
         """The photo's pixels, None where there is none.
@@ -207,67 +192,3 @@ class AlignedObject:
         """The mesh, stretched and placed in a frame [units of the camera frame]."""
         mesh, placing = self.require_mesh(), self.frame_from_model(frame)
         return replace(mesh, vertices=placing.apply(mesh.vertices))
-
-
-def names_of(photos: Iterable[object]) -> dict[object, str]:
-    """Names of the photos that are files, relative to the folder that holds them all."""
-    paths = {photo: Path(os.path.abspath(photo)) for photo in photos if isinstance(photo, Path)}
-    root = os.path.commonpath([path.parent for path in paths.values()]) if paths else ""
-    return {photo: path.relative_to(root).as_posix() for photo, path in paths.items()}
-
-
-def photos_of(
-    exported: AlignedObject, *, category: str = "object", mask: Path | None = None
-) -> tuple[Photo, ...]:
-    """The views of an aligned object as photos of a data set.
-
-    Parameters
-    ----------
-    exported : AlignedObject
-    category : str
-        What the object is.
-    mask : Path, optional
-        Image of the object's pixels.
-    """
-    names = tuple(str(name) for name in exported.ids)
-    model = CadModel(
-        exported.name,
-        exported.mesh,
-        NamedPoints(names, exported.points_3d),
-        bounds=exported.bounds if exported.mesh or names else None,
-    )
-    photos = []
-    for number, view in enumerate(exported.views):
-        marked = tuple(str(name) for name in view.ids)
-        found = PhotoObject(
-            object_id="0",
-            category=category,
-            truth=Truth(view.cam_from_model, metres=exported.metres),
-            keypoints=PhotoKeypoints(view.points_2d, marked, np.ones(len(marked), dtype=bool)),
-            model=model,
-            mask_path=mask,
-        )
-        image = view.image if isinstance(view.image, Path) else None
-        name = view.image_name or f"{number}.png"
-        photos.append(Photo(name, image, view.camera, (found,)))
-    return tuple(photos)
-
-
-FORMS = tuple(each.name for each in PHOTO_FORMATS if each.write is not None)
-"""Names of the forms."""
-
-
-def write_photo_set(folder: Path, photos: Sequence[Photo], form: str) -> tuple[InputError, ...]:
-    """Write annotated photos as a data set; see `cadalign.datasets.write_photos`.
-
-    Raises
-    ------
-    InputError
-        If the form is unknown, or there is no photo that it can hold.
-    DataError
-        If the folder has files, or cannot be written to.
-    """
-    if not photos and form in FORMS:
-        fix = "place at least four pairs"
-        raise InputError("no photo has an alignment yet", where="export", fix=fix)
-    return write_photos(folder, photos, form)

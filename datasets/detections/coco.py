@@ -1,4 +1,4 @@
-"""COCO: keypoints in images, read from its JSON and what detectors make of it, written; masks.
+"""COCO: keypoints in images, read from its JSON and what detectors make of it; masks.
 
 The forms that are read are described in docs/formats/detections.md.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from msgspec import Meta, field
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.datasets.models.model_keypoints import FORMAT as MODEL_KEYPOINTS_FORMAT
 from cadalign.datasets.photos.dataset import leaving_out
@@ -344,59 +344,3 @@ def _fill(polygons: Sequence[Sequence[float]], width: int, height: int) -> BoolA
     )
     with warnings.catch_warnings(action="ignore"):  # its of NumPy's newer conventions
         return np.asarray(mask.decode(runs) != 0)
-
-
-# Writing ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class CocoObject:
-    """One object's keypoints, as an annotation of COCO."""
-
-    image: int  # row of its image in the document
-    category: int  # row of its category
-    points_2d: FloatArray  # (k, 2), pixels of all keypoints of the category
-    flags: IntArray
-    """(k,), 2 for keypoints that are observed, 1 for inferred ones; 0 for others, whose pixels
-    don't count."""
-    rectangle: FloatArray  # (4,), left, top, right and bottom
-    track: int | None = None  # of the object through the images of a video
-
-    def annotation(self, number: int) -> dict[str, Any]:
-        """The annotation of a number."""
-        left, top, right, bottom = self.rectangle.tolist()
-        pixels = np.where(self.flags[:, None] > 0, self.points_2d, 0.0).tolist()
-        rows = zip(pixels, self.flags.tolist(), strict=True)
-        return {
-            **({} if self.track is None else {"track_id": self.track}),
-            "id": number,
-            "image_id": self.image,
-            "category_id": 1 + self.category,
-            "keypoints": [value for (x, y), flag in rows for value in (x, y, flag)],
-            "num_keypoints": int(np.count_nonzero(self.flags)),
-            "bbox": [left, top, right - left, bottom - top],
-            "area": (right - left) * (bottom - top),
-            "iscrowd": 0,
-        }
-
-
-def coco_document(
-    images: Iterable[tuple[str, int, int]],
-    categories: Iterable[tuple[str, Sequence[str]]],
-    objects: Iterable[CocoObject],
-) -> dict[str, Any]:
-    """Keypoints as COCO's JSON.
-
-    Images are file names with width and height, categories names with the names of their keypoints.
-    """
-    return {
-        "images": [
-            {"id": row, "file_name": name, "width": width, "height": height}
-            for row, (name, width, height) in enumerate(images)
-        ],
-        "categories": [
-            {"id": number, "name": name, "keypoints": list(points), "skeleton": []}
-            for number, (name, points) in enumerate(categories, start=1)
-        ],
-        "annotations": [each.annotation(number) for number, each in enumerate(objects, start=1)],
-    }

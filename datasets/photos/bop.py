@@ -7,9 +7,7 @@ bop_toolkit's ``docs/bop_datasets_format.md``.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,23 +20,17 @@ from cadalign.datasets.photos.bop_files import (
     Nine,
     ScenePose,
     object_name,
-    stored_table,
-    write_model,
-    write_models_info,
-    write_scene_gt,
 )
 from cadalign.datasets.photos.dataset import (
     PhotoDataset,
     PhotoFormat,
-    PoseEstimate,
     leaving_out,
     parse,
     read_each,
     read_table,
 )
 from cadalign.datasets.photos.photo import DepthImage, Photo, PhotoObject, Truth, first_existing
-from cadalign.datasets.photos.placed import PlacedObject, converted
-from cadalign.errors import DataError, InputError, quote
+from cadalign.errors import DataError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.symmetry import Symmetry
@@ -51,7 +43,7 @@ from cadalign.io.documents import (
     in_file,
     read_json,
 )
-from cadalign.io.files import as_path, made_folder, write_json
+from cadalign.io.files import as_path
 from cadalign.io.images import photo_size
 
 MILLIMETRES = 1e-3
@@ -61,7 +53,6 @@ _CAMERA = "camera.json"
 _MASK_FOLDERS = ("mask_visib", "mask")
 _MOST_DIGITS = 18
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif")
-_WRITTEN_SCENE = Path("test", "000001")
 
 
 class _Info(ForeignDocument):
@@ -236,73 +227,8 @@ def _common_camera(folder: Path) -> _SceneCamera | None:
     return None
 
 
-def write_bop(folder: Path, numbered: Iterable[tuple[int, PlacedObject]]) -> list[InputError]:
-    """Write objects as one scene, a photo for each, with the stretched meshes [mm] as its models.
-
-    Each object has a model of its own, ``obj_000001`` and so on: poses have no stretch. Returns
-    why objects were left out.
-    """
-    entries, problems = converted(numbered, partial(_written, folder))
-    poses = [pose for pose, *_ in entries]
-    write_models_info(folder, {int(pose.model_id): model for pose, _, model, _ in entries})
-    scene = folder / _WRITTEN_SCENE
-    write_scene(scene, poses, scene_cameras(scene, {pose.image: c for pose, c, *_ in entries}))
-    write_json(scene / _INFO, {pose.image: [info] for pose, *_, info in entries})
-    return problems
-
-
-def _written(
-    folder: Path, number: int, placed: PlacedObject
-) -> tuple[PoseEstimate, Camera, dict[str, float], dict[str, list[float]]]:
-    """An object's pose and camera, and its entries in the tables of models and of objects."""
-    placed.require_plain_camera("BOP")
-    scene, model_id = folder / _WRITTEN_SCENE, number + 1
-    left, top, right, bottom = placed.bbox.tolist()
-    mesh = placed.mesh.stretched(placed.scale / MILLIMETRES)
-    placed.copy_image(scene / "rgb" / f"{number:06d}")
-    placed.write_mask(scene / "mask_visib" / f"{number:06d}_000000.png")
-    pose = replace(placed.pose, translation=placed.pose.translation / MILLIMETRES)
-    estimate = PoseEstimate("1", str(number), str(model_id), pose)
-    info = {"bbox_obj": [left, top, right - left, bottom - top]}
-    return estimate, placed.camera, write_model(folder, mesh, model_id), info
-
-
-def scene_cameras(folder: Path, cameras: Mapping[str, Camera]) -> dict[str, dict[str, Any]]:
-    """The entries of ``scene_camera.json`` with those of photos named by their numbers.
-
-    Raises InputError if a camera has lens distortion, which the format lacks, DataError if a photo
-    is there with another camera.
-    """
-    path = folder / _CAMERAS
-    table = stored_table(path, dict[str, Any])
-    for number, (image, camera) in enumerate(cameras.items()):
-        if camera.distortion:
-            fix = "undistort the photo and fit again, or export the result CSV alone"
-            what = "BOP's camera files have no place for lens distortion"
-            raise InputError(what, where=f"views[{number}].camera", fix=fix)
-        entry = {"cam_K": camera.matrix.ravel().tolist(), "depth_scale": 1.0}
-        if table.setdefault(image, entry).get("cam_K") != entry["cam_K"]:
-            fix = "give another image_id, or another folder"
-            raise DataError(f"photo {image} has another camera", where=str(path), fix=fix)
-    return table
-
-
-def write_scene(
-    folder: Path, poses: Iterable[PoseEstimate], cameras: Mapping[str, dict[str, Any]]
-) -> None:
-    """Write ``scene_gt.json``, where other objects are kept, and ``scene_camera.json``.
-
-    Raises InputError if a pose has a stretch, which the format lacks.
-    """
-    made_folder(folder)
-    write_json(folder / _CAMERAS, cameras)
-    write_scene_gt(folder / TRUTH, poses)
-
-
 FORMAT = PhotoFormat(
-    "bop",
     f"BOP: {TRUTH}, in the folder or one or two below",
     lambda folder: next(find_scenes(folder), None) is not None,
     Bop,
-    write_bop,
 )

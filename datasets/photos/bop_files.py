@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Hashable, Iterable, Iterator, Mapping
-from dataclasses import replace
-from itertools import count
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +21,6 @@ from cadalign.datasets.photos.dataset import PoseEstimate
 from cadalign.datasets.photos.photo import CadModel, existing
 from cadalign.errors import CadalignError, DataError, InputError, brief, quote
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.mesh import Mesh
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.geometry.symmetry import Symmetry, SymmetryAxis
 from cadalign.io.documents import (
@@ -38,13 +34,8 @@ from cadalign.io.documents import (
     within,
 )
 from cadalign.io.files import (
-    made_folder,
-    read_bytes,
     read_text,
-    write_json,
-    write_text,
 )
-from cadalign.io.meshes.files import ply_mesh, write_ply_mesh
 
 TRUTH = "scene_gt.json"
 RESULT_COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
@@ -81,68 +72,6 @@ Estimates = tuple[tuple[PoseEstimate, ...], tuple[DataError, ...]]
 def object_name(number: int) -> str:
     """The name of a model's files, as ``obj_000001``."""
     return f"obj_{number:06d}"
-
-
-def photo_numbers(photos: Iterable[Hashable]) -> dict[Hashable, int]:
-    """The numbers of different photos by their paths, or by what else stands for one.
-
-    A photo's number is its file's name, where that is one that no photo before it has; the others
-    have those that are left, from 0.
-    """
-    known = dict.fromkeys(photos)
-    named: dict[int, Hashable] = {}
-    for photo in known:
-        if isinstance(photo, Path) and photo.stem.isdecimal():
-            named.setdefault(int(photo.stem), photo)
-    numbers = {photo: number for number, photo in named.items()}
-    free = (number for number in count() if number not in named)
-    return numbers | {photo: next(free) for photo in known if photo not in numbers}
-
-
-def write_bop_results(path: Path, poses: Iterable[PoseEstimate]) -> None:
-    """Write poses as the CSV file of results that the BOP challenge takes.
-
-    Their ids are numbers; models may be called ``obj_000001``. Translations are millimetres. Raises
-    InputError if an id is not a number, or a pose has a stretch.
-    """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(RESULT_COLUMNS)
-    for number, each in enumerate(poses):
-        rotation, translation = _rigid(each, number)
-        ids = _numbers(replace(each, scene=each.scene or "0"), number, "scene", "image", "model_id")
-        seconds = _UNKNOWN_TIME if each.seconds is None else each.seconds
-        numbers = (" ".join(f"{x:.17g}" for x in values) for values in (rotation, translation))
-        writer.writerow([*ids, f"{each.score:.17g}", *numbers, f"{seconds:.17g}"])
-    write_text(path, text.getvalue())
-
-
-def write_scene_gt(path: Path, poses: Iterable[PoseEstimate]) -> None:
-    """Write poses of one scene as ``scene_gt.json``; see `write_bop_results`.
-
-    In a file that is there, they take the place of the same objects' in the same photos.
-    """
-    added: dict[str, list[dict[str, Any]]] = {}
-    for number, each in enumerate(poses):
-        rotation, translation = _rigid(each, number)
-        obj_id, image = _numbers(each, number, "model_id", "image")
-        pose = {"cam_R_m2c": rotation.tolist(), "cam_t_m2c": translation.tolist()}
-        added.setdefault(str(image), []).append({**pose, "obj_id": obj_id})
-    table = stored_table(path, list[dict[str, Any]])
-    for key, new in added.items():
-        written = {each["obj_id"] for each in new}
-        table[key] = [e for e in table.get(key, ()) if e.get("obj_id") not in written] + new
-    write_json(path, {key: table[key] for key in sorted(table, key=lambda key: (len(key), key))})
-
-
-def stored_table(path: Path, kind: Any) -> dict[str, Any]:
-    """The entries, by their numbers, of a file that is added to; none where there is no file.
-
-    Raises DataError if the file is no such table.
-    """
-    with in_file(path):
-        table: dict[str, Any] = convert(read_json(path) if path.exists() else {}, dict[str, kind])
-    return table
 
 
 def read_bop_results(path: Path) -> Estimates:
@@ -230,31 +159,11 @@ def _alignment(rotation: FloatArray, translation: FloatArray) -> Alignment:
     return Alignment(turn, translation, np.ones(3), is_valid=True)
 
 
-def _rigid(each: PoseEstimate, number: int) -> tuple[FloatArray, FloatArray]:
-    pose = each.cam_from_model
-    if np.abs(pose.scale - 1).max() > 1e-12:
-        scale = pose.scale.tolist()
-        what = f"the pose has the stretch {scale}, which BOP's files have no place for"
-        fix = "stretch the mesh, write that, and give the pose with scale 1"
-        raise InputError(what, where=f"poses[{number}]", fix=fix)
-    return pose.rotation.ravel(), pose.translation
-
-
 def _number(text: str, where: str) -> int:
     if not (text.isdecimal() and int(text) <= _MAX_ID):
         what = f"{where} {quote(text)} is not a whole number from 0 to {_MAX_ID}"
         raise InputError(what, where=where, fix="BOP's files number scenes, images and models")
     return int(text)
-
-
-def _numbers(pose: PoseEstimate, number: int, *fields: str) -> Iterator[int]:
-    for field in fields:
-        text = getattr(pose, field)
-        text = text.removeprefix("obj_") if field == "model_id" else text
-        yield _number(text, f"poses[{number}].{field}")
-
-
-# Models ----------------------------------------------------------------------------------------
 
 
 class _Axis(ForeignDocument):
@@ -331,45 +240,3 @@ class BopModels:
             model = CadModel(name, mesh, bounds=info.bounds(), diameter=info.diameter)
             self._known[obj_id] = model, symmetry
         return self._known[obj_id]
-
-
-def write_model(folder: Path, mesh: Mesh, number: int) -> dict[str, float]:
-    """Write a mesh [mm] into ``models``; returns its entry for `write_models_info`.
-
-    Raises DataError if another mesh has this number: poses that are there are of that one.
-    """
-    path = folder / _MODEL_FOLDERS[0] / f"{object_name(number)}.ply"
-    if not path.exists():
-        write_ply_mesh(path, mesh)
-    elif read_bytes(path) != ply_mesh(mesh):
-        fix = "give another object_id, or another folder"
-        raise DataError("holds another mesh", where=str(path), fix=fix)
-    low, high = mesh.bounds
-    info = {"diameter": _diameter(mesh)}
-    for axis, least, size in zip("xyz", low.tolist(), (high - low).tolist(), strict=True):
-        info |= {f"min_{axis}": least, f"size_{axis}": size}
-    return info
-
-
-def write_models_info(folder: Path, entries: Mapping[int, dict[str, float]]) -> None:
-    """Add entries of models to ``models/models_info.json``; those of others are kept.
-
-    Raises DataError if the file with the other models cannot be read.
-    """
-    path = folder / _MODEL_FOLDERS[0] / _MODELS_INFO
-    table = stored_table(path, Any)
-    made_folder(path.parent)
-    write_json(path, table | {str(number): each for number, each in entries.items()})
-
-
-def _diameter(mesh: Mesh) -> float:
-    from scipy.spatial import ConvexHull, QhullError  # only writing needs SciPy
-    from scipy.spatial.distance import pdist
-
-    points = mesh.vertices[mesh.is_used]
-    try:
-        points = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # a flat mesh
-        points = np.unique(points, axis=0)
-    points = points[:: max(1, -(-len(points) // _HULL_POINTS))]
-    return float(pdist(points).max(initial=0.0))

@@ -17,8 +17,7 @@ import numpy as np
 from msgspec import Raw
 
 from cadalign.datasets.photos.photo import Photo, PhotoObject
-from cadalign.datasets.photos.placed import PlacedObject
-from cadalign.errors import CadalignError, DataError, InputError, brief
+from cadalign.errors import CadalignError, DataError, brief
 from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import convert, in_file
 from cadalign.io.files import damaged, read_bytes
@@ -202,18 +201,14 @@ class PhotoDataset(ABC):
 
 @dataclass(frozen=True)
 class PhotoFormat:
-    """A format of data sets of photos: how it is recognised, read and written."""
+    """A format of data sets of photos: how it is recognised and read."""
 
-    name: str
-    """Its short name, which `write_photos` knows it by."""
     signature: str
     """What it is recognised by, for messages."""
     is_here: Callable[[Path], bool]
     """Whether a folder holds it."""
     open: Callable[[Path], PhotoDataset]
     """Makes the data set of the folder."""
-    write: Callable[[Path, Iterable[tuple[int, PlacedObject]]], list[InputError]] | None = None
-    """Writes objects with their numbers into a folder; returns why some cannot be held."""
 
 
 def has(*patterns: str) -> Callable[[Path], bool]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,10 +26,8 @@ from cadalign.datasets.photos.kitti_keypoints import (
     car_box,
     list_cars,
     list_tracks,
-    yaw_of_car,
 )
 from cadalign.datasets.photos.photo import Photo, PhotoObject, Truth, existing
-from cadalign.datasets.photos.placed import PlacedObject, list_writer
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
@@ -240,42 +237,8 @@ def read_projection(path: Path, size: tuple[int, int]) -> tuple[Camera, FloatArr
         raise damaged("P2 is not the matrix of a camera", path) from None
 
 
-def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
-    """Entry of `cars.json` with a box that stands upright before a level camera.
-
-    A model whose y is up is taken to face -z, as ShapeNet's do; one whose z is up to face -y.
-    """
-    placed.require_plain_camera("KITTI")
-    pose = placed.pose
-    is_z_up = (pose.rotation[:, 2] @ UP) > (pose.rotation[:, 1] @ UP)
-    car_from_model = np.eye(3) if is_z_up else _CAR_FROM_Y_UP
-    cam_from_car: FloatArray = pose.rotation @ car_from_model.T
-    tilt = np.degrees(np.arccos(np.clip(cam_from_car[:, 2] @ UP, -1, 1)))
-    if tilt > _MOST_TILT:
-        what = f"KITTI's boxes stand upright, but this one is tilted by {tilt:.0f} degrees"
-        raise InputError(what, where=placed.photo.name, fix="choose another form, such as bop")
-    width, length, height = np.abs(car_from_model @ placed.sides).tolist()
-    image = placed.copy_image(folder / "images" / f"{number:06d}")
-    keypoints = [
-        {"name": name, "xyz": xyz.tolist(), "uv": placed.marked[name].tolist()}
-        for name, xyz in zip(placed.names, placed.points @ car_from_model.T, strict=True)
-        if name in placed.marked
-    ]
-    return {
-        "image": image.relative_to(folder).as_posix(),
-        "K": placed.camera.matrix.tolist(),
-        "bbox": placed.bbox.tolist(),
-        "dims_hwl": [height, width, length],
-        "location_bottom_centre": (placed.center + [0.0, height / 2, 0.0]).tolist(),
-        "rotation_y": yaw_of_car(cam_from_car),
-        "keypoints": keypoints,
-    }
-
-
 FORMAT = PhotoFormat(
-    "kitti",
     f"KITTI: {_OBJECT[0]}, {_TRACKING[0]}, {CARS} or {TRACKS}",
     has(CARS, TRACKS, *(f"{place}{kind}" for place in ("", "training/") for kind, _ in _LAYOUTS)),
     KittiCars,
-    list_writer(CARS, _written),
 )

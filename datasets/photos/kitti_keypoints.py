@@ -26,7 +26,6 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.placed import LEVEL_UP
 from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.box import Box
@@ -54,7 +53,7 @@ SIZE = (1242, 375)
 """The size of most of KITTI's photos, taken where the photo itself is not there [px]."""
 HIDDEN = 0.1
 """Scores below this are those of keypoints that something hides."""
-UP = read_only(np.array(LEVEL_UP))
+UP = read_only(np.array([0.0, -1.0, 0.0]))
 """KITTI's cameras are level, and so are the boxes of its labels."""
 _MEAN_CAR = np.array([1.63, 3.88, 1.53])  # width, length and height of cars in KITTI [m]
 # The car's frame from KITTI's object frame (x forward, y down, z left at rotation_y = 0).

@@ -334,13 +334,11 @@ class Pascal3DDetections(PhotoDataset):
 
 
 FORMAT = PhotoFormat(
-    "pascal3d",
     f"PASCAL3D+ or ObjectNet3D: {ANNOTATIONS} with .mat files",
     has(f"{ANNOTATIONS}/*.mat", f"{ANNOTATIONS}/*/*.mat"),
     Pascal3D,
 )
 DETECTIONS = PhotoFormat(
-    "pascal3d-detections",
     f"PASCAL3D+ photos with detected keypoints: {DETECTED}/*.mat",
     has(f"{DETECTED}/*.mat"),
     Pascal3DDetections,

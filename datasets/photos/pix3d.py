@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from msgspec import field
@@ -24,8 +24,7 @@ from cadalign.datasets.photos.photo import (
     Truth,
     existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject, list_writer
-from cadalign.datasets.photos.scannet import read_matrix, write_matrix
+from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
@@ -41,9 +40,6 @@ ANNOTATIONS = "pix3d.json"
 _SENSOR = 32.0
 # Pix3D's camera has x to the left, y up and z forward.
 _PIX3D_AXES = np.array([-1.0, -1.0, 1.0])
-_NEAR_MIDDLE = 1.0  # farthest principal point of written cameras from the image's middle [px]
-_SAME_FOCAL = 1e-3
-_UNMARKED = (-1.0, -1.0)
 _FLAGS = {"truncated": "truncated", "occluded": "occluded", "slightly_occluded": "occluded"}
 
 
@@ -159,46 +155,4 @@ def _keypoints(entry: _Entry) -> PhotoKeypoints | None:
     return PhotoKeypoints(mean, names, np.ones(len(rows), dtype=bool))
 
 
-def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
-    """The entry of an object: a rigid pose of the stretched mesh [m]."""
-    camera, category = placed.camera, placed.category
-    placed.require_plain_camera("Pix3D")
-    middle = (camera.width - 1) / 2, (camera.height - 1) / 2
-    is_off = max(abs(camera.cx - middle[0]), abs(camera.cy - middle[1])) > _NEAR_MIDDLE
-    if is_off or abs(camera.fy / camera.fx - 1) > _SAME_FOCAL:
-        what = "Pix3D has the principal point in the image's middle, and square pixels"
-        raise InputError(what, where=placed.photo.name, fix="choose another form, such as bop")
-    bbox = placed.bbox + PIXEL_CENTRE
-    model = folder / "model" / category / f"{number:06d}"
-    placed.write_model(model / "model.obj", is_stretched=True)
-    write_matrix(model / "3d_keypoints.txt", placed.points)
-    image = placed.copy_image(folder / "img" / category / f"{number:06d}")
-    mask = placed.write_mask(folder / "mask" / category / f"{number:06d}.png")
-    marked = placed.marked
-    pixels = [
-        (marked[name] + PIXEL_CENTRE).tolist() if name in marked else list(_UNMARKED)
-        for name in placed.names
-    ]
-
-    def written(path: Path) -> str:
-        return path.relative_to(folder).as_posix()
-
-    return {
-        "img": written(image),
-        "category": placed.found.category,
-        "img_size": [camera.width, camera.height],
-        "2d_keypoints": [pixels],
-        "mask": None if mask is None else written(mask),
-        "model": written(model / "model.obj"),
-        "3d_keypoints": written(model / "3d_keypoints.txt"),
-        "rot_mat": (_PIX3D_AXES[:, None] * placed.pose.rotation).tolist(),
-        "trans_mat": (_PIX3D_AXES * placed.pose.translation).tolist(),
-        "focal_length": camera.fx / camera.width * _SENSOR,
-        "bbox": bbox.tolist(),
-        **dict.fromkeys(_FLAGS, False),
-    }
-
-
-FORMAT = PhotoFormat(
-    "pix3d", f"Pix3D: {ANNOTATIONS}", has(ANNOTATIONS), Pix3D, list_writer(ANNOTATIONS, _written)
-)
+FORMAT = PhotoFormat(f"Pix3D: {ANNOTATIONS}", has(ANNOTATIONS), Pix3D)

@@ -69,4 +69,4 @@ class PosedPhotos(PhotoDataset):
         return Photo(name, existing(self.root / name), camera, (shown,))
 
 
-FORMAT = PhotoFormat("posed-photos", f"posed photos: {POSES}", has(POSES), PosedPhotos)
+FORMAT = PhotoFormat(f"posed photos: {POSES}", has(POSES), PosedPhotos)

@@ -6,7 +6,7 @@ Avetisyan et al., "Scan2CAD: Learning CAD Model Alignment in RGB-D Scans", CVPR 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,13 +34,12 @@ from cadalign.datasets.photos.photo import (
     existing,
     first_existing,
 )
-from cadalign.datasets.photos.placed import PlacedObject, list_writer, upright_rotation
-from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames, write_frame
+from cadalign.datasets.photos.scannet import ScanNetFrame, list_frames
 from cadalign.errors import DataError, InputError, quote
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import quat_wxyz_from_rotation, rotation_from_quat_wxyz
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.geometry.symmetry import SCAN2CAD_FOLDS, Symmetry
 from cadalign.io.documents import Finite, ForeignDocument, Id, Point3, Positive, convert
 from cadalign.io.files import as_path
@@ -278,81 +277,4 @@ def _annotation_file(path: Path) -> tuple[Path, Path]:
     raise DataError(what, where=str(path), fix="give the folder of Scan2CAD's annotations")
 
 
-def scan_entry(
-    scan_id: str,
-    aligned: Alignment,
-    *,
-    model_id: str,
-    category_id: str,
-    bounds: FloatArray,
-    keypoints: Mapping[str, FloatArray] | None = None,
-) -> dict[str, Any]:
-    """Entry of a scan with one model in Scan2CAD's annotations, in the scan's coordinates [m].
-
-    ``scan_id`` is such as ``scene0470_00``, ``category_id`` the model's synset, ``bounds`` (2, 3)
-    its coordinates before the stretch. ``keypoints`` are pairs of points (k, 3), ``keypoints_cad``
-    and ``keypoints_scan``.
-    """
-    low, high = bounds
-    model = {
-        "trs": _trs_of(aligned),
-        "id_cad": model_id,
-        "catid_cad": category_id,
-        "sym": "__SYM_NONE",
-        "bbox": ((high - low) / 2).tolist(),
-        "center": ((high + low) / 2).tolist(),
-        **{name: {"position": xyz.ravel().tolist()} for name, xyz in (keypoints or {}).items()},
-    }
-    trs = _trs_of(Alignment.identity())
-    return {"id_scan": scan_id, "trs": trs, "n_aligned_models": 1, "aligned_models": [model]}
-
-
-def _written(folder: Path, number: int, placed: PlacedObject) -> dict[str, Any]:
-    """The entry of an object, the only model of a scan of one frame, whose z points up.
-
-    Keypoints are pairs: on the CAD model, and on the scan, where the marked pixel's ray has the
-    depth of the model's keypoint.
-    """
-    placed.require_plain_camera("Scan2CAD")
-    scene, category = f"scene{number:04d}_00", placed.category
-    model_id = f"{number:06d}-{placed.model_id}"
-    models = folder / _MODEL_FOLDERS[0] / category / model_id
-    placed.write_model(models / MESH_FILES[0], is_stretched=False)
-    pose, turn, scan_from_cam = placed.pose, upright_rotation(placed.up), np.eye(4)
-    scan_from_cam[:3, :3] = turn
-    place = folder / "scans" / scene
-    write_frame(place, placed.camera.matrix, scan_from_cam)
-    placed.copy_image(place / "color" / "0")
-    names, marked = placed.names, placed.marked
-    rows = [row for row, name in enumerate(names) if name in marked]
-    on_model = pose.apply(placed.points)[rows]
-    pixels = np.array([marked[names[row]] for row in rows]).reshape(-1, 2)
-    rays = np.column_stack([placed.camera.normalize(pixels), np.ones(len(rows))])
-    return scan_entry(
-        scene,
-        Alignment(turn @ pose.rotation, turn @ pose.translation, placed.scale),
-        model_id=model_id,
-        category_id=category,
-        bounds=placed.bounds,
-        keypoints={
-            "keypoints_cad": on_model @ turn.T,
-            "keypoints_scan": (rays * on_model[:, 2:]) @ turn.T,
-        },
-    )
-
-
-def _trs_of(alignment: Alignment) -> dict[str, Any]:
-    return {
-        "translation": alignment.translation.tolist(),
-        "rotation": np.asarray(quat_wxyz_from_rotation(alignment.rotation)).tolist(),
-        "scale": alignment.scale.tolist(),
-    }
-
-
-FORMAT = PhotoFormat(
-    "scan2cad",
-    f"Scan2CAD: {FULL} or annot.json",
-    has(FULL, *_SAMPLES),
-    Scan2CAD,
-    list_writer(FULL, _written),
-)
+FORMAT = PhotoFormat(f"Scan2CAD: {FULL} or annot.json", has(FULL, *_SAMPLES), Scan2CAD)

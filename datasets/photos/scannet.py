@@ -1,4 +1,4 @@
-"""Frames of ScanNet scenes, read and written: photos with intrinsics and poses."""
+"""Frames of ScanNet scenes: photos with intrinsics and poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import in_file
-from cadalign.io.files import damaged, listed, made_folder, read_text, write_text
+from cadalign.io.files import damaged, listed, read_text
 from cadalign.io.images import photo_size
 
 # The intrinsics of the colour images, as SensReader and as scannet_frames_25k name them.
@@ -106,18 +106,3 @@ def read_matrix(path: Path, shape: tuple[int | None, int]) -> FloatArray:
     if not np.isfinite(matrix).all():
         raise DataError("some of its numbers are not finite", where=str(path))
     return matrix
-
-
-def write_matrix(path: Path, matrix: FloatArray) -> None:
-    """Write a text file of a matrix, a row on each line; folders above it are made."""
-    made_folder(path.parent)
-    rows = (" ".join(f"{value:.17g}" for value in row) for row in matrix.tolist())
-    write_text(path, "".join(f"{row}\n" for row in rows))
-
-
-def write_frame(folder: Path, matrix: FloatArray, scan_from_cam: FloatArray) -> None:
-    """Write pose (4, 4) and intrinsics (3, 3) of the only frame of a scene, number 0."""
-    intrinsics = np.eye(4)
-    intrinsics[:3, :3] = matrix
-    write_matrix(folder / "pose" / "0.txt", scan_from_cam)
-    write_matrix(folder / _INTRINSICS[0], intrinsics)

@@ -42,9 +42,6 @@ if (
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(_MEMORY))
     tempfile.tempdir = os.environ.setdefault("TMPDIR", str(_MEMORY))
 
-# Undo histories of the annotator are kept there.
-os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cadalign-tests-")
-
 # What a page shows is waited for; how soon it does is a matter for the tests of times.
 expect.set_options(timeout=30_000)
 
@@ -54,11 +51,6 @@ REQUIRED = os.environ.get("CADALIGN_REQUIRED", "").split()
 
 
 COMPILED = pytest.StashKey[Future[None]]()
-
-
-def pytest_unconfigure() -> None:
-    """Remove the undo histories; not at exit, which processes that are forked have, too."""
-    shutil.rmtree(os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

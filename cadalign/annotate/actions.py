@@ -10,14 +10,9 @@ from typing import Any, get_type_hints
 
 import msgspec
 
-from cadalign.annotate.document import AnnotationDocument, Pair, Pixel
-from cadalign.annotate.object_actions import (
-    EVIDENCE_ACTIONS,
-    OBJECT_ACTIONS,
-    ActionOutcome,
-    bring_back,
-)
-from cadalign.annotate.objects import PhotoState
+from cadalign.annotate.annotation import Annotation
+from cadalign.annotate.document import Pair, Pixel
+from cadalign.annotate.evidence_actions import EVIDENCE_ACTIONS, ActionOutcome
 from cadalign.annotate.photos import Mark, WorkList, nearest_corner
 from cadalign.annotate.session import Session
 from cadalign.errors import InputError, quote
@@ -29,35 +24,23 @@ MIRRORED = 0.01
 """Largest distance of a point from a mirror image that it counts as [diagonals]."""
 
 
-def perform(
-    session: Session, number: int, action: Mapping[str, Any], *, slot: int | None = None
-) -> ActionOutcome:
+def perform(session: Session, number: int, action: Mapping[str, Any]) -> ActionOutcome:
     """Do an action of the page, its name ``do`` and its arguments, and save its changes.
 
-    It is done on an object of the photo of a number; see `Session.photo_state`.
+    It is done on the annotation of a number.
     """
     with session.lock:
-        state = session.photo_state(number, slot)
-        if slot == 0 and session.objects[number][0].is_shown:
-            state = session.objects[number][0]  # which is not listed while nothing is marked
-        elif slot not in (None, state.place[1]):
-            what = "this object was deleted, or the photo is no longer one of its photos"
-            raise InputError(what, where="object", fix="reload the page")
+        state = session.annotation(number)
         name = action.get("do")
         function = ACTIONS.get(name) if isinstance(name, str) else None
         if function is None:
             fix = f"known are {', '.join(ACTIONS)}"
             raise InputError(f"{quote(name)} is not an action", where="do", fix=fix)
-        before = {owner: owner.document for owner in session.owners}
+        before = state.document
         arguments = msgspec.structs.asdict(convert(action, _arguments_of(function)))
         outcome = function(state, **arguments) or ActionOutcome()
-        changed = [each for each in session.owners if before.get(each) is not each.document]
-        for each in changed:
-            session.save(each)
-        if changed and name not in _DELETING:
-            session.just_deleted.discard(number)
-        if name in _RENAMING:
-            session.save(state.owner)
+        if state.document is not before or name in _RENAMING:
+            session.save(state)
         return outcome
 
 
@@ -73,7 +56,7 @@ def _arguments_of(function: Callable[..., ActionOutcome | None]) -> type[msgspec
 
 
 def place_uv(
-    state: PhotoState, *, uv: Point2, pair: Index | None = None, snap: NotNegative = 0.0
+    state: Annotation, *, uv: Point2, pair: Index | None = None, snap: NotNegative = 0.0
 ) -> ActionOutcome:
     """Place a photo half, by preference of the given pair; see `move` for ``snap``."""
     place, message = _snapped(uv, snap, state)
@@ -83,7 +66,7 @@ def place_uv(
 
 
 def place_keypoint(
-    state: PhotoState, *, keypoint: Index, pair: Index | None = None
+    state: Annotation, *, keypoint: Index, pair: Index | None = None
 ) -> ActionOutcome:
     """Place a model half, a keypoint of the registry, by preference of the given pair."""
     state.model.registry[keypoint]  # refuses an unknown one
@@ -93,7 +76,7 @@ def place_keypoint(
 
 
 def pick(
-    state: PhotoState,
+    state: Annotation,
     *,
     origin: Point3,
     direction: Point3,
@@ -109,7 +92,7 @@ def pick(
 
 
 def repick(
-    state: PhotoState,
+    state: Annotation,
     *,
     pair: Index,
     origin: Point3,
@@ -125,7 +108,7 @@ def repick(
     return ActionOutcome(pair)
 
 
-def mirrored(state: PhotoState, *, pair: Index) -> ActionOutcome:
+def mirrored(state: Annotation, *, pair: Index) -> ActionOutcome:
     """Begin a pair at the mirror image of another's model point."""
     keypoint = state.document.pair(pair).keypoint
     registry, model = state.model.registry, state.model.cad
@@ -138,7 +121,7 @@ def mirrored(state: PhotoState, *, pair: Index) -> ActionOutcome:
 
 
 def suggested(
-    state: PhotoState,
+    state: Annotation,
     *,
     pair: Index | None = None,
     uv: Point2 | None = None,
@@ -164,7 +147,7 @@ def suggested(
 
 
 def move(
-    state: PhotoState,
+    state: Annotation,
     *,
     pair: Index,
     uv: Point2,
@@ -181,18 +164,18 @@ def move(
     return ActionOutcome(pair, message)
 
 
-def release(state: PhotoState, *, pair: Index) -> ActionOutcome:
+def release(state: Annotation, *, pair: Index) -> ActionOutcome:
     """Remove the model half of a pair."""
     state.record(state.document.release_keypoint(pair))
     return ActionOutcome(pair)
 
 
-def delete(state: PhotoState, *, pair: Index) -> None:
+def delete(state: Annotation, *, pair: Index) -> None:
     """Delete a pair."""
     state.record(state.document.delete(pair))
 
 
-def rename(state: PhotoState, *, pair: Index, name: Text) -> ActionOutcome:
+def rename(state: Annotation, *, pair: Index, name: Text) -> ActionOutcome:
     """Rename the keypoint of a pair."""
     keypoint = state.document.pair(pair).keypoint
     if keypoint is None:
@@ -202,7 +185,7 @@ def rename(state: PhotoState, *, pair: Index, name: Text) -> ActionOutcome:
     return ActionOutcome(pair)
 
 
-def identify(state: PhotoState, *, pair: Index, label: Index | Text) -> ActionOutcome:
+def identify(state: Annotation, *, pair: Index, label: Index | Text) -> ActionOutcome:
     """Say which keypoint of the category's shape the model point of a pair is."""
     keypoint, shape = state.document.pair(pair).keypoint, state.session.shape
     if keypoint is None or label not in shape.ids:
@@ -219,7 +202,7 @@ def identify(state: PhotoState, *, pair: Index, label: Index | Text) -> ActionOu
     return ActionOutcome(pair)
 
 
-def accept(state: PhotoState, *, keypoints: list[Index] | None = None) -> ActionOutcome:
+def accept(state: Annotation, *, keypoints: list[Index] | None = None) -> ActionOutcome:
     """Place pairs at a detector's places of some keypoints, or of all that are left."""
     document, number = state.document, None
     for found in state.detected:
@@ -233,66 +216,38 @@ def accept(state: PhotoState, *, keypoints: list[Index] | None = None) -> Action
     return ActionOutcome(number)
 
 
-def mark(state: PhotoState, *, mark: Mark | None = None) -> None:
+def mark(state: Annotation, *, mark: Mark | None = None) -> None:
     """Say that a photo is done or skipped, or neither."""
     session = state.session
-    session.before_saving()
     # As the file is by now, which others may have changed.
     kept = WorkList.open(session.worklist.path.parent)
-    session.worklist = kept.marked(state.photo.path, mark)
+    session.worklist = kept.marked(state.listed, mark)
 
 
-def undo(state: PhotoState) -> ActionOutcome:
+def undo(state: Annotation) -> ActionOutcome | None:
     """Undo the last change."""
-    deleted = state.session.last_deleted(state.place[0], at_once=True)
-    if deleted is not None:
-        return bring_back(deleted)
-    before = replace(state.document, further_views=())
-    if not state.owner.history.undo():
-        return ActionOutcome(message="There is nothing to undo.")
-    return _gone_on(state, before)
+    return None if state.history.undo() else ActionOutcome(message="There is nothing to undo.")
 
 
-def redo(state: PhotoState) -> ActionOutcome:
+def redo(state: Annotation) -> ActionOutcome | None:
     """Redo the last undone change."""
-    before = replace(state.document, further_views=())
-    is_done = state.owner.history.redo()
-    if state.owner.document.is_gone:
-        state.session.note_deletion(state.owner)
-    if not is_done:
-        return ActionOutcome(message="There is nothing to redo.")
-    return _gone_on(state, before)
+    return None if state.history.redo() else ActionOutcome(message="There is nothing to redo.")
 
 
 ACTIONS: dict[str, Callable[..., ActionOutcome | None]] = {
     function.__name__: function
     for function in (
         *(place_uv, place_keypoint, pick, repick, mirrored, suggested, move, release, delete),
-        *(rename, identify, *EVIDENCE_ACTIONS, *OBJECT_ACTIONS, accept, mark, undo, redo),
+        *(rename, identify, *EVIDENCE_ACTIONS, accept, mark, undo, redo),
     )
 }
 """Actions by the name that the page sends as ``do``."""
-
-# Actions after which undoing brings back what was deleted, and actions that may change the names
-# of keypoints instead of the document.
-_DELETING = ("delete_object", "undo", "redo")
 _RENAMING = ("rename", "identify")
-
-
-def _gone_on(state: PhotoState, before: AnnotationDocument) -> ActionOutcome:
-    """The outcome of undoing or redoing, which may concern another photo of the object.
-
-    ``before`` is what was marked in the photo.
-    """
-    if not state.is_shown:
-        return ActionOutcome(message="This photo is no longer one of the object's.")
-    if len(state.owner.shown) > 1 and replace(state.document, further_views=()) == before:
-        return ActionOutcome(message="That was a change in another photo of this object.")
-    return ActionOutcome()
+"""Actions that may change the names of keypoints in place of the document."""
 
 
 def _aimed_at(
-    state: PhotoState, origin: Point3, direction: Point3, near: int | None, snap: float
+    state: Annotation, origin: Point3, direction: Point3, near: int | None, snap: float
 ) -> int | None:
     """The keypoint that a ray points at, registered; None if it misses the model.
 
@@ -306,7 +261,7 @@ def _aimed_at(
     return None if point is None else state.model.registry.placed(point)
 
 
-def _snapped(uv: Pixel, reach: float, state: PhotoState) -> tuple[Pixel, str]:
+def _snapped(uv: Pixel, reach: float, state: Annotation) -> tuple[Pixel, str]:
     """The nearest corner of the photo within reach [px], or the place itself, and a message."""
     state.require_inside(uv)
     if not reach > 0:

@@ -24,7 +24,6 @@ from cadalign.retrieval.silhouettes import grab_cut
 Point2 = tuple[float, float]
 Segment = tuple[Point2, Point2]
 
-_SHIFT = 4  # bits of parts of a pixel in OpenCV's drawing
 _LONGEST_CUT = 800  # side of the photo in which a box is cut out [px]
 _LEAST_BOX = 4.0  # [px]
 _END_SIGMA = 1.0  # of the ends of a vertical edge [px]
@@ -34,25 +33,26 @@ _MOST_UP_SIGMA = 20.0  # [degrees]
 
 
 @dataclass(frozen=True)
-class Stroke:
-    """A part of a mask: a polygon, a brush stroke of a ``radius`` [px], or ``runs``.
+class MarkedMask:
+    """A mask: that of a file, or a drawn one, as the runs of `encode_runs`."""
 
-    Runs are the numbers of pixels outside and inside in turn, row by row.
-    """
-
-    points: tuple[Point2, ...] = ()
-    radius: float | None = None
+    file: str | None = None
+    sigma: float | None = None  # of its contour [px]
     runs: tuple[int, ...] = ()
-    adds: bool = True  # False to take the part away
 
-
-@dataclass(frozen=True)
-class MaskDrawing:
-    """A mask: that of a file, if there is one, with strokes over it in turn."""
-
-    base: str | None = None
-    base_sigma: float | None = None  # of its contour [px]
-    strokes: tuple[Stroke, ...] = ()
+    def pixels(self, width: int, height: int) -> BoolArray:
+        """The mask (h, w); raises DataError if its file is none of that size."""
+        if self.file is None:
+            return decode_runs(self.runs, width, height)
+        mask = read_mask(Path(self.file))
+        if mask.shape != (height, width):
+            raise DataError(
+                f"the mask has {mask.shape[1]} x {mask.shape[0]} pixels, the photo "
+                f"{width} x {height}",
+                where=self.file,
+                fix="give a mask of the photo's size",
+            )
+        return mask
 
 
 @dataclass(frozen=True)
@@ -102,11 +102,11 @@ class MarkedEvidence:
     """Marks in a photo beside its pairs.
 
     ``up`` is the model's up axis in the camera, with its standard deviation [degrees], from a file;
-    vertical edges take its place. ``photo`` says that the photos themselves count, ``start`` is
-    where the search begins while there are few pairs.
+    vertical edges take its place. ``photo`` says that the photo itself counts, ``start`` is where
+    the search begins while there are few pairs.
     """
 
-    mask: MaskDrawing | None = None
+    mask: MarkedMask | None = None
     verticals: tuple[Segment, ...] = ()
     up: tuple[float, float, float] | None = None
     up_sigma_deg: float | None = None
@@ -115,46 +115,32 @@ class MarkedEvidence:
     start: StartFields | None = None
 
     @classmethod
-    def of(cls, image: ImageEvidence, observation: Observation | None = None) -> Self:
-        """The marks that stand for the evidence of an image, and for that of its object."""
-        x, y, z = (0.0, 0.0, 0.0) if image.up is None else image.up.tolist()
-        start = None if observation is None else observation.init
+    def of(cls, observation: Observation) -> Self:
+        """The marks that stand for the evidence of an observation."""
+        known, start = observation.evidence, observation.init
+        x, y, z = (0.0, 0.0, 0.0) if known.up is None else known.up.tolist()
         return cls(
-            mask=None if image.mask is None else MaskDrawing(str(image.mask), image.mask_sigma),
-            up=None if image.up is None else (x, y, z),
-            up_sigma_deg=image.up_sigma_deg,
-            lengths=None if observation is None else MarkedLengths.of(observation.size),
-            photo=observation is not None and bool(observation.fit_options.get("image")),
+            mask=None if known.mask is None else MarkedMask(str(known.mask), known.mask_sigma),
+            up=None if known.up is None else (x, y, z),
+            up_sigma_deg=known.up_sigma_deg,
+            lengths=MarkedLengths.of(observation.size),
+            photo=bool(observation.fit_options.get("image")),
             start=None if start is None else StartFields.of(start),
         )
 
-    def shared_with(self, other: Self) -> Self:
-        """The evidence of another photo, with what is known of the object."""
-        return replace(other, lengths=self.lengths, photo=self.photo)
+    def in_place_of(self, known: ImageEvidence, camera: Camera, mask: Path | None) -> ImageEvidence:
+        """The evidence with these marks in place of its own; ``mask`` is the file of theirs.
 
-    def as_written(self, camera: Camera, drawn: Path | None) -> Self:
-        """The marks as an observation holds them, with an upward direction for vertical edges.
-
-        ``drawn`` is the file of a mask with strokes, None if nothing is left of it.
+        Vertical edges tell the upward direction.
         """
-        mask = self.mask
-        if mask is not None and mask.strokes:
-            mask = None if drawn is None else MaskDrawing(str(drawn))
-        found = find_up(self.verticals, camera)
-        if found is None:
-            return replace(self, mask=mask, verticals=())
-        (x, y, z), sigma = found[0].tolist(), found[1]
-        return replace(self, mask=mask, verticals=(), up=(x, y, z), up_sigma_deg=sigma)
-
-    def in_place_of(self, image: ImageEvidence) -> ImageEvidence:
-        """The evidence of an image with these marks, as they are written, in place of its own."""
-        mask, up = self.mask, self.up
+        up = None if self.up is None else np.array(self.up)
+        found = find_up(self.verticals, camera) or (up, self.up_sigma_deg)
         return replace(
-            image,
-            mask=None if mask is None else Path(mask.base or ""),
-            mask_sigma=None if mask is None else mask.base_sigma,
-            up=None if up is None else np.array(up),
-            up_sigma_deg=None if up is None else self.up_sigma_deg,
+            known,
+            mask=mask,
+            mask_sigma=None if self.mask is None else self.mask.sigma,
+            up=found[0],
+            up_sigma_deg=None if found[0] is None else found[1],
         )
 
 
@@ -182,36 +168,6 @@ def find_up(verticals: tuple[Segment, ...], camera: Camera) -> tuple[FloatArray,
     factor = max(1.0, chi_square / redundancy) if redundancy else 1.0
     sigma = math.sqrt(factor * float(np.linalg.eigvalsh(covariance)[-1]))
     return None if sigma > _MOST_UP_SIGMA else (up, max(_LEAST_UP_SIGMA, sigma))
-
-
-def draw_mask(drawing: MaskDrawing, width: int, height: int) -> BoolArray:
-    """The pixels (h, w) of a mask; raises DataError if its file is none of that size."""
-    mask = np.zeros((height, width), dtype=np.uint8)
-    if drawing.base is not None:
-        base = read_mask(Path(drawing.base))
-        if base.shape != mask.shape:
-            raise DataError(
-                f"the mask has {base.shape[1]} x {base.shape[0]} pixels, the photo "
-                f"{width} x {height}",
-                where=drawing.base,
-                fix="give a mask of the photo's size",
-            )
-        mask[:] = base
-    for stroke in drawing.strokes:
-        value = int(stroke.adds)
-        if stroke.runs:
-            mask[decode_runs(stroke.runs, width, height)] = value
-            continue
-        points = np.round(np.array(stroke.points) * 2**_SHIFT).astype(np.int32)
-        if stroke.radius is None:
-            cv2.fillPoly(mask, [points], value, shift=_SHIFT)
-            continue
-        thickness = max(1, round(2 * stroke.radius))
-        cv2.polylines(mask, [points], False, value, thickness, shift=_SHIFT)
-        for end in (points[0], points[-1]):
-            radius = round(stroke.radius * 2**_SHIFT)
-            cv2.circle(mask, end.tolist(), radius, value, cv2.FILLED, shift=_SHIFT)
-    return mask.astype(bool)
 
 
 def encode_runs(mask: BoolArray) -> tuple[int, ...]:
@@ -259,7 +215,7 @@ def cut_out(photo: npt.NDArray[np.uint8], corners: npt.NDArray[np.float64]) -> B
         raise InputError(
             "nothing in the box differs from what is around it",
             where="box",
-            fix="paint the object, or draw a polygon",
+            fix="draw it closer around the object",
         )
     whole = cv2.resize(255 * found, (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(whole >= 128)

@@ -1,17 +1,14 @@
-"""Files of an object: its observation, which holds all that must last, and its alignment.
+"""Files of an annotation: its observation, which holds all that must last, and its alignment.
 
 Beside the observation `photo.json` is `photo_fit/fit.json`, the alignment as `cadalign fit` finds
-and writes it, but for what other objects of the photo say of its focal length. The observation's
-field ``unfinished`` has what a fit cannot use: pairs with only one half placed, those whose
-keypoint the category's shape lacks, and further photos without any pair.
-Sessions of earlier versions kept these in a file of their own, `photo.unfinished.json`.
+and writes it. The observation's field ``unfinished`` has what a fit cannot use: pairs with only one
+half placed, those whose keypoint the category's shape lacks, and edges that are vertical.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,40 +17,30 @@ import msgspec
 import numpy as np
 
 from cadalign.annotate.document import AnnotationDocument, Pair, Priors
-from cadalign.annotate.locks import LastContent
+from cadalign.annotate.evidence import MarkedEvidence
 from cadalign.annotate.models import (
     KeypointRegistry,
     ObjectShape,
     OpenedModel,
     refuse_other_model,
 )
-from cadalign.annotate.names import earlier_unfinished_file
+from cadalign.annotate.names import LastContent
 from cadalign.arrays import FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.focal import FocalPrior
 from cadalign.estimation.result import Result
-from cadalign.geometry.camera import Camera
-from cadalign.io.documents import (
-    Document,
-    PathText,
-    Point2,
-    convert,
-    in_file,
-    path_from,
-    read_json,
-    within,
-)
-from cadalign.io.evidence import ObservedImage
+from cadalign.io.documents import Document, Point2, convert, in_file, read_json, within
 from cadalign.io.files import write_json, writing
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import SeenKeypoint
 
 logger = logging.getLogger("cadalign")
 
+NOTHING = np.empty((0, 3)), np.empty((0, 2))
+"""Keypoints of an observation without any: on the model and in the photo."""
 _RENAME = "rename it: the annotator writes a file of this name"
-_NO_KEYPOINTS = np.empty((0, 3)), np.empty((0, 2))
-_EARLIER_FORMAT = "cadalign unfinished pairs"
+_OTHER_FILE = "give another --observation or --out"
 # Fields that are not of one image.
 _OF_THE_OBJECT = (
     *("init", "model", "object", "shape", "size", "symmetry", "up_axis", "fit", "unfinished"),
@@ -70,70 +57,14 @@ class _Half(SeenKeypoint, kw_only=True):
             raise InputError("uv and semantic_id are both missing", fix="give one of them")
 
 
-class _UnfinishedView(Document):
-    """The pairs of a further photo that the observation lacks, or the photo without any."""
-
-    image: PathText
-    camera: Any  # in the form of `Camera.from_dict`
-    pairs: list[_Half] = msgspec.field(default_factory=list)
-
-
 class _Unfinished(Document):
     pairs: list[_Half] = msgspec.field(default_factory=list)
-    views: list[_UnfinishedView] = msgspec.field(default_factory=list)
-    format: str = ""  # of the file of earlier versions
-
-
-@dataclass(frozen=True, eq=False)
-class StoredView:
-    """An image of an observation; a further photo of the object has its annotation if it exists."""
-
-    seen: ObservedImage
-    document: AnnotationDocument | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """An earlier session's annotation of a photo; ``observation`` is None without such a file."""
-
-    document: AnnotationDocument = field(default_factory=AnnotationDocument)
-    observation: Observation | None = None
-    views: tuple[StoredView | None, ...] = (None,)
-    """The images of the observation, and further ones without anything that counts.
-
-    None stands in the place of the photo itself.
-    """
-
-    @property
-    def seen(self) -> ObservedImage | None:
-        """Content of the observation about the photo."""
-        given = self.observation
-        return None if given is None else given.views[self.views.index(None)]
-
-    @property
-    def sigma(self) -> float | None:
-        """Stored standard deviation of all keypoints in place of their own [px]."""
-        options = {} if self.observation is None else self.observation.fit_options
-        # Beside a prior on the stretch it is the annotator's own, from the pairs of that time.
-        sigma = None if "stretch_sigma" in options else options.get("sigma")
-        return sigma if isinstance(sigma, float) else None
-
-    def priors_or(self, likely: Priors) -> Priors:
-        """The priors of `cadalign fit` on the stored pairs; the likely ones before there are any.
-
-        Where no prior on the focal length is stored, `cadalign fit` takes the likely one, too.
-        """
-        if self.observation is None or not self.document.complete_pairs:
-            return likely
-        options = self.observation.fit_options
-        stored = options.get("focal_prior", likely.focal)
-        focal = FocalPrior(**stored) if isinstance(stored, Mapping) else stored
-        return Priors(options.get("stretch_sigma"), focal)
+    verticals: list[tuple[Point2, Point2]] = msgspec.field(default_factory=list)
 
 
 @dataclass(eq=False)
 class AnnotationFiles:
-    """Files of one object; the observation, which names photos and mesh, need not exist yet."""
+    """Files of one annotation; the observation need not exist yet."""
 
     observation: Path
     _content: LastContent = field(default_factory=LastContent, init=False, repr=False)
@@ -143,33 +74,28 @@ class AnnotationFiles:
         """File of the alignment, the same as `cadalign fit` writes."""
         return self.observation.with_name(f"{self.observation.stem}_fit") / "fit.json"
 
-    def read(self, photo: Path, model: OpenedModel, shape: ObjectShape) -> Stored:
-        """Read an earlier session's annotation; new model points are added to the registry."""
-        registry, stored = model.registry, Stored()
+    def read(
+        self, photo: Path, model: OpenedModel, shape: ObjectShape
+    ) -> tuple[Observation | None, AnnotationDocument]:
+        """Read an earlier session's observation, None without one, and its marks.
+
+        New model points are added to the registry. The document lacks focal length and priors.
+        """
         self._content.note(self.observation)
-        parts = []
-        if self.observation.exists():
-            observation = self._load()
-            refuse_other_model(observation.model, model.path, where=self.observation)
-            place = _place_of(photo, observation.views, where=self.observation)
-            shown = _document_of(observation.views[place], registry)
-            shown = replace(shown, name=observation.object_name or "")
-            views: list[StoredView | None] = []
-            for seen in observation.views:
-                is_there = seen.image is not None and seen.image.exists()
-                is_other = is_there and len(views) != place
-                own = _document_of(seen, registry) if is_other else None
-                views.append(StoredView(seen, own))
-            views[place] = None
-            stored = Stored(shown, observation, tuple(views))
-            self._warn_of_options(stored, shape)
-            with in_file(self.observation), within("unfinished"):
-                parts.append(convert(observation.unfinished or {}, _Unfinished))
-        earlier = self._earlier_unfinished()
-        for unfinished in parts if earlier is None else [*parts, earlier]:
-            stored = self._with_unfinished(stored, unfinished, registry)
         self._refuse_other_fit()
-        return stored
+        if not self.observation.exists():
+            return None, AnnotationDocument()
+        observation = self._load()
+        refuse_other_model(observation.model, model.path, where=self.observation)
+        self._refuse_other_photos(observation, photo)
+        self._warn_of_options(observation, shape)
+        with in_file(self.observation), within("unfinished"):
+            unfinished = convert(observation.unfinished or {}, _Unfinished)
+        document = _with_pairs(AnnotationDocument(), observation, model.registry)
+        document = _with_halves(document, unfinished.pairs, model.registry)
+        marks = MarkedEvidence.of(observation)
+        marks = replace(marks, verticals=tuple(unfinished.verticals))
+        return observation, replace(document, evidence=marks)
 
     def write(self, observation: Observation) -> None:
         """Write the observation as a whole; raises DataError on failure.
@@ -178,28 +104,17 @@ class AnnotationFiles:
         by others is refused.
         """
         self._content.refuse_changed(self.observation)
-        earlier = self._earlier_unfinished()
         observation.save(self.observation)
         self._content.note(self.observation)
-        if earlier is not None:
-            _remove(earlier_unfinished_file(self.observation))
 
     def write_fit(self, result: Result | None) -> None:
         """Write the alignment, or remove its file; raises DataError on failure."""
-        if result is None:
-            _remove(self.fit)
-            return
         with writing(self.fit):
+            if result is None:
+                self.fit.unlink(missing_ok=True)
+                return
             self.fit.parent.mkdir(exist_ok=True)
         write_json(self.fit, result.to_dict())
-
-    def remove(self) -> None:
-        """Remove the files of a deleted object; raises DataError on failure."""
-        self._content.refuse_changed(self.observation)
-        for path in (self.observation, self.fit):
-            _remove(path)
-        with suppress(OSError):  # something else is in it
-            self.fit.parent.rmdir()
 
     def _load(self) -> Observation:
         data = read_json(self.observation)
@@ -211,58 +126,27 @@ class AnnotationFiles:
                 return Observation.from_dict(data, folder=self.observation.parent)
         return Observation.load(self.observation)
 
-    def _earlier_unfinished(self) -> _Unfinished | None:
-        """The unfinished pairs in a file of an earlier version; None if there is none."""
-        path = earlier_unfinished_file(self.observation)
-        if not path.is_file():
-            return None
-        with suppress(DataError):
-            data = read_json(path)
-            if isinstance(data, dict) and data.get("format") == _EARLIER_FORMAT:
-                with in_file(path):
-                    found: _Unfinished = convert(data, _Unfinished)
-                return found
-        return None
+    def _refuse_other_photos(self, observation: Observation, photo: Path) -> None:
+        """Refuse an observation of another photo, or of several; one that is gone was renamed."""
+        where, named = str(self.observation), observation.image
+        if observation.others:
+            what = f"has {len(observation.views)} views, the annotator opens files of one photo"
+            raise DataError(what, where=where, fix=_OTHER_FILE)
+        if named is not None and named.exists() and not named.samefile(photo):
+            raise DataError(
+                f"belongs to the photo {named.name}, not {photo.name}",
+                where=where,
+                fix="give another --observation, or correct the field image in this one",
+            )
 
-    def _with_unfinished(
-        self, stored: Stored, unfinished: _Unfinished, registry: KeypointRegistry
-    ) -> Stored:
-        """An annotation with what the keypoints of its observation lack."""
-        views = list(stored.views)
-        further = {
-            view.seen.image.resolve(): row
-            for row, view in enumerate(views)
-            if view is not None and view.document is not None and view.seen.image is not None
-        }
-        for number, each in enumerate(unfinished.views):
-            image = path_from(each.image, self.observation.parent)
-            if not image.exists():
-                logger.warning(
-                    "%s: the photo %s is gone, with its unfinished pairs", self.observation, image
-                )
-                continue
-            with in_file(self.observation), within(f"unfinished.views[{number}]"):
-                camera = Camera.from_dict(each.camera)
-            new = StoredView(ObservedImage(*_NO_KEYPOINTS, camera, image=image))
-            row = further.setdefault(image.resolve(), len(views))
-            if row == len(views):
-                views.append(new)
-            view = views[row] or new
-            before = view.document or AnnotationDocument()
-            views[row] = replace(view, document=_with_halves(before, each.pairs, registry))
-        document = _with_halves(stored.document, unfinished.pairs, registry)
-        return replace(stored, document=document, views=tuple(views))
-
-    def _warn_of_options(self, stored: Stored, shape: ObjectShape) -> None:
+    def _warn_of_options(self, observation: Observation, shape: ObjectShape) -> None:
         """Warn of stored options of the fit that the page does not use."""
-        observation = stored.observation
-        assert observation is not None
-        ours = {"sigma": stored.sigma, "shape_sigma": shape.sigma}
         options = dict(observation.fit_options)
         for name in ("focal_prior", "image"):
             options.pop(name, None)
         if not shape.is_estimated and options.pop("stretch_sigma", None) is not None:
             options.pop("sigma", None)  # the annotator's own
+        ours = {"sigma": stored_sigma(observation), "shape_sigma": shape.sigma}
         others = [
             name
             for name, value in options.items()
@@ -288,30 +172,25 @@ class AnnotationFiles:
                 raise DataError("not an alignment of cadalign", where=str(self.fit), fix=_RENAME)
 
 
-def _place_of(photo: Path, views: Sequence[ObservedImage], *, where: Path) -> int:
-    """The number of the view that shows a photo; that of a single view whose photo is gone."""
-    named = views[0].image
-    if len(views) == 1:
-        if named is None or not named.exists() or named.samefile(photo):
-            return 0
-        raise DataError(
-            f"belongs to the photo {named.name}, not {photo.name}",
-            where=str(where),
-            fix="give another --observation, or correct the field image in this one",
-        )
-    for number, view in enumerate(views):
-        if view.image is not None and view.image.exists() and view.image.samefile(photo):
-            return number
-    raise DataError(
-        f"none of its {len(views)} views has the image {photo.name}",
-        where=str(where),
-        fix="annotate the image of one of them, or give another --observation",
-    )
+def stored_sigma(observation: Observation) -> float | None:
+    """Stored standard deviation of all keypoints in place of their own [px]."""
+    options = observation.fit_options
+    # Beside a prior on the stretch it is the annotator's own, from the pairs of that time.
+    sigma = None if "stretch_sigma" in options else options.get("sigma")
+    return sigma if isinstance(sigma, float) else None
 
 
-def _remove(path: Path) -> None:
-    with writing(path):
-        path.unlink(missing_ok=True)
+def stored_priors(observation: Observation, likely: Priors) -> Priors:
+    """The priors of `cadalign fit` on stored pairs; the likely ones before there are any.
+
+    Where no prior on the focal length is stored, `cadalign fit` takes the likely one, too.
+    """
+    if not len(observation.points_2d):
+        return likely
+    options = observation.fit_options
+    stored = options.get("focal_prior", likely.focal)
+    focal = FocalPrior(**stored) if isinstance(stored, Mapping) else stored
+    return Priors(options.get("stretch_sigma"), focal)
 
 
 def written_half(pair: Pair) -> dict[str, Any]:
@@ -325,13 +204,10 @@ def _with_halves(
     document: AnnotationDocument, halves: Sequence[_Half], registry: KeypointRegistry
 ) -> AnnotationDocument:
     """The document with unfinished pairs, of which some are of no use any more."""
-    placed = {pair.uv for pair in document.pairs}
     for half in halves:
         keypoint = half.semantic_id
-        if half.uv in placed and (keypoint is None or keypoint in document.keypoints):
-            continue  # a file of an earlier version, not yet without the pair that was completed
         if keypoint not in registry or keypoint in document.keypoints:
-            keypoint = None  # it was saved in another pair, or the keypoints file was deleted
+            keypoint = None  # the keypoints file was deleted
         if half.uv is None and keypoint is None:
             continue
         number = document.next_number
@@ -340,8 +216,9 @@ def _with_halves(
     return document
 
 
-def _document_of(observation: ObservedImage, registry: KeypointRegistry) -> AnnotationDocument:
-    document = AnnotationDocument()
+def _with_pairs(
+    document: AnnotationDocument, observation: Observation, registry: KeypointRegistry
+) -> AnnotationDocument:
     ids, names = observation.ids, observation.names
     columns = (observation.sigma, observation.scores, observation.depths)
     for row, (xyz, uv) in enumerate(

@@ -5,10 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import secrets
-import socket
-from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs
 
@@ -24,7 +21,6 @@ MAX_BODY = 512 * 1024
 MOST_CONNECTIONS = 64
 PATIENCE = 10.0
 """Seconds within which a request's head, and then its body, have to be there."""
-_EVERYWHERE = "0.0.0.0"
 _NAMES = (LOOPBACK, "localhost")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -45,30 +41,17 @@ class Access:
     """Requirements on requests: host, origin and the session's secret token."""
 
     port: int
-    host: str = LOOPBACK
     token: str = field(default_factory=lambda: secrets.token_urlsafe(32), repr=False)
 
     @property
     def address(self) -> str:
         """Address of the page, for browsers that have the cookie."""
-        name = socket.gethostname() if self.host == _EVERYWHERE else self.host
-        return f"http://{name}:{self.port}/"
+        return f"http://{LOOPBACK}:{self.port}/"
 
     @property
     def url(self) -> str:
         """Address of the page with the token."""
         return f"{self.address}?token={self.token}"
-
-    @cached_property
-    def names(self) -> frozenset[str]:
-        """Names and addresses under which the server may be asked for."""
-        if self.host != _EVERYWHERE:
-            return frozenset({*_NAMES, self.host})
-        own = socket.gethostname()
-        addresses: list[str] = []
-        with suppress(OSError):
-            addresses = socket.gethostbyname_ex(own)[2]
-        return frozenset({*_NAMES, own, socket.getfqdn(), *addresses, _outward_address()})
 
     @property
     def cookie(self) -> str:
@@ -78,7 +61,7 @@ class Access:
     def refusal(self, scope: Scope) -> tuple[int, str] | None:
         """Check a request before its body is read; returns status and reason of a refusal."""
         headers = Headers(scope=scope)
-        hosts = {f"{name}:{self.port}" for name in self.names}
+        hosts = {f"{name}:{self.port}" for name in _NAMES}
         if headers.get("host") not in hosts:
             # Another site's name may resolve to this machine (DNS rebinding).
             return 400, "unknown host"
@@ -107,16 +90,6 @@ class Access:
         return any(
             hmac.compare_digest(text.encode("utf-8", "replace"), wanted) for text in given if text
         )
-
-
-def _outward_address() -> str:
-    """This machine's address in its network; nothing is sent to find it."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # reserved for documentation
-        except OSError:
-            return LOOPBACK
-        return str(probe.getsockname()[0])
 
 
 class Guard:

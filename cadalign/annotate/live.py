@@ -1,21 +1,28 @@
-"""Live alignment: the estimate from all photos of an object, as one shows it, drawn and told."""
+"""Live alignment: the estimate from what is marked, drawn and told."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 
-from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.lines import Wireframe, box_lines
 from cadalign.annotate.models import KeypointRegistry, ObjectShape
-from cadalign.annotate.problem import LEAST_JOINT_PAIRS, LEAST_PAIRS, Known
+from cadalign.annotate.problem import (
+    LEAST_JOINT_PAIRS,
+    LEAST_PAIRS,
+    LEAST_SIGMA,
+    Known,
+    LiveProblem,
+)
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
+from cadalign.errors import DegenerateError
 from cadalign.estimation.result import Result
+from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 from cadalign.io.evidence import LENGTHS
 from cadalign.io.observation import Observation
@@ -34,19 +41,77 @@ _UNCERTAIN_DEG = 60.0
 _UNDETERMINED = "not determined", "these pairs leave it open"
 
 
+@dataclass(frozen=True, eq=False)
+class LiveAlignment:
+    """Alignment of what is marked so far, with what the page shows of it."""
+
+    result: Result | None = None
+    message: str = ""  # reason for a missing result, or an assumption that was made
+    problem: LiveProblem | None = None  # what the result was computed from
+    sigma: float = LEAST_SIGMA  # standard deviation of the pairs [px], larger if the residuals are
+    fit_options: Mapping[str, Any] = field(default_factory=dict)
+    """With which, and the priors, `cadalign fit` finds the result."""
+
+    counts: BoolArray = field(default_factory=lambda: np.empty(0, dtype=bool))
+    """(n,), the complete pairs whose keypoints the shape knows."""
+    residuals: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    """(n, 2), projected minus placed points of all complete pairs [px]."""
+    outliers: Mapping[int, float] = field(default_factory=dict)
+    """Distances [px] of the pairs that contradict the others, by their rows."""
+    wireframe: Wireframe | None = None
+    """Lines of the model, warped to an own shape, in its frame before the stretch."""
+    prior_lengths: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """(3,), standard deviations of the logarithms of the lengths before any pair."""
+    also_used: tuple[str, ...] = ()  # evidence beyond the pairs
+
+    @classmethod
+    def of(cls, known: Known, observation: Observation) -> LiveAlignment:
+        """Align, with as few assumptions as the marks need; raises a CadalignError without."""
+        problem = LiveProblem.of(known, observation)
+        reason: DegenerateError | None = None
+        for attempt, assumed in problem.attempts():
+            try:
+                result, sigma, options = attempt.solve()
+            except DegenerateError as error:
+                reason = error
+                continue
+            if (stored := observation.fit_options.get("sigma")) is not None:
+                sigma, options = stored, {"sigma": stored}
+            text = assumed.format(reason="" if reason is None else reason.what) or attempt.unsaved
+            return cls(result, text, attempt, sigma, options)
+        assert reason is not None
+        raise reason
+
+    @property
+    def provisional(self) -> bool:
+        """True if the marks alone did not suffice, so that nothing is saved."""
+        return self.result is not None and bool(self.message)
+
+    @property
+    def camera(self) -> Camera:
+        """The photo's camera."""
+        assert self.result is not None
+        return self.result.camera
+
+    @property
+    def alignment(self) -> Alignment:
+        """The alignment in the photo's camera."""
+        assert self.result is not None
+        return self.result.alignment
+
+
 def live_alignment(
     estimate: LiveAlignment,
     known: Known,
     wireframe: Wireframe,
     observation: Observation,
-    place: int,
     points: Sequence[ModelKeypoint],
     uv: FloatArray,
 ) -> LiveAlignment:
-    """An estimate as the photo of a number shows it.
+    """An estimate as the page shows it.
 
-    ``points`` and ``uv`` (n, 2) [px] are the model points and photo points of all complete pairs of
-    the photo; the estimate was computed from the observation, and the wireframe is the model's.
+    ``points`` and ``uv`` (n, 2) [px] are the model points and photo points of all complete pairs;
+    the estimate was computed from the observation, and the wireframe is the model's.
     """
     result, problem, shape = estimate.result, estimate.problem, known.shape
     assert result is not None
@@ -54,22 +119,18 @@ def live_alignment(
     counts = shape.known(points)
     free = np.array([point.xyz for point in points], dtype=float).reshape(-1, 3)[~counts]
     lines, carried = _warped(wireframe, result, known, free)
-    camera = result.cameras[place]
     residuals = np.empty((len(points), 2))
-    residuals[counts] = result.views[place].residuals
-    residuals[~counts] = camera.project(result.poses[place].apply(carried)) - uv[~counts]
+    residuals[counts] = result.residuals
+    residuals[~counts] = result.camera.project(result.alignment.apply(carried)) - uv[~counts]
     rows = np.flatnonzero(counts)
-    judged = problem if problem.exact else problem.at_focal(result.cameras)
+    judged = problem if problem.exact else problem.at_focal(result.camera)
     prior = observation.fit_options.get("stretch_sigma") or np.inf
-    message = _assumed_text(known.assumed_focal, camera) or estimate.message
     return replace(
         estimate,
-        message=message,
-        fit_options={} if message else estimate.fit_options,
-        place=place,
+        fit_options={} if estimate.message else estimate.fit_options,
         counts=counts,
         residuals=residuals,
-        outliers={int(rows[row]): off for row, off in judged.contradicting(place).items()},
+        outliers={int(rows[row]): off for row, off in judged.contradicting().items()},
         wireframe=lines,
         prior_lengths=(
             shape.length_sigmas(problem.model)
@@ -80,7 +141,7 @@ def live_alignment(
     )
 
 
-def missing_text(counts: BoolArray, shape: ObjectShape, *, is_plain: bool, has_others: bool) -> str:
+def missing_text(counts: BoolArray, shape: ObjectShape, *, is_plain: bool) -> str:
     """Say how many more pairs the first alignment needs; empty if none.
 
     ``counts`` (n,) are the complete pairs that count, ``is_plain`` says that nothing else is used.
@@ -91,18 +152,7 @@ def missing_text(counts: BoolArray, shape: ObjectShape, *, is_plain: bool, has_o
     text = f"{missing} more pair{'s' if missing > 1 else ''} to the first alignment"
     if not counts.all() and shape.learned is not None:
         text += f": keypoints that {shape.learned.category} has, marked by rings on the model"
-    return f"{text} of this photo" if has_others else text
-
-
-def _assumed_text(photos: tuple[str, ...], camera: Camera) -> str:
-    """Say whose focal length is assumed; empty if none is."""
-    if not photos:
-        return ""
-    fix = "accept or correct it; until then the alignment is not saved."
-    if "" in photos:
-        return f"The focal length is assumed, {camera.fx:.0f} px. Choose 'known' to {fix}"
-    names = " and ".join(photos)
-    return f"The focal length of {names} is assumed. Choose 'known' in that photo to {fix}"
+    return text
 
 
 def _warped(
@@ -124,20 +174,19 @@ def drawing_of(
 ) -> dict[str, Any]:
     """Box and edges of the model and, for an own shape, its keypoints with regions that hold them.
 
-    Regions of keypoints that the model lacks are the faint ones. There are none in another view
-    than the first.
+    Regions of keypoints that the model lacks are the faint ones.
     """
     result, lines = live.result, live.wireframe
     assert result is not None
     assert lines is not None
     drawing: dict[str, Any] = {
-        "box": box_of(live),
+        "box": flat(box_lines(result.bounds, live.camera, live.alignment)),
         "lines": flat(lines.seen_in(live.camera, live.alignment)),
         "keypoints": [],
         "regions": [],
         "faint_regions": [],
     }
-    if not shape.is_estimated or live.place:
+    if not shape.is_estimated:
         return drawing
     in_camera = result.alignment.apply(result.points_3d)
     names = {shape.id_of(point): (point.name, number in used) for number, point in registry}
@@ -158,13 +207,6 @@ def drawing_of(
     return drawing
 
 
-def box_of(live: LiveAlignment) -> list[float]:
-    """The box of an estimate alone, as x1, y1, x2, y2, ...; empty without an estimate."""
-    if live.result is None:
-        return []
-    return flat(box_lines(live.result.bounds, live.camera, live.alignment))
-
-
 def flat(lines: FloatArray) -> list[float]:
     """Lines (k, 2, 2) as x1, y1, x2, y2, ... to a tenth of a pixel."""
     inside = lines[(np.abs(lines) < 1e6).all(axis=(1, 2))]
@@ -172,17 +214,13 @@ def flat(lines: FloatArray) -> list[float]:
 
 
 def evidence_labels(observation: Observation) -> tuple[str, ...]:
-    """Name what an observation holds beyond one photo's keypoints, for the page."""
-    views = observation.views
-    given = set().union(*(view.evidence.given for view in views))
-    if any(view.depths is not None for view in views):
+    """Name what an observation holds beyond keypoints, for the page."""
+    given = set(observation.evidence.given)
+    if observation.depths is not None:
         given.add("depth")
     labels = [label for name, label in _LABELS.items() if name in given]
-    if observation.fit_options.get("image") and any(not view.evidence.mask for view in views):
+    if observation.fit_options.get("image") and not observation.evidence.mask:
         labels.append("photo")
-    count = len(views) - 1
-    if count:
-        labels.append(f"{count} other view{'s' if count > 1 else ''}")
     size = observation.size
     if size is not None:
         known = [name for name in LENGTHS if getattr(size, name) is not None]
@@ -237,7 +275,6 @@ def notes_of(live: LiveAlignment, shape: ObjectShape) -> tuple[str, ...]:
             f"{others} other alignment{'s explain' if others > 1 else ' explains'} these pairs "
             f"{how}: one more pair tells them apart"
         )
-    notes += live.contradictions
     return (*notes, *(warning.replace("+-", "± ") for warning in result.warnings))
 
 
@@ -301,17 +338,10 @@ def _focal(live: LiveAlignment) -> Fact:
     if result.std is None or result.focal == "known":
         note = "assumed" if "focal length" in live.message else "taken as known"
         return Fact("Focal length", f"{focal:.0f} px", note)
-    if live.camera != result.camera:  # another lens, which is not in the covariance
-        return Fact("Focal length", f"{focal:.0f} px", "estimated")
     relative = result.std.focal
     if relative > _UNCERTAIN:
         return Fact("Focal length", *_UNDETERMINED)
-    others = live.others_focal
-    note = "estimated"
-    if others is not None:
-        percent = short(100 * others.relative_sigma)
-        note += f" with the photo's other objects, which say {others.focal:.0f} px ± {percent} %"
-    return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", note)
+    return Fact("Focal length", f"{focal:.0f} ± {short(focal * relative)} px", "estimated")
 
 
 def _unit(shape: ObjectShape) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,9 +12,8 @@ import numpy as np
 
 from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.lines import Wireframe
-from cadalign.annotate.locks import LastContent
 from cadalign.annotate.model import ClickableModel
-from cadalign.annotate.names import keypoints_file
+from cadalign.annotate.names import LastContent, keypoints_file
 from cadalign.annotate.options import SessionOptions
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
@@ -361,11 +359,6 @@ class Models:
         """The models that are open."""
         return tuple(self._models.values())
 
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Names of the models' files, with as much of their folders as tells them apart."""
-        return tuple(_told_apart(path, self.paths) for path in self.paths)
-
     def number_of(self, path: Path) -> int:
         """The number of the model of a file, which is added if it is not among them."""
         wanted = path.resolve()
@@ -436,12 +429,3 @@ def _is_others(path: Path, model: Path) -> bool:
         return False
     named = ModelKeypoints.load(path).model
     return named is not None and named.resolve() != model.resolve()
-
-
-def _told_apart(path: Path, paths: Sequence[Path]) -> str:
-    parts = path.resolve().parts
-    others = [other.resolve().parts for other in paths if other is not path]
-    for count in range(1, len(parts)):
-        if all(parts[-count:] != other[-count:] for other in others):
-            return os.path.join(*parts[-count:])
-    return path.name

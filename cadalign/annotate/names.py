@@ -1,35 +1,76 @@
-"""Names of an annotator's files, such that no two photos of a folder share one.
+"""Names of an annotator's files, such that no two photos of a folder share one, and their lock.
 
 The observation of `photo.jpg` is `photo.json`. It is `photo.jpg.json` where the shorter name might
 be another file's: photos of one folder differ only in their endings, or the name without its ending
-ends like a derived one (`photo.unfinished.jpg`, `chair.keypoints.jpg`, `photo.png.jpg`). An
-observation of an earlier session that names the photo is found under either name. Further objects
-of the photo are `photo.object-2.json` and so on.
+ends like a derived one (`chair.keypoints.jpg`, `photo.png.jpg`). An observation of an earlier
+session that names the photo is found under either name. Further objects of the photo are
+`photo-2.json` and so on.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import re
 import unicodedata
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-from cadalign.annotate.photos import FILE, MASK, SECOND_MASK
+from cadalign.annotate.photos import FILE
 from cadalign.datasets.models.model_keypoints import SUFFIX
 from cadalign.errors import DataError, InputError
 from cadalign.io.documents import path_from, read_json
+from cadalign.io.files import checksum, read_bytes, writing
 from cadalign.io.images import PHOTO_ENDINGS
 
 _MOST_BYTES = 255  # of a file's name, in the common file systems
-_EARLIER_UNFINISHED = ".unfinished.json"
-_DERIVED = (_EARLIER_UNFINISHED, SUFFIX, FILE)
-_AMBIGUOUS = (*(name.removesuffix(".json") for name in _DERIVED), *PHOTO_ENDINGS)
-_OBJECT = re.compile(r"\.object-([1-9][0-9]*)$")  # at the end of a stem
+_AMBIGUOUS = (*(name.removesuffix(".json") for name in (SUFFIX, FILE)), *PHOTO_ENDINGS)
 _OTHER_FOLDER = "give another --observation or --out"
+_LOCK = ".annotate-lock"
+
+
+@contextmanager
+def only_annotator(folder: Path) -> Iterator[None]:
+    """Keep other annotators off a folder; a killed process holds no lock. Raises DataError."""
+    with writing(folder):
+        lock = (folder / _LOCK).open("a")
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise DataError(
+                "another annotator has this folder open",
+                where=str(folder),
+                fix=f"go on in its page or end it, or {_OTHER_FOLDER}",
+            ) from None
+        yield
+
+
+@dataclass
+class LastContent:
+    """The content of a file as it was last read or written: who changes it is no annotator."""
+
+    _known: bytes | None = None  # its checksum; None without a file
+
+    def note(self, path: Path) -> None:
+        """Remember the content of the file, or that there is none."""
+        self._known = _content(path)
+
+    def refuse_changed(self, path: Path) -> None:
+        """Raise DataError if the file has other content by now."""
+        if _content(path) not in (None, self._known):
+            what = "was changed by another program since the annotator read or wrote it"
+            fix = "rename it to have all marks saved, or start anew to go on with that file"
+            raise DataError(what, where=str(path), fix=fix)
+
+
+def _content(path: Path) -> bytes | None:
+    return checksum(read_bytes(path)) if path.exists() else None
 
 
 def file_name(stem: str, ending: str) -> str:
@@ -50,46 +91,28 @@ def keypoints_file(model: Path, folder: Path, *, parents: int = 0) -> Path:
     return folder / file_name(".".join([*parts, model.stem]), SUFFIX)
 
 
-def earlier_unfinished_file(observation: Path) -> Path:
-    """Path of the file of unfinished pairs that earlier versions wrote beside an observation."""
-    return observation.with_name(file_name(observation.stem, _EARLIER_UNFINISHED))
+def free_mask_file(observation: Path) -> Path:
+    """Path of a new mask beside an observation: `.mask.png`, `.mask-2.png` and so on."""
+    endings = (f".mask{'' if number == 1 else f'-{number}'}.png" for number in count(1))
+    paths = (observation.with_name(file_name(observation.stem, ending)) for ending in endings)
+    return next(path for path in paths if not path.exists())
 
 
-def mask_files(observation: Path) -> tuple[Path, Path]:
-    """Paths of the mask beside an observation; the second where the first is another's file."""
-    first, second = (
-        observation.with_name(file_name(observation.stem, ending)) for ending in (MASK, SECOND_MASK)
-    )
-    return first, second
+def further_file(observation: Path, number: int) -> Path:
+    """Path of the observation of a photo's object of a number, beside that of the first."""
+    return observation.with_name(file_name(f"{observation.stem}-{number}", ".json"))
 
 
-def object_file(observation: Path, number: int) -> Path:
-    """Path of a further object's observation, beside the first object's."""
-    return observation.with_name(file_name(f"{observation.stem}.object-{number}", ".json"))
-
-
-def object_number(observation: Path) -> int:
-    """The number of the object in the name of its observation; 1 without one."""
-    found = _OBJECT.search(observation.stem)
-    return 1 if found is None else int(found[1])
-
-
-def object_files(observation: Path, photo: Path) -> list[Path]:
+def further_files(observation: Path, photo: Path) -> list[Path]:
     """Observations of a photo's further objects beside that of its first one, by number."""
-    folder = observation.parent
     try:
-        names = os.listdir(folder)
+        names = os.listdir(observation.parent)
     except OSError:  # it is not there yet
         return []
-    prefix = f"{observation.stem}.object-"
-    paths = [folder / name for name in names if name.startswith(prefix) and name.endswith(".json")]
-    found = [
-        path
-        for path in paths
-        if path == object_file(observation, object_number(path))
-        and any(other.samefile(photo) for other in _named_photos(path))
-    ]
-    return sorted(found, key=object_number)
+    pattern = re.compile(re.escape(observation.stem) + r"-([1-9][0-9]*)\.json")
+    numbers = sorted(int(found[1]) for name in names if (found := pattern.fullmatch(name)))
+    paths = [further_file(observation, number) for number in numbers]
+    return [path for path in paths if any(each.samefile(photo) for each in _named_photos(path))]
 
 
 def observation_file(photo: Path, folder: Path, others: Iterable[Path] = ()) -> Path:
@@ -104,11 +127,9 @@ def observation_file(photo: Path, folder: Path, others: Iterable[Path] = ()) -> 
         if any(other.samefile(photo) for other in found):
             return path
     taken = {path for path, found in named.items() if found} | set(others)
-    if not _has_namesake(photo) and short not in taken:
-        stem = _folded(photo.stem)
-        is_plain = not stem.endswith(_AMBIGUOUS) and _OBJECT.search(stem) is None
-        if is_plain or _observation(short):
-            return short
+    is_plain = not _folded(photo.stem).endswith(_AMBIGUOUS) or bool(_observation(short))
+    if is_plain and short not in taken and not _has_namesake(photo):
+        return short
     if full not in taken:
         return full
     owner = f"the photo {named[full][0]}" if named[full] else "another photo of its name"

@@ -37,10 +37,6 @@ class FileOptions:
     up_axis: Literal["x", "y", "z"] | None = None
     """The models' axis that points up, for their view and for gravity; by default the observation
     file's, or y."""
-    models: tuple[Path, ...] = ()
-    """Further models that objects in the photos can have."""
-    further_photos: tuple[Path, ...] = ()
-    """Further photos, such as other views of the same object, which the page can add to it."""
     detections: Path | None = None
     """Keypoints of a detector, to confirm or correct: COCO's JSON, MMPose's, ultralytics'
     or CSV, with the photos' file names and the names of the model's keypoints."""

@@ -3,68 +3,58 @@
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from cadalign.annotate.actions import MIRRORED
-from cadalign.annotate.estimate import LiveAlignment
+from cadalign.annotate.annotation import Annotation
 from cadalign.annotate.evidence import MarkedLengths, find_up
-from cadalign.annotate.live import box_of, drawing_of, facts_of, notes_of
-from cadalign.annotate.object_actions import ActionOutcome
-from cadalign.annotate.objects import PhotoState, shown_objects
+from cadalign.annotate.evidence_actions import ActionOutcome
+from cadalign.annotate.live import LiveAlignment, drawing_of, facts_of, notes_of
 from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
 from cadalign.io.documents import read_json
 from cadalign.io.evidence import LENGTHS
 
-_VIEW = re.compile(r"views\[(\d+)\]")
-
 
 def page_state(
-    session: Session, number: int, outcome: ActionOutcome | None = None, *, slot: int | None = None
+    session: Session, number: int, outcome: ActionOutcome | None = None
 ) -> dict[str, Any]:
-    """Collect everything that the page shows of an object, after an action of that outcome.
+    """Collect everything that the page shows of an annotation, after an action of that outcome.
 
-    It is an object of the photo of a number, or the one that the outcome goes on with.
+    It is the one of a number, or the one that the outcome goes on with.
     """
     outcome = outcome or ActionOutcome()
     with session.lock:
-        state = outcome.shown or session.photo_state(number, slot)
-        number, slot = state.place
+        state = outcome.shown or session.annotation(number)
         live, suggestion = session.live(state)
         document, registry, cad = state.document, state.model.registry, state.model.cad
-        history, used = state.owner.history, document.keypoints
-        deleted = session.last_deleted(number)
-        photos = [_view(view) | {"is_current": view is state} for view in state.owner.shown]
-        taken = {photo["number"] for photo in photos}
+        history, used = state.history, document.keypoints
         return {
             "revision": history.revision,
             "image": {
-                "number": number,
-                "object": slot,
-                "count": len(session.objects),
-                "name": state.photo.path.name,
+                "number": state.number,
+                "count": len(session.photos),
+                "name": state.name,
                 "width": state.photo.width,
                 "height": state.photo.height,
                 "model": state.model.path.name,
-                "up_axis": state.owner.up_axis or "y",
+                "up_axis": state.stored.up_axis or "y",
                 "model_number": session.models.number_of(state.model.path),
                 "has_library": session.choice is not None,
                 "state": session.work_state(state),
             },
             "saved": {
-                "path": state.owner.files.observation.name,
-                "at": state.owner.saved_at,
-                "trouble": state.owner.save_error,
+                "path": state.files.observation.name,
+                "at": state.saved_at,
+                "trouble": state.save_error,
             },
             "selected": outcome.selected,
             "message": outcome.message or _moved(state),
-            "can_undo": bool(history.before)
-            or session.last_deleted(number, at_once=True) is not None,
+            "can_undo": bool(history.before),
             "can_redo": bool(history.after),
             "focal": {
                 "known": document.focal.known,
@@ -99,49 +89,25 @@ def page_state(
                 "uv": suggestion.uv,
                 "text": suggestion.text,
             },
-            "objects": [
-                _object(each) | {"is_current": each is state}
-                for each in shown_objects(session.objects[number])
-            ],
-            "views": photos,
-            "further_photos": [
-                {"number": other, "name": states[0].photo.path.name}
-                for other, states in enumerate(session.objects)
-                if other not in taken
-            ],
-            "models": list(session.models.labels),
-            "deleted": None if deleted is None else deleted.label,
         }
 
 
 def worklist_state(session: Session) -> list[dict[str, Any]]:
-    """All photos with their state, objects, number of pairs, and residual.
-
-    The residual is the root mean square of the object whose pairs agree worst [px].
-    """
-    found = []
+    """All annotations with their state, number of pairs, and residual [px]."""
     with session.lock:
-        for number, states in enumerate(session.objects):
-            shown = shown_objects(states)
-            pairs = [len(each.document.complete_pairs) for each in shown]
-            residuals = [_rms(each) for each in shown]
-            found.append(
-                {
-                    "number": number,
-                    "name": shown[0].photo.path.name,
-                    "state": session.work_state(shown[0]),
-                    "pairs": sum(pairs),
-                    "rms": max((rms for rms in residuals if rms is not None), default=None),
-                    "objects": [
-                        {"label": each.label, "pairs": count, "rms": rms}
-                        for each, count, rms in zip(shown, pairs, residuals, strict=True)
-                    ],
-                }
-            )
-    return found
+        return [
+            {
+                "number": number,
+                "name": each.name,
+                "state": session.work_state(each),
+                "pairs": len(each.document.complete_pairs),
+                "rms": _rms(each),
+            }
+            for number, each in enumerate(session.photos)
+        ]
 
 
-def _evidence(state: PhotoState) -> dict[str, Any]:
+def _evidence(state: Annotation) -> dict[str, Any]:
     """Marks beside the pairs; ``mask`` changes with the mask, None without one."""
     evidence = state.document.evidence
     found = find_up(evidence.verticals, state.camera)
@@ -154,11 +120,11 @@ def _evidence(state: PhotoState) -> dict[str, Any]:
         "gravity_sigma": None if sigma is None else round(sigma, 1),
         "lengths": {name: getattr(lengths, name) for name in LENGTHS},
         "length_sigma": lengths.sigmas[0] if lengths.sigmas else None,
-        "photo": state.owner.document.evidence.photo,
+        "photo": evidence.photo,
     }
 
 
-def _priors(state: PhotoState) -> dict[str, Any]:
+def _priors(state: Annotation) -> dict[str, Any]:
     """Priors on the stretch [%] and on the focal length: chosen ones and likely ones."""
     priors = state.document.priors
     likely = priors.focal or state.intrinsics.likely_focal
@@ -169,11 +135,11 @@ def _priors(state: PhotoState) -> dict[str, Any]:
         "focal": priors.focal is not None,
         "about": f"{likely.focal:.0f} px ± {100 * likely.relative_sigma:.0f} % ({source})",
         "has_stretch": not state.session.shape.is_estimated,
-        "has_focal": state.is_first and state.estimates_focal,
+        "has_focal": not state.document.focal.known,
     }
 
 
-def _shape(state: PhotoState) -> dict[str, Any] | None:
+def _shape(state: Annotation) -> dict[str, Any] | None:
     shape = state.session.shape
     if not shape.is_estimated:
         return None
@@ -184,7 +150,7 @@ def _shape(state: PhotoState) -> dict[str, Any] | None:
     }
 
 
-def _moved(state: PhotoState) -> str:
+def _moved(state: Annotation) -> str:
     """Say that the photo or the model is no longer where it was; empty while both are."""
     needed = state.photo.path, state.model.path
     gone = [path.name for path in needed if not os.path.exists(path)]
@@ -192,11 +158,11 @@ def _moved(state: PhotoState) -> str:
         return ""
     return (
         f"{' and '.join(gone)}: moved, renamed or deleted. Go on here, or start anew with the new "
-        f"name and --observation {state.owner.files.observation.name}."
+        f"name and --observation {state.files.observation.name}."
     )
 
 
-def _pairs(state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
+def _pairs(state: Annotation, live: LiveAlignment) -> list[dict[str, Any]]:
     """The pairs with their residuals and, of pairs with one half, the other one's likely place."""
     session, opened, document = state.session, state.model, state.document
     cad, pairs, row = opened.cad, [], 0
@@ -204,7 +170,6 @@ def _pairs(state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
     for pair in document.pairs:
         entry: dict[str, Any] = {
             "pair": pair.number,
-            "position": pair.number,
             "uv": pair.uv,
             "keypoint": pair.keypoint,
             "name": "",
@@ -235,11 +200,11 @@ def _pairs(state: PhotoState, live: LiveAlignment) -> list[dict[str, Any]]:
     return pairs
 
 
-def _alignment(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
+def _alignment(state: Annotation, live: LiveAlignment) -> dict[str, Any]:
     result, cad, session = live.result, state.model.cad, state.session
     if result is None:
-        message = _with_photo_names(state, live.message)
-        return {"status": "none" if session.ready else "preparing", "message": message}
+        status = "none" if session.ready else "preparing"
+        return {"status": status, "message": _named(state, live.message)}
     camera, alignment = live.camera, live.alignment
     # The rows of the matrix (4, 4) that places the displayed model; a warped one has none.
     matrix = np.eye(4)
@@ -250,7 +215,7 @@ def _alignment(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
         "status": "done",
         "message": "",
         "facts": [asdict(fact) for fact in facts_of(live, session.shape)],
-        "notes": [_with_photo_names(state, note) for note in notes_of(live, session.shape)],
+        "notes": [_named(state, note) for note in notes_of(live, session.shape)],
         "also_used": ", ".join(live.also_used),
         "alignment": alignment.to_dict(),
         "eye": cad.to_display(alignment.inverse(np.zeros((1, 3)))[0]).tolist(),
@@ -262,50 +227,17 @@ def _alignment(state: PhotoState, live: LiveAlignment) -> dict[str, Any]:
     }
 
 
-def _with_photo_names(state: PhotoState, text: str) -> str:
-    """A text of the estimate with the photos' names for the views' numbers."""
-    if not _VIEW.search(text):
-        return text
-    images = [view.image for view in state.observation().views]
-
-    def name(found: re.Match[str]) -> str:
-        image = images[int(found[1])]
-        return f"view {int(found[1]) + 1}" if image is None else image.name
-
-    return _VIEW.sub(name, text)
+def _named(state: Annotation, text: str) -> str:
+    """A text of the estimate with the photo's name."""
+    return text.replace("views[0]", state.photo.path.name)
 
 
-def _object(state: PhotoState) -> dict[str, Any]:
-    """One object of the photo; its box as x1, y1, x2, y2, ... [px]."""
-    models = state.session.models
-    live, _ = state.session.live(state)
-    return {
-        "object": state.place[1],
-        "label": state.label,
-        "name": state.document.name,
-        "model": models.labels[models.number_of(state.model.path)],
-        "pairs": len(state.document.complete_pairs),
-        "box": box_of(live),
-    }
-
-
-def _view(state: PhotoState) -> dict[str, Any]:
-    number, slot = state.place
-    return {
-        "number": number,
-        "object": slot,
-        "name": state.photo.path.name,
-        "pairs": len(state.document.complete_pairs),
-        "is_first": state.is_first,
-    }
-
-
-def _rms(state: PhotoState) -> float | None:
+def _rms(state: Annotation) -> float | None:
     """Residual of the saved alignment, which is not computed anew for a list of many photos."""
-    if not state.document.complete_pairs or not state.owner.files.fit.exists():
+    if not state.document.complete_pairs or not state.files.fit.exists():
         return None
     try:
-        rms = read_json(state.owner.files.fit).get("rms")
+        rms = read_json(state.files.fit).get("rms")
     except CadalignError:
         return None
     return rms if isinstance(rms, float) else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, cast
@@ -29,8 +29,7 @@ Mark = Literal["done", "skipped"]
 State = Literal["to do", "begun", "done", "skipped"]
 FILE = "cadalign.worklist.json"
 _FORMAT = "cadalign work list"
-MASK, SECOND_MASK = ".mask.png", ".mask-2.png"
-"""Endings of the files of masks; the second is for one that is painted over the first."""
+_MASK = re.compile(r"\.mask(-[0-9]+)?\.png$")  # at the end of the name of a mask's file
 _SHOWN_AS_IS = {"JPEG": "image/jpeg", "PNG": "image/png", "WEBP": "image/webp"}
 _ORIENTATION = 0x0112  # the EXIF tag
 _TURNED = range(2, 9)  # its values for photos that are not stored upright
@@ -106,13 +105,11 @@ def find_photos(path: Path) -> list[Path]:
     return [path]
 
 
-def _is_mask(path: Path, stems: Collection[str]) -> bool:
+def _is_mask(path: Path, stems: Set[str]) -> bool:
     """True for a mask of another photo of the folder, as the annotator names them."""
-    stem = path.name.removesuffix(MASK).removesuffix(SECOND_MASK)
-    if stem == path.name:
-        return False
-    # The mask of a further object or view has more between the photo's name and the ending.
-    return any(stem == photo or stem.startswith(f"{photo}.") for photo in stems)
+    stem = _MASK.sub("", path.name)
+    # The mask of a further object has its number between the photo's name and the ending.
+    return stem != path.name and not stems.isdisjoint({stem, re.sub(r"-[0-9]+$", "", stem)})
 
 
 @dataclass(frozen=True)
@@ -222,11 +219,7 @@ class _File(Document):
 
 @dataclass(frozen=True)
 class WorkList:
-    """Photos that are marked as done or skipped, and the file of the list.
-
-    A photo goes by its path relative to the list's folder, which of those in it is their name.
-    Earlier versions wrote the name of every photo.
-    """
+    """Photos that are marked as done or skipped, by their paths, and the file of the list."""
 
     path: Path
     marks: Mapping[str, Mark] = field(default_factory=dict)
@@ -244,25 +237,20 @@ class WorkList:
 
     def state(self, photo: Path, *, pairs: int) -> State:
         """The state of a photo of so many pairs."""
-        found = next((self.marks[key] for key in self._keys(photo) if key in self.marks), None)
-        return found or ("begun" if pairs else "to do")
+        return self.marks.get(self._key(photo)) or ("begun" if pairs else "to do")
 
     def marked(self, photo: Path, mark: Mark | None) -> WorkList:
         """The list with a photo marked, or without its mark; its file is written."""
-        keys = self._keys(photo)
-        marks = {name: kept for name, kept in self.marks.items() if name not in keys}
+        key = self._key(photo)
+        marks = {name: kept for name, kept in self.marks.items() if name != key}
         if mark is not None:
-            marks[keys[0]] = mark
+            marks[key] = mark
         write_json(self.path, {"format": _FORMAT, "photos": dict(sorted(marks.items()))})
         return WorkList(self.path, marks)
 
-    def _keys(self, photo: Path) -> tuple[str, ...]:
-        """Names of a photo in the list, and in those of earlier versions."""
-        folder = self.path.parent
-        own = written_path(photo.absolute(), folder=folder.absolute())
-        # The name is that of a photo in the folder if there is one.
-        is_earlier = own != photo.name and not (folder / photo.name).exists()
-        return (own, photo.name) if is_earlier else (own,)
+    def _key(self, photo: Path) -> str:
+        """The path of a photo, relative to the list's folder."""
+        return written_path(photo.absolute(), folder=self.path.parent.absolute())
 
 
 def nearest_corner(image: npt.NDArray[np.uint8], uv: Pixel, *, reach: float) -> Pixel | None:

@@ -46,7 +46,7 @@ _NOISE_EQUATIONS = 4
 _FIRST_NOISE = 4.0  # over the expected one
 _NOISE_ROUNDS = 12
 _NOISE_TOLERANCE = 0.02
-_POSE_UNKNOWNS, _STRETCH_UNKNOWNS = 6, 2
+_UNKNOWNS = 8  # of a pose and a stretch
 _LEAST_JUDGED = 6  # pairs from which on one can contradict the others
 _CONTRADICTS = 5.0  # distance from the others' prediction [sigmas]; hands click to about 2 px
 _FOCAL_ASSUMED = "The focal length is assumed: add a pair elsewhere to have it estimated."
@@ -60,10 +60,8 @@ class Known:
     mesh: Mesh  # the model's
     anchors: Mapping[Any, ModelKeypoint] = field(default_factory=dict)
     """The model's keypoints that the shape knows, by their ids there."""
-    assumed_focal: tuple[str, ...] = ()
-    """Photos whose focal length is neither known nor estimated, this one by an empty name."""
-    estimates_focal: bool = False  # estimate the focal lengths of all photos
-    focal_prior: FocalPrior | None = None  # on these
+    estimates_focal: bool = False
+    focal_prior: FocalPrior | None = None  # on an estimated focal length
     by_mask: dict[Camera, Result] = field(default_factory=dict)
     """Estimates by the mask alone, by the camera; kept while nothing but pairs changes."""
 
@@ -73,8 +71,8 @@ class Known:
         A similar one has keypoints that no pair shows, too, where they do not change the estimate.
         """
         shape = self.shape
-        is_single = shape.is_estimated and not observation.others
-        if shape.learned is not None or (is_single and not _shows_surface(observation)):
+        is_similar = shape.sigma is not None
+        if shape.learned is not None or (is_similar and not _shows_surface(observation)):
             points = self.anchors.values()
             return shape.model_with(points, self.mesh, up_axis=observation.up_axis)
         options = FitOptions(stretch_sigma=observation.fit_options.get("stretch_sigma"))
@@ -90,7 +88,7 @@ class LiveProblem:
     """
 
     model: Model | ShapeModel
-    views: tuple[View, ...]
+    view: View
     size: Size | None
     noise: str
     estimates_focal: bool
@@ -103,18 +101,16 @@ class LiveProblem:
         """The problem of an observation, with the options of a fit that it holds."""
         options, model = observation.fit_options, known.model_for(observation)
         sigma, has_photos = options.get("sigma"), bool(options.get("image"))
-        views = views_of(observation, model, sigma=sigma, with_photos=has_photos)
-        own = any(view.sigma is not None for view in observation.views)
+        (view,) = views_of(observation, model, sigma=sigma, with_photos=has_photos)
         noise = "given"
-        is_shaped, is_marked = known.shape.is_estimated, any(len(v.keypoint_ids) for v in views)
-        if not is_shaped and sigma is None and is_marked:
+        if not known.shape.is_estimated and sigma is None and len(view.keypoint_ids):
             has_prior = options.get("stretch_sigma") is not None
-            if has_prior and (observation.is_plain or not own):
+            if has_prior and (observation.is_plain or observation.sigma is None):
                 noise = "settled"
             elif not has_prior and observation.is_plain:
                 noise = "scaled"
         focal = known.estimates_focal, known.focal_prior
-        return cls(model, views, observation.size, noise, *focal, observation.init, known.by_mask)
+        return cls(model, view, observation.size, noise, *focal, observation.init, known.by_mask)
 
     @property
     def exact(self) -> Model | None:
@@ -129,7 +125,7 @@ class LiveProblem:
         That does not know a similar model's other keypoints.
         """
         is_similar = self.exact is None and isinstance(self.model, Model)
-        if is_similar and not any(len(view.keypoint_ids) for view in self.views):
+        if is_similar and not len(self.view.keypoint_ids):
             return "It is saved from the first pair on."
         return ""
 
@@ -142,7 +138,7 @@ class LiveProblem:
         if not (self.is_by_mask and self.estimates_focal):  # which a mask alone leaves open
             yield problem, ""
         if self.estimates_focal:
-            problem = problem.at_focal([view.camera for view in self.views])
+            problem = problem.at_focal(self.view.camera)
             yield problem, _FOCAL_ASSUMED
         if self.exact is None:
             return
@@ -155,38 +151,34 @@ class LiveProblem:
         rigid = replace(self.exact, stretch_sigma=None, stretch="none")
         yield replace(problem, model=rigid), "The model is shown unstretched: add a pair elsewhere."
 
-    def at_focal(self, cameras: Sequence[Camera]) -> LiveProblem:
-        """The problem with the focal lengths of these cameras known."""
-        views = zip(self.views, cameras, strict=True)
-        known = tuple(replace(view, camera=camera) for view, camera in views)
-        return replace(self, views=known, estimates_focal=False, focal_prior=None)
+    def at_focal(self, camera: Camera) -> LiveProblem:
+        """The problem with the focal length of this camera known."""
+        view = replace(self.view, camera=camera)
+        return replace(self, view=view, estimates_focal=False, focal_prior=None)
 
     def weighted(self, factor: float) -> LiveProblem:
         """The problem with each pair's standard deviation times a factor."""
-        views = (replace(view, sigma=factor * cast(FloatArray, view.sigma)) for view in self.views)
-        return replace(self, views=tuple(views))
+        sigma = factor * cast(FloatArray, self.view.sigma)
+        return replace(self, view=replace(self.view, sigma=sigma))
 
     def align(self, **options: Any) -> Result:
         """Call `cadalign.align`; raises a CadalignError if that is impossible."""
         if self.estimates_focal:
             options |= {"focal": "estimate", "focal_prior": self.focal_prior}
         init = self.init
-        if self.is_by_mask and len(self.views[0].keypoint_ids):
+        if self.is_by_mask and len(self.view.keypoint_ids):
             init = self._start_by_mask()
-        return align(self.model, self.views, size=self.size, init=init, **options)
+        return align(self.model, self.view, size=self.size, init=init, **options)
 
     @property
     def is_by_mask(self) -> bool:
-        """True if the search begins at what the mask of the only view allows."""
-        if self.exact is None:
-            return False
-        view = self.views[0]
-        few = len(self.views) == 1 and len(view.keypoint_ids) < LEAST_JOINT_PAIRS
-        return few and view.mask is not None and self.init is None
+        """True if the search of an exact model begins at what the mask allows."""
+        few = len(self.view.keypoint_ids) < LEAST_JOINT_PAIRS
+        return self.exact is not None and few and self.view.mask is not None and self.init is None
 
     def _start_by_mask(self) -> Alignment:
         """The alignment by the mask alone that agrees best with the pairs."""
-        (view,), model = self.views, self.exact
+        view, model = self.view, self.exact
         assert model is not None
         if view.camera not in self.by_mask:
             alone = replace(without_keypoints(view), image=None)
@@ -207,38 +199,34 @@ class LiveProblem:
             return self.weighted(factor).align(), factor, {"sigma": self._sigmas(factor)}
         result = self.align()
         squares, count = self._residuals(result)
-        redundancy = 2 * count - self._unknowns - self.estimates_focal
+        redundancy = 2 * count - _UNKNOWNS - self.estimates_focal
         factor = math.sqrt(squares / redundancy) if redundancy > 0 else 0.0
         if self.noise == "given" or factor <= LEAST_SIGMA:
             return result, LEAST_SIGMA, {}
-        if np.ndim(np.asarray(self.views[0].sigma)):
+        if np.ndim(np.asarray(self.view.sigma)):
             options = {"sigma": self._sigmas(factor)}
             return self.weighted(factor).align(), factor, options
-        (view,) = self.views
-        estimated = replace(self, views=(replace(view, sigma=None),))
+        estimated = replace(self, view=replace(self.view, sigma=None))
         return estimated.align(), factor, {"sigma": None}
 
-    def contradicting(self, place: int) -> dict[int, float]:
-        """Distances [px] of the pairs of a photo that contradict its others, by their rows."""
-        view, model = self.views[place], self.exact
-        pairs = replace(
-            self,
-            views=(View(view.camera, view.points_2d, ids=view.ids, sigma=view.sigma),),
-            size=None,
-        )
+    def contradicting(self) -> dict[int, float]:
+        """Distances [px] of the pairs that contradict the others, by their rows."""
+        view, model = self.view, self.exact
+        alone = View(view.camera, view.points_2d, ids=view.ids, sigma=view.sigma)
+        pairs = replace(self, view=alone, size=None)
         if model is None:
             return pairs.left_out()
         points = _points_of(model, view.keypoint_ids)
-        unknowns = _POSE_UNKNOWNS + _STRETCH_UNKNOWNS + self.estimates_focal
+        unknowns = _UNKNOWNS + self.estimates_focal
         observed = np.asarray(view.points_2d)
         return find_outliers(points, observed, pairs.fit_rows, unknowns=unknowns)
 
     def fit_rows(self, rows: Rows, robust: bool) -> PlacedRows:
-        """Align some pairs of the only view; see `find_outliers`."""
-        (view,) = self.views
+        """Align some pairs; see `find_outliers`."""
+        view = self.view
         ids = tuple(view.keypoint_ids[row] for row in rows)
         points = np.asarray(view.points_2d)[rows]
-        alone = replace(self, views=(View(view.camera, points, ids=ids, sigma=LEAST_SIGMA),))
+        alone = replace(self, view=View(view.camera, points, ids=ids, sigma=LEAST_SIGMA))
         result = alone.align()
         for _ in range(_ROBUST_ROUNDS if robust else 0):
             # sigma=None iterates until nothing changes, which takes ten times as long.
@@ -248,8 +236,8 @@ class LiveProblem:
         return result.alignment, result.camera, result.fisher_covariance
 
     def left_out(self) -> dict[int, float]:
-        """Distances [px] of the pairs that a robust search among the only view's leaves out."""
-        if len(self.views[0].keypoint_ids) < _LEAST_JUDGED:
+        """Distances [px] of the pairs that a robust search leaves out."""
+        if len(self.view.keypoint_ids) < _LEAST_JUDGED:
             return {}
         try:
             robust = self.align(ransac=RansacOptions(max_reproj_error=_CONTRADICTS))
@@ -264,24 +252,22 @@ class LiveProblem:
         It is the fixed point of its estimate, reached from above, so that residuals first count as
         noise, and as a stretch only where the noise does not explain them.
         """
-        sides = [max(view.camera.width, view.camera.height) for view in self.views]
-        expected = _EXPECTED_NOISE * sum(sides) / len(sides)
+        expected = _EXPECTED_NOISE * max(self.view.camera.width, self.view.camera.height)
         factor = _FIRST_NOISE * expected
-        # Without masks and photos and with the focal lengths of the first round, which take long.
-        bare = tuple(replace(view, mask=None, mask_sigma=None, image=None) for view in self.views)
-        near = replace(self, views=bare)
+        # Without mask and photo and with the focal length of the first round, which take long.
+        near = replace(self, view=replace(self.view, mask=None, mask_sigma=None, image=None))
         for _ in range(_NOISE_ROUNDS):
             try:
                 result = near.weighted(factor).align()
             except CadalignError:
-                if all(view.mask is None for view in self.views):
+                if self.view.mask is None:
                     raise
-                return expected  # it takes the masks
+                return expected  # it takes the mask
             if near.estimates_focal:
-                near = near.at_focal(result.cameras)
+                near = near.at_focal(result.camera)
             before = factor
             squares, count = self._residuals(result)
-            redundancy = max(0, 2 * count - self._unknowns)
+            redundancy = max(0, 2 * count - _UNKNOWNS)
             factor = math.sqrt(
                 (squares + _NOISE_EQUATIONS * expected**2) / (redundancy + _NOISE_EQUATIONS)
             )
@@ -291,21 +277,15 @@ class LiveProblem:
 
     def _residuals(self, result: Result) -> tuple[float, int]:
         """The sum of the squared residuals over the pairs' own sigmas, and their number."""
-        squares = 0.0
-        for view, given in zip(result.views, self.views, strict=True):
-            if len(view.residuals):
-                sigma = np.reshape(cast(FloatArray, given.sigma), (-1, 1))
-                squares += float(((view.residuals / sigma) ** 2).sum())
-        return squares, len(result.residuals)
-
-    @property
-    def _unknowns(self) -> int:
-        is_rigid = self.views[0].cam_from_rig is not None
-        return _POSE_UNKNOWNS * (1 if is_rigid else len(self.views)) + _STRETCH_UNKNOWNS
+        residuals = result.residuals
+        if not len(residuals):
+            return 0.0, 0
+        sigma = np.reshape(cast(FloatArray, self.view.sigma), (-1, 1))
+        return float(((residuals / sigma) ** 2).sum()), len(residuals)
 
     def _sigmas(self, factor: float) -> float | list[float]:
         """The option of the fit for the pairs' standard deviations times a factor."""
-        given = np.asarray(self.views[0].sigma)
+        given = np.asarray(self.view.sigma)
         return (factor * given).tolist() if given.ndim else factor
 
 
@@ -325,3 +305,19 @@ def _points_of(model: Model, ids: Sequence[Hashable]) -> FloatArray:
     """Keypoints (n, 3) of a model by their ids."""
     rows = {each: row for row, each in enumerate(model.ids or ())}
     return np.asarray(model.points_3d)[[rows[each] for each in ids]]
+
+
+def warm_up(points_3d: FloatArray, points_2d: FloatArray, camera: Camera, *, joint: bool) -> None:
+    """Compile or load what alignments call, by aligning points (n, 3) with (n, 2) [px]."""
+    view, prior = View(camera, points_2d, sigma=1.0), FocalPrior(camera.fx, 0.4)
+    exact = Model(points_3d=points_3d, stretch_sigma=LIKELY_STRETCH)
+    for estimates_focal in (False, True):
+        problem = LiveProblem(exact, view, None, "settled", estimates_focal, prior)
+        problem.solve()
+        problem.contradicting()
+    if joint:
+        similar = Model(points_3d=points_3d, shape_sigma=0.01)
+        for estimates_focal in (False, True):
+            problem = LiveProblem(similar, view, None, "given", estimates_focal, None)
+            problem.solve()
+            problem.left_out()

@@ -6,22 +6,22 @@ from typing import Any
 
 import numpy as np
 
-from cadalign.annotate.objects import filled
+from cadalign.annotate.annotation import filled
 from cadalign.annotate.problem import LEAST_PAIRS
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
 from cadalign.retrieval.page import score_text
 
 
-def ranking_state(session: Session, number: int, *, slot: int | None = None) -> dict[str, Any]:
+def ranking_state(session: Session, number: int) -> dict[str, Any]:
     """Rank the models by the pairs of an object, as `cadalign retrieve` ranks them by its file.
 
     Pairs of points that no model of the library has don't count. Without a known focal length the
     alignment's, else a likely one, is taken.
     """
     with session.lock:
-        state, choice = session.photo_state(number, slot), session.choice
-        revision = state.owner.history.revision
+        state, choice = session.annotation(number), session.choice
+        revision = state.history.revision
         answer: dict[str, Any] = {"revision": revision, "note": "", "none": None, "models": []}
         if choice is None:
             return answer | {"note": "The session has no library: start it with --library."}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import secrets
 import socket
 from collections.abc import Callable
 from functools import partial
@@ -21,9 +20,9 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from cadalign.annotate.actions import perform
+from cadalign.annotate.annotation import Annotation
 from cadalign.annotate.guard import Access, BoundedProtocol, Guard
 from cadalign.annotate.library import thumbnail_of
-from cadalign.annotate.locks import Claims
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
 from cadalign.annotate.page_state import page_state, worklist_state
@@ -34,20 +33,11 @@ from cadalign.web import asset
 
 _LONGEST_NUMBER = 9  # digits
 _BYTES = "application/octet-stream"
-_BROWSER = "cadalign-browser"  # cookie that identifies the browser, for all of its tabs
-
-
-_OF_OBJECT = {"state": page_state, "models": ranking_state}
-"""Plain data of one object of a photo, by the address."""
 
 
 def make_app(session: Session, access: Access) -> ASGIApp:
     """Make the guarded application."""
     routes = _Routes(session, access)
-    data = {
-        f"/{name}/{{number:int}}": partial(routes.data, answer)
-        for name, answer in _OF_OBJECT.items()
-    }
     answers: dict[str, Callable[[Request], Response]] = {
         "/": routes.page,
         "/annotate.js": partial(_asset, "annotate.js", "text/javascript"),
@@ -58,9 +48,9 @@ def make_app(session: Session, access: Access) -> ASGIApp:
         "/worklist": routes.worklist,
         "/thumbnail/{number:int}": routes.thumbnail,
         "/mask/{number:int}": routes.mask,
-        "/claim/{number:int}": routes.claim,
         "/library/{number:int}.jpg": routes.library,
-        **data,
+        "/state/{number:int}": partial(routes.data, page_state),
+        "/models/{number:int}": partial(routes.data, ranking_state),
     }
     app = Starlette(
         routes=[
@@ -72,22 +62,16 @@ def make_app(session: Session, access: Access) -> ASGIApp:
     return Guard(app, access)
 
 
-def listen(port: int, host: str = LOOPBACK) -> socket.socket:
-    """Open a socket on an interface of this machine; port 0 chooses a free one."""
+def listen(port: int) -> socket.socket:
+    """Open a socket that only this machine reaches; port 0 chooses a free one."""
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((host, port))
+        listener.bind((LOOPBACK, port))
         listener.listen()  # connections wait until the server runs
     except (OSError, OverflowError) as error:
         listener.close()
         reason = getattr(error, "strerror", None) or str(error)
-        if host != LOOPBACK:
-            raise InputError(
-                f"{host}, port {port} cannot be opened ({reason})",
-                where="--host",
-                fix="give an address of this machine, or 0.0.0.0 for all",
-            ) from None
         raise InputError(
             f"port {port} cannot be opened ({reason})",
             where="--port",
@@ -121,15 +105,11 @@ class _Routes:
         self._session = session
         self._access = access
         self._models: dict[int, bytes] = {}
-        self._claims = Claims()
 
     def page(self, request: Request) -> Response:
         response = Response(asset("annotate.html"), media_type="text/html")
-        cookies = {self._access.cookie: self._access.token}
-        if _BROWSER not in request.cookies:
-            cookies[_BROWSER] = secrets.token_urlsafe(12)
-        for name, value in cookies.items():
-            response.set_cookie(name, value, httponly=True, samesite="strict")
+        cookie, token = self._access.cookie, self._access.token
+        response.set_cookie(cookie, token, httponly=True, samesite="strict")
         return response
 
     def model(self, request: Request) -> Response:
@@ -144,14 +124,14 @@ class _Routes:
         return Response(detail_bytes(opened.cad, opened.wireframe.creases), media_type=_BYTES)
 
     def photo(self, request: Request) -> Response:
-        kind, data = self._session.photo_state(request.path_params["number"]).photo.encoded()
+        kind, data = self._annotation(request).photo.encoded()
         return Response(data, media_type=kind)
 
     def worklist(self, request: Request) -> Response:
         return JSONResponse(worklist_state(self._session))
 
     def thumbnail(self, request: Request) -> Response:
-        return _kept(self._session.photo_state(request.path_params["number"]).photo.thumbnail())
+        return _kept(self._annotation(request).photo.thumbnail())
 
     def library(self, request: Request) -> Response:
         choice = self._session.choice
@@ -160,24 +140,16 @@ class _Routes:
         return _kept(thumbnail_of(choice, request.path_params["number"]))
 
     def mask(self, request: Request) -> Response:
-        mask = self._session.photo_state(*_place(request)).mask
+        mask = self._annotation(request).mask
         # Its opacity is what the page draws, in a colour of its own.
         opacity = np.where(mask, 255, 0).astype(np.uint8)
         data = io.BytesIO()
         Image.fromarray(np.stack([np.zeros_like(opacity), opacity], axis=2), "LA").save(data, "PNG")
         return Response(data.getvalue(), media_type="image/png")
 
-    def claim(self, request: Request) -> Response:
-        """The revision of an object, and whether its photo was changed in another browser."""
-        number, slot = _place(request)
-        state = self._session.photo_state(number, slot)
-        elsewhere = self._claims.is_elsewhere(number, request.cookies.get(_BROWSER, ""))
-        return JSONResponse({"revision": state.owner.history.revision, "elsewhere": elsewhere})
-
     def data(self, answer: Callable[..., dict[str, Any]], request: Request) -> Response:
-        """Answer with what a function of `_OF_OBJECT` returns for an object."""
-        number, slot = _place(request)
-        return JSONResponse(answer(self._session, number, slot=slot))
+        """Answer with what a function returns for an annotation."""
+        return JSONResponse(answer(self._session, request.path_params["number"]))
 
     async def act(self, request: Request) -> Response:
         """Do an action of the page; answers with the state after it."""
@@ -193,15 +165,13 @@ class _Routes:
         return await run_in_threadpool(self._acted, request, action)
 
     def _acted(self, request: Request, action: dict[str, Any]) -> Response:
-        session = self._session
-        number, slot = _place(request)
-        person = "" if request.client is None else request.client.host
-        with session.lock:
-            views = session.photo_state(number, slot).owner.shown
-            photos = {number, *(view.place[0] for view in views)}
-            self._claims.take(photos, request.cookies.get(_BROWSER, ""), person)
-            outcome = perform(session, number, action, slot=slot)
-            return JSONResponse(page_state(session, number, outcome, slot=slot))
+        number = request.path_params["number"]
+        with self._session.lock:
+            outcome = perform(self._session, number, action)
+            return JSONResponse(page_state(self._session, number, outcome))
+
+    def _annotation(self, request: Request) -> Annotation:
+        return self._session.annotation(request.path_params["number"])
 
 
 def _asset(name: str, media_type: str, request: Request) -> Response:
@@ -210,11 +180,6 @@ def _asset(name: str, media_type: str, request: Request) -> Response:
 
 def _kept(thumbnail: bytes) -> Response:
     return Response(thumbnail, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
-
-
-def _place(request: Request) -> tuple[int, int | None]:
-    """The numbers of a photo, and of one of its objects if the address has it."""
-    return request.path_params["number"], _number(request, "object")
 
 
 def _number(request: Request, name: str) -> int | None:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cadalign.annotate.estimate import LiveAlignment
-from cadalign.annotate.live import short
+from cadalign.annotate.live import LiveAlignment, short
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry, ObjectShape
 from cadalign.datasets.models.model_keypoints import ModelKeypoint
@@ -48,7 +47,7 @@ def suggest(
     the covariance of the point's predicted place.
     """
     result, lines = live.result, live.wireframe
-    if result is None or lines is None or live.place or result.covariance is None:
+    if result is None or lines is None or result.covariance is None:
         return None
     camera, pose = live.camera, live.alignment
     points = [point for number, point in registry if number not in used]

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from cadalign.annotate.options import LOOPBACK, FileOptions, SessionOptions
+from cadalign.annotate.options import FileOptions, SessionOptions
 from cadalign.cli.common import UsageError, answer, make_folder, say, waiting
 from cadalign.cli.options import flag_of
 from cadalign.io.files import writing
@@ -40,10 +40,6 @@ class Annotate(FileOptions):
     """The model, in place of MODEL."""
     port: int = 0
     """Port to listen on; 0 for a free one."""
-    host: str = "127.0.0.1"
-    """Address to listen on: this machine alone, or 0.0.0.0 for all of a network that you trust.
-    Whoever has the printed address with its token can see and change everything, and it is not
-    encrypted."""
     no_open: tyro.conf.FlagCreatePairsOff[bool] = False
     """Print the address instead of opening a browser."""
 
@@ -81,12 +77,12 @@ class Annotate(FileOptions):
         import webbrowser
 
         from cadalign.annotate.guard import Access
-        from cadalign.annotate.locks import WriterLocks
+        from cadalign.annotate.names import only_annotator
         from cadalign.annotate.opening import find_session_files, open_session
         from cadalign.annotate.server import listen, make_app, serve
 
         options = self.session
-        listener = listen(self.port, self.host)
+        listener = listen(self.port)
         with ExitStack() as opened:
             opened.enter_context(listener)
             if self.out is not None:
@@ -94,33 +90,21 @@ class Annotate(FileOptions):
             if self.observation is not None:
                 with writing(self.observation):
                     self.observation.parent.mkdir(parents=True, exist_ok=True)
-            access = Access(listener.getsockname()[1], self.host)
+            access = Access(listener.getsockname()[1])
             files = find_session_files(options)
-            locks = opened.enter_context(
-                WriterLocks(
-                    files.written, whole_folder=options.image.is_dir(), address=access.address
-                )
-            )
+            opened.enter_context(only_annotator(files.keypoints.parent))
             with waiting("reading photos and model"):
-                session = open_session(
-                    options, files, before_saving=locks.confirm, reserve=locks.reserve
-                )
+                session = open_session(options, files)
             warming = threading.Thread(target=session.warm_up, daemon=True)
             warming.start()
             # An extension in C++ that works on while the interpreter ends aborts the process.
             opened.callback(warming.join)
             opened.callback(session.ended.set)
-            reach = (
-                "It works on this machine only, and for this session."
-                if self.host == LOOPBACK
-                else "Whoever has it and reaches this machine can see and change everything, "
-                "unencrypted: give it to your team only."
-            )
             with suppress(KeyboardInterrupt):
                 # Ends as Ctrl+C does, with everything saved and unlocked.
                 signal.signal(signal.SIGTERM, signal.default_int_handler)
                 answer(access.url)
-                say(f"Open this address in a browser; end with Ctrl+C. {reach}")
+                say("Open this address in a browser of this machine; end with Ctrl+C.")
                 if not self.no_open:
                     webbrowser.open(access.url)
                 serve(make_app(session, access), listener)
@@ -134,7 +118,7 @@ def _save_and_say_where(session: Session) -> int:
     if not session.unsaved:
         say(f"Saved in {folder}")
         return 0
-    for trouble in sorted({owner.save_error for owner in session.unsaved}):
+    for trouble in sorted({each.save_error for each in session.unsaved}):
         say(f"Not saved: {trouble}")
     elsewhere = Path(tempfile.mkdtemp(prefix="cadalign-annotate-"))
     session.save_unsaved(elsewhere)

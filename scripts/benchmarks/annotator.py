@@ -134,7 +134,6 @@ def annotator(
         "pictures": _pictures,
     }
     with tempfile.TemporaryDirectory() as folder, chromium() as browser:
-        os.environ["XDG_STATE_HOME"] = str(Path(folder) / "state")
         for part in parts:
             before = os.getloadavg()[0]
             rows = list(measures[part](given, browser, _new(Path(folder) / part)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from typing import Any
 
@@ -12,7 +11,6 @@ from playwright.sync_api import Browser, Page
 from support.annotating import IDLE, Case, opened_page, place, place_all, wait
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.document import history_path
 from cadalign.annotate.model import ClickableModel, MirrorPlanes
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.photos import nearest_corner
@@ -180,49 +178,6 @@ def test_model_point_is_moved_and_refused_where_another_pair_is(case: Case) -> N
     document = session.photos[0].document
     with pytest.raises(CadalignError, match="already used by pair 1"):
         document.exchange_keypoint(2, before.keypoint or 0)
-
-
-# --- undo after a restart ----------------------------------------------------------------------
-
-
-def test_undo_and_numbers_survive_a_restart(case: Case) -> None:
-    session = case.open()
-    place_all(session, case, count=5)
-    perform(session, 0, {"do": "pick", **aim(session)})
-    perform(session, 0, {"do": "delete", "pair": 6})
-    perform(session, 0, {"do": "delete", "pair": 2})
-    perform(session, 0, {"do": "move", "pair": 3, "uv": [50, 60]})
-    perform(session, 0, {"do": "undo"})
-    state = page_state(session, 0)
-    numbers = [pair["position"] for pair in state["pairs"]]
-    assert numbers == [1, 3, 4, 5]
-
-    again = case.open(keypoints=None)
-    restored = page_state(again, 0)
-    assert json.dumps(restored["pairs"]) == json.dumps(state["pairs"])
-    assert restored["can_undo"]
-    assert restored["can_redo"]
-    perform(again, 0, {"do": "redo"})
-    assert again.photos[0].document.pair(3).uv == (50, 60)
-    for _ in range(3):
-        perform(again, 0, {"do": "undo"})
-    assert [pair.number for pair in again.photos[0].document.pairs] == [1, 2, 3, 4, 5, 6]
-    placed = again.models[0].registry[again.photos[0].document.pair(6).keypoint or 0]
-    assert placed.xyz == session.models[0].registry[placed.semantic_id or 0].xyz
-    while again.photos[0].owner.history.before:
-        perform(again, 0, {"do": "undo"})
-    assert again.photos[0].document.pairs == ()
-
-
-def test_history_of_another_annotation_is_left_alone(case: Case) -> None:
-    session = case.open()
-    place_all(session, case, count=5)
-    data: dict[str, Any] = json.loads(case.observation.read_text())
-    data["keypoints"][0]["uv"] = [7.0, 7.0]
-    case.observation.write_text(json.dumps(data))
-    assert not page_state(case.open(), 0)["can_undo"]
-    history_path(case.observation).write_text("{")
-    assert len(page_state(case.open(), 0)["pairs"]) == 5
 
 
 # --- in the page -------------------------------------------------------------------------------

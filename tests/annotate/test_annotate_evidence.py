@@ -12,7 +12,7 @@ from support.annotating import Case, fitted, flat, place, place_all
 
 from cadalign import Size, Symmetry, View, align
 from cadalign.annotate.actions import perform
-from cadalign.annotate.estimate import LiveAlignment
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.errors import CadalignError
@@ -24,7 +24,7 @@ from cadalign.render import cast_geometry
 
 pytestmark = pytest.mark.long
 
-PIECES = ("mask", "keypoint depths", "depth image", "up", "camera_height", "size", "views", "rig")
+PIECES = ("mask", "keypoint depths", "depth image", "up", "camera_height", "size")
 
 
 def observed(case: Case, *pieces: str) -> Observation:
@@ -69,16 +69,9 @@ def observed(case: Case, *pieces: str) -> Observation:
         evidence=ImageEvidence(**given),
         **fields,
     )
-    if "views" not in pieces and "rig" not in pieces:
+    if "views" not in pieces:
         return first
-    turn = np.eye(4)
-    turn[:3, 3] = [0.1, 0.02, 0.05]
-    moved = in_camera @ turn[:3, :3].T + turn[:3, 3]
-    other = replace(first, points_2d=camera.project(moved), image=None, evidence=ImageEvidence())
-    if "rig" in pieces:
-        first = replace(first, evidence=replace(first.evidence, cam_from_rig=np.eye(4)))
-        other = replace(other, evidence=ImageEvidence(cam_from_rig=turn))
-    return replace(first, others=(other,))
+    return replace(first, others=(replace(first, image=None, evidence=ImageEvidence()),))
 
 
 def stored(case: Case) -> dict[str, Any]:
@@ -111,8 +104,8 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
         np.testing.assert_allclose(flat(page[name]), flat(command[name]), rtol=1e-9, atol=1e-12)
     assert page["warnings"] == command["warnings"]
     shown = page_state(session, 0)["alignment"]
-    words = {"up": "gravity", "size": "known width and height", "views": "1 other view"}
-    words |= {"keypoint depths": "depth", "depth image": "depth", "rig": "known camera poses"}
+    words = {"up": "gravity", "size": "known width and height"}
+    words |= {"keypoint depths": "depth", "depth image": "depth"}
     words |= {"camera_height": "camera height"}
     for piece in pieces:
         assert words.get(piece, piece) in shown["also_used"]
@@ -121,7 +114,7 @@ def test_evidence_is_kept_used_as_by_fit_and_named(
 
 
 def test_the_symmetry_of_a_file_is_kept(case: Case) -> None:
-    given = replace(observed(case, "views"), symmetry=Symmetry.around((0, 1, 0), fold=2))
+    given = replace(observed(case, "up"), symmetry=Symmetry.around((0, 1, 0), fold=2))
     given.save(case.observation)
     before = stored(case)["symmetry"]
     perform(case.open(), 0, {"do": "move", "pair": 1, "uv": [200, 200]})
@@ -140,28 +133,12 @@ def test_evidence_outlives_the_last_pair(case: Case) -> None:
     assert page_state(again, 0)["alignment"]["also_used"] == "gravity, known width and height"
 
 
-def test_second_view_is_annotated_in_its_place(case: Case) -> None:
-    whole = observed(case, "views")
-    (other,) = whole.others
-    assert isinstance(other, Observation)
-    replace(other, others=(replace(whole, others=()),)).save(case.observation)
-    session = case.open(keypoints=None)
-    live, _ = session.live(session.photos[0])
-    assert isinstance(live, LiveAlignment)
-    assert live.place == 1
-    assert np.abs(live.residuals).max() < 10
-    perform(session, 0, {"do": "move", "pair": 1, "uv": [200, 200]})
-    views = stored(case)["views"]
-    assert views[1]["keypoints"][0]["uv"] == [200, 200]
-    assert views[1]["image"] == "photo.png"
-    assert "image" not in views[0]
-
-
-def test_views_of_other_photos_are_refused(case: Case) -> None:
-    whole = observed(case, "views")
-    replace(whole, image=case.folder / "gone.png").save(case.observation)
-    with pytest.raises(CadalignError, match=r"none of its 2 views has the image photo\.png"):
-        case.open(observation=case.observation)
+def test_several_views_are_refused(case: Case) -> None:
+    observed(case, "views").save(case.observation)
+    before = case.observation.read_bytes()
+    with pytest.raises(CadalignError, match="has 2 views, the annotator opens files of one photo"):
+        case.open()
+    assert case.observation.read_bytes() == before
 
 
 def test_mask_and_lengths_are_given_by_options(case: Case) -> None:

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from support.problems import problem_of
 
 from cadalign import Alignment, Camera, fit
-from cadalign.annotate.estimate import LiveAlignment
 from cadalign.annotate.lines import Wireframe
-from cadalign.annotate.live import facts_of, live_alignment, missing_text, notes_of
+from cadalign.annotate.live import LiveAlignment, facts_of, live_alignment, missing_text, notes_of
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.models import KeypointRegistry, ObjectShape
 from cadalign.annotate.photos import FocalChoice, Intrinsics
@@ -66,7 +65,7 @@ def live_of(
     ]
     estimate = LiveAlignment.of(known, observation)
     lines = Wireframe.of_model(ClickableModel(BOX))
-    return live_alignment(estimate, known, lines, observation, 0, points, observation.points_2d)
+    return live_alignment(estimate, known, lines, observation, points, observation.points_2d)
 
 
 # --- the alignment ---------------------------------------------------------------------------
@@ -91,10 +90,10 @@ def test_is_what_fit_finds() -> None:
 )
 def test_says_how_many_pairs_are_missing(points: int, message: str) -> None:
     counts = np.ones(points, dtype=bool)
-    assert missing_text(counts, STRETCHED, is_plain=True, has_others=False) == message
-    assert missing_text(np.ones(4, dtype=bool), STRETCHED, is_plain=True, has_others=False) == ""
-    beside = missing_text(np.ones(2, dtype=bool), STRETCHED, is_plain=False, has_others=True)
-    assert beside == "1 more pair to the first alignment of this photo"
+    assert missing_text(counts, STRETCHED, is_plain=True) == message
+    assert missing_text(np.ones(4, dtype=bool), STRETCHED, is_plain=True) == ""
+    beside = missing_text(np.ones(2, dtype=bool), STRETCHED, is_plain=False)
+    assert beside == "1 more pair to the first alignment"
 
 
 @pytest.mark.parametrize(("stretch", "noise"), [(0.25, "settled"), (None, "given")])

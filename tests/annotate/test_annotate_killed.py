@@ -75,19 +75,3 @@ def test_stopped_before_any_write_an_action_is_done_or_not(
         if not stopped:
             return
     pytest.fail("it never came to an end")
-
-
-def test_unfinished_pairs_of_an_earlier_version_are_taken_over(case: Case) -> None:
-    """They had a file of their own, which may still have a pair that was completed."""
-    session = case.open(prepared=False)
-    place_all(session, case, count=3)
-    earlier = case.folder / "photo.unfinished.json"
-    halves = [{"uv": case.clicks[1][1]}, {"uv": [1, 2]}]
-    earlier.write_text(json.dumps({"format": "cadalign unfinished pairs", "pairs": halves}))
-    again = case.open(prepared=False)
-    pairs = again.photos[0].document.pairs
-    assert [pair.uv for pair in pairs[3:]] == [(1.0, 2.0)]
-    perform(again, 0, {"do": "place_uv", "uv": [3, 4]})
-    assert not earlier.exists()
-    pairs = case.open(prepared=False).photos[0].document.pairs
-    assert [pair.uv for pair in pairs[3:]] == [(1.0, 2.0), (3.0, 4.0)]

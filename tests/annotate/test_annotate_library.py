@@ -14,9 +14,9 @@ from support.annotating import IDLE, Case, make_case, opened_page, place, place_
 from support.refusals import refusal_line
 
 from cadalign.annotate.actions import perform
+from cadalign.annotate.evidence_actions import carry_keypoints
 from cadalign.annotate.library import ModelChoice, starting_model
 from cadalign.annotate.models import KeypointRegistry
-from cadalign.annotate.object_actions import carry_keypoints
 from cadalign.annotate.options import FileOptions
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.ranking import ranking_state

@@ -12,14 +12,7 @@ from support.refusals import refusal_text
 
 from cadalign import Camera
 from cadalign.annotate.actions import perform
-from cadalign.annotate.evidence import (
-    MaskDrawing,
-    Stroke,
-    decode_runs,
-    draw_mask,
-    encode_runs,
-    find_up,
-)
+from cadalign.annotate.evidence import decode_runs, encode_runs, find_up
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
@@ -53,6 +46,17 @@ def inside(case: Case, edges: list[Any]) -> list[Any]:
     return [tuple(tuple(np.clip(end, low, high).tolist()) for end in edge) for edge in edges]
 
 
+def load(session: Session, mask: np.ndarray) -> None:
+    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
+
+
+def box(u: int, v: int) -> np.ndarray:
+    """A mask of some pixels."""
+    mask = np.zeros((480, 640), dtype=bool)
+    mask[v - 8 : v + 9, u - 8 : u + 9] = True
+    return mask
+
+
 def agree_with_fit(
     session: Session, case: Case, capsys: pytest.CaptureFixture[str]
 ) -> dict[str, Any]:
@@ -65,18 +69,9 @@ def agree_with_fit(
     return dict(page_state(session, 0)["alignment"])
 
 
-def test_strokes_are_drawn_over_each_other() -> None:
-    square = Stroke(points=((10, 10), (29, 10), (29, 29), (10, 29)))
-    mask = draw_mask(MaskDrawing(strokes=(square,)), 60, 50)
-    assert mask.sum() == 400
-    hole = Stroke(points=((20, 20),), radius=4, adds=False)
-    line = Stroke(points=((40, 5), (40, 45)), radius=3)
-    drawn = draw_mask(MaskDrawing(strokes=(square, hole, line)), 60, 50)
-    assert not drawn[20, 20]
-    assert drawn[25, 40]
-    assert not drawn[25, 45]
-    assert 400 - np.pi * 25 < drawn[:, :35].sum() < 400 - np.pi * 12
-    np.testing.assert_array_equal(decode_runs(encode_runs(drawn), 60, 50), drawn)
+def test_runs_are_those_of_the_pixels() -> None:
+    mask = np.random.default_rng(0).uniform(size=(50, 60)) < 0.3
+    np.testing.assert_array_equal(decode_runs(encode_runs(mask), 60, 50), mask)
     with pytest.raises(CadalignError, match="60 x 50 pixels"):
         decode_runs((1, 2, 3), 60, 50)
 
@@ -90,32 +85,31 @@ def test_mask_is_used_saved_and_undone(case: Case, capsys: pytest.CaptureFixture
     assert shown["also_used"] == "mask"
     assert shown["alignment"] != without["alignment"]
     np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
-    # A part is taken away and given back.
-    perform(session, 0, {"do": "mask_paint", "points": [[320, 240]], "radius": 20, "adds": False})
-    assert not (read_grey(case.folder / "photo.mask.png") != 0)[240, 320]
+    # Another one takes its place and is undone.
+    load(session, box(100, 100))
+    np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, box(100, 100))
     perform(session, 0, {"do": "undo"})
     np.testing.assert_array_equal(read_grey(case.folder / "photo.mask.png") != 0, true_mask(case))
     again = case.open(keypoints=None)
     assert page_state(again, 0)["alignment"]["alignment"] == shown["alignment"]
-    perform(again, 0, {"do": "undo"})  # the mask, in the session before
-    assert page_state(again, 0)["alignment"]["also_used"] == ""
+    perform(session, 0, {"do": "undo"})
+    assert page_state(session, 0)["alignment"]["also_used"] == ""
     assert "mask" not in json.loads(case.observation.read_text())
 
 
-def test_mask_of_a_file_is_painted_over_without_changing_it(case: Case) -> None:
+def test_mask_of_a_file_is_not_changed(case: Case) -> None:
     session = case.open()
     place_all(session, case, count=5)
-    perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(true_mask(case)))})
+    load(session, true_mask(case))
     first = case.folder / "photo.mask.png"
     before = first.read_bytes()
-    history = case.folder / "elsewhere"
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setenv("XDG_STATE_HOME", str(history))  # without the undo history
-        again = case.open(keypoints=None)
-        perform(again, 0, {"do": "mask_paint", "points": [[10, 10]], "radius": 5})
-        assert first.read_bytes() == before
-        assert json.loads(case.observation.read_text())["mask"] == "photo.mask-2.png"
-        assert (read_grey(case.folder / "photo.mask-2.png") != 0)[10, 10]
+    again = case.open(keypoints=None)
+    load(again, box(10, 10))
+    assert first.read_bytes() == before
+    assert json.loads(case.observation.read_text())["mask"] == "photo.mask-2.png"
+    assert (read_grey(case.folder / "photo.mask-2.png") != 0)[10, 10]
+    perform(again, 0, {"do": "undo"})
+    assert json.loads(case.observation.read_text())["mask"] == "photo.mask.png"
     # Masks are no photos of the folder.
     names = [state.photo.path.name for state in case.open(image=case.folder).photos]
     assert names == ["photo.png"]
@@ -132,13 +126,16 @@ def test_box_is_cut_out(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     ]
     perform(session, 0, {"do": "mask_cut", "corners": corners})
     found = read_grey(case.folder / "photo.mask.png") != 0
-    box = np.zeros_like(truth)
-    box[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
-    overlap, plain = ((mask & truth).sum() / (mask | truth).sum() for mask in (found, box))
+    whole = np.zeros_like(truth)
+    whole[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = True
+    overlap, plain = ((mask & truth).sum() / (mask | truth).sum() for mask in (found, whole))
     assert overlap > max(0.75, plain + 0.1)
     agree_with_fit(session, case, capsys)
     with pytest.raises(CadalignError, match="too small"):
         perform(session, 0, {"do": "mask_cut", "corners": [[1, 1], [2, 2]]})
+    load(session, box(20, 20))
+    perform(session, 0, {"do": "mask_cut", "corners": corners})  # beside what is there
+    np.testing.assert_array_equal(session.annotation(0).mask, found | box(20, 20))
 
 
 def test_vertical_edges_tell_gravity(case: Case, capsys: pytest.CaptureFixture[str]) -> None:
@@ -198,7 +195,7 @@ def test_known_length_is_used(case: Case, capsys: pytest.CaptureFixture[str]) ->
 def test_a_mask_that_was_taken_from_the_file_does_not_come_back(case: Case) -> None:
     session = case.open(prepared=False)
     place_all(session, case, count=4)
-    perform(session, 0, {"do": "mask_paint", "points": [[200, 200]], "radius": 20})
+    load(session, box(200, 200))
     assert case.open(prepared=False).photos[0].document.evidence.mask is not None
     data = json.loads(case.observation.read_text())
     assert data.pop("mask") == "photo.mask.png"
@@ -239,7 +236,7 @@ def test_a_mask_of_noise_keeps_no_server_busy(case: Case) -> None:
     assert page_state(session, 0)["alignment"]["status"] == "done"
 
 
-def test_a_mask_of_others_is_not_painted_over(case: Case) -> None:
+def test_a_mask_of_others_is_not_written_over(case: Case) -> None:
     theirs = case.folder / "photo.mask.png"
     write_image(theirs, np.full((480, 640), 7, dtype=np.uint8))
     kept = theirs.read_bytes()
@@ -251,14 +248,7 @@ def test_a_mask_of_others_is_not_painted_over(case: Case) -> None:
     for start in ({}, {"mask": theirs}):
         session = case.open(prepared=False, **start)
         perform(session, 0, {"do": "mask_clear"})
-        perform(session, 0, {"do": "mask_paint", "points": [[200, 200]], "radius": 20})
+        load(session, box(200, 200))
         assert named() == "photo.mask-2.png"
-        again = case.open(prepared=False)  # with the strokes, which can be undone
-        perform(again, 0, {"do": "mask_paint", "points": [[300, 200]], "radius": 20})
-        assert named() == "photo.mask-2.png"
-        drawn = read_grey(case.folder / "photo.mask-2.png") != 0
-        assert drawn[200, 200]
-        assert drawn[200, 300]
-        perform(again, 0, {"do": "undo"})
-        assert not (read_grey(case.folder / "photo.mask-2.png") != 0)[200, 300]
+        (case.folder / "photo.mask-2.png").unlink()
         assert theirs.read_bytes() == kept

@@ -14,8 +14,6 @@ from cadalign.io.images import write_image
 
 pytestmark = pytest.mark.long
 
-TOOL = "What a click in the photo marks"
-
 
 @pytest.fixture
 def opened(browser: Browser, case: Case) -> Iterator[tuple[Page, Session]]:
@@ -40,38 +38,6 @@ def used(page: Page) -> str:
     return str(page.evaluate("annotator.state.alignment.also_used"))
 
 
-def test_mask_is_painted_taken_away_and_cleared(opened: tuple[Page, Session]) -> None:
-    page, session = opened
-    page.get_by_label(TOOL).select_option("brush")
-    drag(page, (250, 200), (400, 200))
-    painted = session.photo_state(0).mask
-    assert painted[200, 320]
-    assert not painted[300, 320]
-    assert len(session.photos[0].document.pairs) == 5
-    page.keyboard.down("Shift")
-    drag(page, (320, 180), (320, 220))
-    page.keyboard.up("Shift")
-    assert not session.photo_state(0).mask[200, 320]
-    page.keyboard.press("Control+z")
-    wait(page, "annotator.api.idle && annotator.state.can_redo")
-    assert session.photo_state(0).mask[200, 320]
-    wait(page, "!!annotator.photo.marking.tinted")
-
-    page.keyboard.press("g")
-    for place in ((300, 300), (420, 300), (420, 400), (300, 400)):
-        page.mouse.click(*place_of_pixel(page, place))
-    page.keyboard.press("c")
-    wait(page, IDLE)
-    assert session.photo_state(0).mask[350, 350]
-    assert "mask" in used(page)
-    page.get_by_role("button", name="Mask, gravity, known size (1 used)").click()
-    page.get_by_role("button", name="Clear the mask").click()
-    wait(page, "annotator.api.idle && annotator.state.evidence.mask === null")
-    assert used(page) == ""
-    page.keyboard.press("Escape")
-    assert page.get_by_label(TOOL).input_value() == "points"
-
-
 def test_box_and_file_give_masks(opened: tuple[Page, Session], case: Case) -> None:
     page, session = opened
     page.keyboard.press("x")
@@ -80,7 +46,7 @@ def test_box_and_file_give_masks(opened: tuple[Page, Session], case: Case) -> No
     high = np.minimum(points.max(axis=0) + 25, (634, 474))
     drag(page, (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
     assert used(page) == "mask", page.locator("[role=alert]").inner_text()
-    cut = session.photo_state(0).mask
+    cut = session.annotation(0).mask
     assert 0.05 < cut[int(low[1]) : int(high[1]), int(low[0]) : int(high[0])].mean() < 0.98
     given = np.zeros_like(cut)
     given[100:400, 150:450] = True
@@ -88,13 +54,19 @@ def test_box_and_file_give_masks(opened: tuple[Page, Session], case: Case) -> No
     write_image(file, np.where(given, 255, 0).astype(np.uint8))
     page.get_by_label("Mask file").set_input_files(file)
     for _ in range(200):
-        if (session.photo_state(0).mask == given).all():
+        if (session.annotation(0).mask == given).all():
             break
         page.wait_for_timeout(30)
-    np.testing.assert_array_equal(session.photo_state(0).mask, given)
+    np.testing.assert_array_equal(session.annotation(0).mask, given)
     write_image(file, np.zeros((10, 12), dtype=np.uint8))
     page.get_by_label("Mask file").set_input_files(file)
     wait(page, "document.querySelector('[role=alert]').textContent.includes('12 x 10 pixels')")
+    page.get_by_role("button", name="Mask, gravity, known size (1 used)").click()
+    page.get_by_role("button", name="Clear the mask").click()
+    wait(page, "annotator.api.idle && annotator.state.evidence.mask === null")
+    assert used(page) == ""
+    page.keyboard.press("Escape")
+    assert page.get_by_label("What a click in the photo marks").input_value() == "points"
 
 
 def test_edges_and_lengths_by_keys_alone(opened: tuple[Page, Session], case: Case) -> None:

@@ -206,14 +206,6 @@ def test_observation_of_another_photo_is_refused_by_name(case: Case) -> None:
 
 
 @pytest.mark.long
-def test_further_photos_count_once(case: Case) -> None:
-    other = case.folder / "other.png"
-    shutil.copy(case.photo, other)
-    session = case.open(further_photos=(other, case.photo, other), prepared=False)
-    assert [each.photo.path for each in session.photos] == [case.photo, other]
-
-
-@pytest.mark.long
 def test_names_that_are_not_utf_8(case: Case, caplog: pytest.LogCaptureFixture) -> None:
     folder = case.folder / "photos"
     folder.mkdir()

@@ -12,7 +12,7 @@ import pytest
 from support.annotating import aligned_once, place
 
 from cadalign import Alignment, Box, Camera
-from cadalign.annotate.estimate import LiveAlignment
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.opening import open_session
 from cadalign.annotate.options import SessionOptions
 from cadalign.annotate.session import Session
@@ -230,7 +230,7 @@ def check_fit_agrees(session: Session, case: Scripted, capsys: pytest.CaptureFix
     live, _ = session.live(session.photos[0])
     page = live.result
     assert page is not None
-    path = session.photos[0].owner.files.observation
+    path = session.photos[0].files.observation
     assert main(["fit", str(path), "--json", "--no-picture"]) == 0
     command = json.loads(capsys.readouterr().out)
     assert page.covariance is not None

@@ -74,7 +74,8 @@ def test_with_the_token_everything_is_served(access: Access, path: str) -> None:
 def test_the_model_of_each_number_is_served(original: Case, tmp_path: Path) -> None:
     other = tmp_path / "other.obj"
     other.write_text(TETRAHEDRON)
-    session = original.open(models=(other,), prepared=False)
+    session = original.open(prepared=False)
+    session.models.of(other)
     with served(session) as opened:
         for number in (0, 1):
             model = session.models[number]

@@ -197,7 +197,7 @@ def test_an_observation_that_others_changed_is_not_written_over(case: Case) -> N
     place(session, 0, [10, 20])
     data = json.loads(case.observation.read_text()) | {"object": "seat"}
     case.observation.write_text(json.dumps(data))
-    for action in ({"do": "place_uv", "uv": [30, 40]}, {"do": "delete_object"}):
+    for action in ({"do": "place_uv", "uv": [30, 40]}, {"do": "delete", "pair": 1}):
         perform(session, 0, action)
         assert page_state(session, 0)["saved"]["trouble"] == (
             f"{case.observation}: was changed by another program since the annotator read or wrote "
@@ -301,16 +301,14 @@ def test_click_beside_the_model_says_so_and_changes_nothing(case: Case) -> None:
     session = case.open()
     outcome = perform(session, 0, {"do": "pick", "origin": [0, 0, 3], "direction": [0, 0, 1]})
     assert outcome.message == "That click missed the model."
-    assert not session.photos[0].owner.history.before
+    assert not session.photos[0].history.before
 
 
 def test_contradicting_pair_is_marked(case: Case) -> None:
     session = case.open()
     for row, (keypoint, (u, v)) in enumerate(case.clicks):
         place(session, keypoint, [u + (45 if row == 4 else 0), v])
-    marked = {
-        pair["position"]: pair["off"] for pair in page_state(session, 0)["pairs"] if pair["off"]
-    }
+    marked = {pair["pair"]: pair["off"] for pair in page_state(session, 0)["pairs"] if pair["off"]}
     assert list(marked) == [5]
     assert marked[5] == pytest.approx(45, abs=15)
 

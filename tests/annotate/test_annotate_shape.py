@@ -14,7 +14,7 @@ from support.annotating import Case, fitted, flat, place, place_all
 
 from cadalign import CadalignError, Result, ShapeModel
 from cadalign.annotate.actions import perform
-from cadalign.annotate.estimate import LiveAlignment
+from cadalign.annotate.live import LiveAlignment
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.cli import main

@@ -56,10 +56,10 @@ def test_the_up_axis_is_written_and_kept(case: Case) -> None:
     assert page_state(again, 0)["image"]["up_axis"] == "z"
     place(again, again.models[0].registry.add(again.models[0].cad.samples[0]), [300.0, 200.0])
     assert Observation.load(case.observation).up_axis == "z"
-    perform(again, 0, {"do": "add_object"})
-    assert page_state(again, 0, slot=1)["image"]["up_axis"] == "z"
-    for pair in again.objects[0][0].document.pairs:  # a file without keypoints keeps it, too
-        perform(again, 0, {"do": "delete", "pair": pair.number}, slot=0)
+    perform(again, 0, {"do": "another"})
+    assert page_state(again, 1)["image"]["up_axis"] == "z"
+    for pair in again.photos[0].document.pairs:  # a file without keypoints keeps it, too
+        perform(again, 0, {"do": "delete", "pair": pair.number})
     assert page_state(z_up.open(), 0)["image"]["up_axis"] == "z"
 
 

@@ -119,28 +119,26 @@ def test_keypoints_of_a_detector_are_shown_and_taken(case: Case) -> None:
         case.open(image=case.folder, detections=file)
 
 
-def test_photos_of_one_name_in_two_folders_are_told_apart(case: Case) -> None:
-    photos = [case.folder / side / "img.png" for side in ("left", "right")]
-    for photo in photos:
-        photo.parent.mkdir()
-        shutil.copy(case.photo, photo)
-    out = case.folder / "out"
-    out.mkdir()
-    earlier = {"format": "cadalign work list", "photos": {"img.png": "skipped"}}
-    (out / FILE).write_text(json.dumps(earlier))  # as it was written once
-    options: dict[str, Any] = {"image": photos[0], "further_photos": (photos[1],), "out": out}
-    session = case.open(**options)
-    assert [each["state"] for each in worklist_state(session)] == ["skipped"] * 2
-    perform(session, 0, {"do": "mark", "mark": "done"})
-    for number in (0, 1):
-        for keypoint, uv in case.clicks[number : 5 + number]:
-            place(session, keypoint, uv, image=number)
-    again = case.open(**options)
-    assert [each["state"] for each in worklist_state(again)] == ["done", "begun"]
-    assert [each["state"] for each in worklist_state(case.open(image=photos[1], out=out))] == [
-        "begun"
-    ]
-    assert WorkList.open(out).marks == {"../left/img.png": "done"}
+def test_objects_of_one_photo_are_entries_of_the_list(case: Case) -> None:
+    folder_of(case, "other.png", "photo-2.png")
+    session = case.open(image=case.folder, prepared=False)
+    place(session, *case.clicks[0])
+    new = perform(session, 0, {"do": "another"}).shown
+    assert new is session.photos[3]
+    assert new.files.observation.name == "other-2.json"
+    place(session, *case.clicks[1], image=3)
+    number = next(k for k, each in enumerate(session.photos) if each.name == "photo.png")
+    taken = perform(session, number, {"do": "another"}).shown
+    assert taken.files.observation.name == "photo-3.json"
+    perform(session, 3, {"do": "mark", "mark": "done"})
+    again = worklist_state(case.open(image=case.folder, prepared=False))
+    assert {each["name"]: (each["state"], each["pairs"]) for each in again} == {
+        "other.png": ("begun", 1),
+        "other.png (other-2.json)": ("done", 1),
+        "photo.png": ("to do", 0),
+        "photo-2.png": ("to do", 0),
+    }
+    assert [each["name"] for each in again][:2] == ["other.png", "other.png (other-2.json)"]
 
 
 def test_keypoints_of_a_detector_are_taken_in_the_page(browser: Browser, case: Case) -> None:

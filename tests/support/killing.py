@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from cadalign.annotate.actions import perform
-from cadalign.annotate.document import history_path
 from cadalign.annotate.page_state import page_state
 from cadalign.annotate.session import Session
 from cadalign.errors import CadalignError
@@ -62,7 +61,6 @@ def content(state: dict[str, Any]) -> dict[str, Any]:
         "mask": evidence["mask"] is not None,
         "lengths": evidence["lengths"],
         "verticals": len(evidence["verticals"]),
-        "can_undo": state["can_undo"],
         "mark": state["image"]["state"],
     }
 
@@ -136,11 +134,6 @@ class _Shadow:
         folder = case.folder.with_name(f"{case.folder.name}-shadow")
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(case.folder, folder)
-        for lock in folder.glob(".*lock"):
-            lock.unlink()
-        history = history_path(case.observation)
-        if history.exists():
-            shutil.copy(history, history_path(folder / case.observation.name))
         copy = replace(
             case, folder=folder, photo=folder / case.photo.name, camera=folder / case.camera.name,
             keypoints=folder / case.keypoints.name,
@@ -166,9 +159,10 @@ def _draw(rng: np.random.Generator, state: dict[str, Any]) -> dict[str, Any]:
     free = [each["keypoint"] for each in state["keypoints"] if not each["used"]]
     uv = [float(value) for value in rng.uniform((20, 20), (600, 440)).round(2)]
     other = [float(value) for value in rng.uniform((20, 20), (600, 440)).round(2)]
+    start = int(rng.integers(1, 9999))
     actions: list[dict[str, Any]] = [
         {"do": "place_uv", "uv": uv},
-        {"do": "mask_paint", "points": [uv, other], "radius": 20.0},
+        {"do": "mask_load", "runs": [start, 5000, 640 * 480 - 5000 - start]},
         {"do": "mask_clear"},
         {"do": "lengths", "height": float(rng.integers(1, 9))},
         {"do": "vertical", "ends": [uv, other]},

@@ -12,7 +12,7 @@ import cadalign.cli.evaluate
 import cadalign.evaluation.instances.views
 import cadalign.evaluation.plots
 import cadalign.evaluation.runs.run  # noqa: F401
-from cadalign.annotate.estimate import warm_up
+from cadalign.annotate.problem import warm_up
 from cadalign.evaluation.simulation import simulate_problem
 
 _problem = simulate_problem(np.random.default_rng(0), points=8, noise_px=1.0)

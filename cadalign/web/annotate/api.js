@@ -16,52 +16,39 @@ export class Api {
     this.onWorking = onWorking;
     this.queue = Promise.resolve();
     this.waiting = 0;
-    this.place = { image: 0, object: null };
+    this.image = 0;
   }
 
-  /**
-   * Do an action on the object, or another one of the photo; resolves to the state, or to null if
-   * it was refused.
-   */
-  act(action, object = this.place.object) {
-    return this.enqueue(({ image }) => ({
-      url: addressOf("act", { image, object }),
+  /** Do an action; resolves to the state, or to null if it was refused. */
+  act(action) {
+    return this.enqueue({
+      url: `act/${this.image}`,
       options: {
         method: "POST",
         headers: { "Content-Type": "application/json" },
         body: JSON.stringify(action),
       },
-    }));
+    });
   }
 
   /** Fetch the state anew. */
   refresh() {
-    return this.enqueue((place) => ({ url: addressOf("state", place), options: {} }));
+    return this.enqueue({ url: `state/${this.image}`, options: {} });
   }
 
-  /** The revision of what is shown, and whether another browser has changed it; null without one. */
-  async claim() {
-    try {
-      const response = await fetch(addressOf("claim", this.place));
-      return response.ok ? await response.json() : null;
-    } catch {
-      return null; // the next action reports that the server is gone
-    }
-  }
-
-  /** A library's models, ranked by an object's pairs; null if the server does not answer. */
+  /** A library's models, ranked by the pairs; null if the server does not answer. */
   async models() {
     try {
-      const response = await fetch(addressOf("models", this.place));
+      const response = await fetch(`models/${this.image}`);
       return response.ok ? await response.json() : { note: await reasonOf(response), none: null, models: [] };
     } catch {
       return null;
     }
   }
 
-  /** Go on to another photo, or to an object of one; without a number to its first object. */
-  open(image, object = null) {
-    this.place = { image, object };
+  /** Go on to another photo. */
+  open(image) {
+    this.image = image;
     return this.refresh();
   }
 
@@ -70,12 +57,11 @@ export class Api {
     return this.waiting === 0;
   }
 
-  enqueue(makeRequest) {
-    const { place } = this;
-    const request = makeRequest(place);
+  enqueue(request) {
+    const { image } = this;
     this.waiting += 1;
     this.slow ??= setTimeout(() => this.onWorking(true), LONG);
-    const answer = this.queue.then(() => this.send(request, place));
+    const answer = this.queue.then(() => this.send(request, image));
     this.queue = answer.catch(() => null);
     return answer.finally(() => {
       this.waiting -= 1;
@@ -86,7 +72,7 @@ export class Api {
     });
   }
 
-  async send({ url, options }, place) {
+  async send({ url, options }, image) {
     let response;
     try {
       response = await fetch(url, options);
@@ -100,16 +86,13 @@ export class Api {
     }
     const state = await response.json();
     this.onTrouble("");
-    if (place === this.place) {
-      const { number: image, object } = state.image;
-      if (place.image === image && place.object === null) place.object = object;
-      // What still waits is of the place before: its answers are not shown any more.
-      else if (place.image !== image || place.object !== object) this.place = { image, object };
+    // What still waits after the page went on is of the photo before, and not shown any more.
+    if (image === this.image) {
+      this.image = state.image.number;
       this.onState(state);
     }
     return state;
   }
-
 }
 
 /** Why the server refused a request. */
@@ -130,9 +113,4 @@ export async function failureOf(address) {
   } catch {
     return SILENT;
   }
-}
-
-/** The address of what concerns an object of a photo. */
-export function addressOf(name, { image, object }) {
-  return `${name}/${image}${object === null ? "" : `?object=${object}`}`;
 }

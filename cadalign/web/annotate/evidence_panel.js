@@ -32,7 +32,7 @@ export class EvidencePanel {
         this.lengths.map(({ name, axis, input }) => h("label", {}, `${name} ${axis} `, input)),
         h("label", {}, "± ", this.sigma.input, " %"),
       ),
-      h("p", { class: "soft" }, "Mask and vertical edges are drawn in the photo: choose what a click marks there."),
+      h("p", { class: "soft" }, "A box for the mask and vertical edges are drawn in the photo: choose what is marked there."),
     );
     this.root = h(
       "div",

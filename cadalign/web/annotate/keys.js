@@ -76,9 +76,6 @@ function plain(app, event) {
     case "v":
     case "V":
       return app.asPhoto();
-    case "c":
-    case "C":
-      return app.closePolygon();
     case "a":
     case "A":
       return app.accept();
@@ -88,15 +85,9 @@ function plain(app, event) {
     case "q":
     case "Q":
       return app.showModels();
-    case "e":
-    case "E":
-      return app.nextObject();
     case "t":
     case "T":
-      return app.showObjects();
-    case "y":
-    case "Y":
-      return app.nextView();
+      return app.another();
     case "w":
     case "W":
       return app.showPhotos();

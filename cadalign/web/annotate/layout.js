@@ -20,19 +20,15 @@ const KEYS = [
   ["S held", "snaps clicks and drags: on the model to corners, creases and silhouette, in the photo to corners"],
   ["L", "a loupe beside the pointer, or none"],
   ["M", "begins a pair at the mirror image of the selected one, on a symmetric model"],
-  ["P B G X U", "what a click in the photo marks: points; the mask by brush, polygon, box; a vertical edge"],
-  ["Shift while marking", "takes away from the mask"],
-  ["C", "closes the polygon"],
+  ["P X U", "what is marked in the photo: points; the mask by a box; a vertical edge"],
   ["I", "fits to the photo itself, too, or no more: the outline is sought in it"],
-  ["Right button", "pans the photo while the mask is drawn"],
+  ["Right button", "pans the photo while a box or an edge is drawn"],
   ["H held", "hides the alignment over the photo"],
   ["R", "shows the aligned model before the photo in 3D, or the model to click on again"],
   ["O", "draws the alignment as edges, shaded, as a box, or not"],
   ["Page up, Page down", "the photo before and after, as the list is filtered"],
   ["Q", "the library's models by how well they explain the pairs: there 1 to 9 choose one, 0 none of them"],
-  ["E", "the next object of the photo"],
-  ["T", "the objects of the photo: add, rename, delete; and the photos of the object"],
-  ["Y", "the next photo of the object"],
+  ["T", "begins another object of the photo"],
   ["W", "the list of photos with their states"],
   ["D, K", "marks the photo as done or skipped, and goes on"],
   ["Escape", "gives up what is begun, goes back to points, selects nothing"],
@@ -43,7 +39,7 @@ const WORKING = "Working…";
 
 export class Layout {
   /** @param {object} handlers - undo, redo, previous, next */
-  constructor(handlers, panel, objects) {
+  constructor(handlers, panel) {
     this.title = h("h1");
     this.place = h("span", { class: "soft count" });
     this.saved = h("span", { class: "saved", role: "status" });
@@ -61,6 +57,9 @@ export class Layout {
     this.model = h("div", { class: "host" });
     this.overlay = makeOverlay(handlers.overlay);
     this.tools = makeTools(handlers);
+    this.another = button("Another object", handlers.another, {
+      title: "Begin another object of this photo, in a file of its own (T)",
+    });
     this.shown = h("span", { class: "soft" });
     this.snapping = toggle("Snap", handlers.snap, { title: "Clicks go to corners, creases and silhouette (hold S)" });
     this.loupe = toggle("Loupe", handlers.loupe, { title: "Magnify about the pointer (L)" });
@@ -92,7 +91,7 @@ export class Layout {
         "main",
         {},
         view("Photo", this.photo, handlers.photo, {
-          above: [h("div", { class: "above" }, objects.open, this.tools.root), objects.strip],
+          above: h("div", { class: "above" }, this.another, this.tools.root),
           below: this.overlay.root,
         }),
         view("Model", this.model, handlers.model, { below: [this.models, this.shown, this.result, this.asPhoto] }),
@@ -164,23 +163,19 @@ export class Layout {
   }
 }
 
-/** What clicks in the photo mark, and how wide the brush is. */
-function makeTools({ tool: onChoose, brush: onBrush }) {
+/** What clicks in the photo mark. */
+function makeTools({ tool: onChoose }) {
   const options = Object.entries(TOOLS).map(([name, { label, key }]) =>
     h("option", { value: name }, `${label} (${key.toUpperCase()})`),
   );
   const choice = h("select", { "aria-label": "What a click in the photo marks", onchange: () => onChoose(choice.value) }, options);
-  const size = h("input", {
-    type: "range", min: "2", max: "60", value: "14", "aria-label": "Size of the brush", oninput: () => onBrush(Number(size.value)),
-  });
   let how = h("span", { class: "soft" });
-  const root = h("div", { class: "marking" }, choice, size, how);
+  const root = h("div", { class: "marking" }, choice, how);
   const show = (name) => {
     choice.value = name;
     const told = h("span", { class: "soft" }, TOOLS[name].how);
     how.replaceWith(told);
     how = told;
-    size.hidden = name !== "brush";
   };
   show("points");
   return { root, show };
@@ -245,7 +240,7 @@ function helpDialog(onTour) {
     h(
       "p",
       {},
-      "Red is the model's box, blue its edges, white the boxes of the photo's other objects, orange arrows lead from a point to where the alignment puts it. Pink rings are estimated keypoints that are not marked, with the regions that hold them at 95 %. Every change is saved at once.",
+      "Red is the model's box, blue its edges, orange arrows lead from a point to where the alignment puts it. Pink rings are estimated keypoints that are not marked, with the regions that hold them at 95 %. Every change is saved at once.",
     ),
     button("Close", () => dialog.close()),
     " ",

@@ -7,7 +7,6 @@ import { ModelLibrary } from "./library.js";
 import { Layout } from "./layout.js";
 import { ModelView } from "./model_view.js";
 import { Mover } from "./mover.js";
-import { Objects } from "./objects.js";
 import { Panel } from "./panel.js";
 import { ShadedOverlay } from "./overlay.js";
 import { Tour } from "./tour.js";
@@ -15,8 +14,6 @@ import { WorkList } from "./worklist.js";
 import { PhotoView } from "./photo_view.js";
 
 const POLL = 400; // while the solvers are being prepared [ms]
-const FOLLOW = 2000; // between looks for changes in other pages [ms]
-const ELSEWHERE = "This photo was changed in another browser: this page follows. A change made here takes it back.";
 // ShapeNet's models face -z, with y up; none is looked at straight along y, where left is undefined.
 const SIDES = {
   front: [0, 0, -1], back: [0, 0, 1], left: [1, 0, 0], right: [-1, 0, 0],
@@ -44,11 +41,6 @@ class App {
       mirror: (pair) => this.mirror(pair),
       tell: (text) => this.layout.tell(text),
     });
-    this.objects = new Objects({
-      act: (action, object) => this.api.act(action, object),
-      go: ({ image, object }) => this.goTo(image, object),
-      tell: (text) => this.layout.tell(text),
-    });
     this.worklist = new WorkList({ go: (number) => this.goTo(number), tell: (text) => this.layout.tell(text) });
     this.layout = new Layout(
       {
@@ -63,7 +55,7 @@ class App {
         result: (on) => this.showResult(on),
         models: () => this.showModels(),
         tool: (tool) => this.choose(tool),
-        brush: (radius) => (this.photo.marking.radius = radius),
+        another: () => this.another(),
         snap: (on) => this.snap({ on }),
         loupe: (on) => this.magnify(on),
         overlay: (changed) => this.photo.setOverlay(changed),
@@ -71,7 +63,6 @@ class App {
         model: { zoom: (factor) => this.model.zoom(factor), fit: () => this.model.frame() },
       },
       this.panel.root,
-      this.objects,
     );
     this.photo = new PhotoView(this.layout.photo, {
       onPlace: (uv) => this.place(uv),
@@ -93,7 +84,6 @@ class App {
     listen(this);
     window.addEventListener("hashchange", () => this.open());
     window.addEventListener("focus", () => this.api.idle && this.state && this.api.refresh());
-    setInterval(() => this.follow(), FOLLOW);
   }
 
   async start() {
@@ -119,16 +109,15 @@ class App {
     }
   }
 
-  /** Show the photo, or the object of one, that the address names: #3 or #3.2, counted from 1. */
+  /** Show the photo that the address names: #3, counted from 1. */
   open() {
-    const [photo, part] = location.hash.slice(1).split(".").map((text) => parseInt(text, 10));
-    const number = Math.max(0, (photo || 1) - 1);
+    const number = Math.max(0, (parseInt(location.hash.slice(1), 10) || 1) - 1);
     this.selected = null;
-    if (number !== this.state?.image.number) this.opened = null; // another object keeps the zoom
+    this.opened = null;
     if (this.model?.result) this.showResult(false);
     // The token has done its work: it stays out of the history and of what is copied.
     history.replaceState(null, "", `/${location.hash}`);
-    return this.api.open(number, part > 0 ? part - 1 : null);
+    return this.api.open(number);
   }
 
   /** Show a new state. */
@@ -137,21 +126,14 @@ class App {
     const { image } = state;
     if (this.opened !== image.number) {
       this.opened = image.number;
-      this.photo.open(image.number, image);
-    }
-    const object = `${image.number}.${image.object}`;
-    if (this.object !== object) {
-      if (this.object !== undefined) this.selected = null;
       if (this.model.result) this.showResult(false);
-      this.photo.marking.cancel();
-      this.object = object;
-      this.showAddress(image);
+      this.photo.open(image.number, image);
+      if (location.hash || image.number) history.replaceState(null, "", `/#${image.number + 1}`);
     }
     if (this.model.number !== image.model_number) this.useModel(image.model_number);
     if (state.selected !== null) this.selected = state.selected;
     if (!state.pairs.some((pair) => pair.pair === this.selected)) this.selected = null;
     this.layout.show(state);
-    this.objects.show(state);
     this.draw();
     if (state.alignment.status === "preparing") setTimeout(() => this.api.refresh(), POLL);
   }
@@ -161,17 +143,6 @@ class App {
     this.model.show(this.state, this.selected);
     if (this.model.result) this.showResult(true);
     this.panel.show(this.state, this.selected);
-  }
-
-  /** Show what was changed in another page, and say so if it is another browser's. */
-  async follow() {
-    if (document.hidden || !this.api.idle || !this.state) return;
-    const { api, state } = this;
-    const found = await api.claim();
-    if (!found || !api.idle || state !== this.state) return;
-    if (found.revision !== state.revision) await api.refresh();
-    if (found.elsewhere !== Boolean(this.elsewhere)) this.layout.tell(found.elsewhere ? ELSEWHERE : "");
-    this.elsewhere = found.elsewhere;
   }
 
   /** Do an action; the time until its result is drawn is kept in `redrawn` [ms]. */
@@ -226,12 +197,6 @@ class App {
   choose(tool) {
     this.photo.marking.choose(tool);
     this.layout.showTool(tool);
-    return true;
-  }
-
-  closePolygon() {
-    if (!this.photo.marking.active) return false;
-    this.photo.marking.finish();
     return true;
   }
 
@@ -363,28 +328,15 @@ class App {
     return true;
   }
 
-  goTo(number, object = null) {
-    location.hash = object === null ? String(number + 1) : `${number + 1}.${object + 1}`;
+  goTo(number) {
+    location.hash = String(number + 1);
     return true;
   }
 
-  /** Let the address name the object that is shown, so that reloading the page shows it again. */
-  showAddress({ number, object }) {
-    const part = object === 0 ? "" : `.${object + 1}`;
-    const isNamed = location.hash || number || object;
-    if (isNamed) history.replaceState(null, "", `/#${number + 1}${part}`);
-  }
-
-  nextObject() {
-    return this.objects.nextObject();
-  }
-
-  nextView() {
-    return this.objects.nextView();
-  }
-
-  showObjects() {
-    return this.objects.showDialog();
+  /** Begin another object of the photo, in a file of its own. */
+  another() {
+    this.act({ do: "another" });
+    return true;
   }
 
   /** Take all keypoints of a detector. */

@@ -1,16 +1,11 @@
 // Marking a mask or vertical edges in the photo, in place of points.
 
-import { addressOf } from "./api.js";
-
-const NEAR = 10; // of the first corner, at which a polygon closes [px]
 const MASK = "#b04dff";
 const VERTICAL = "#4be38a";
 
 /** Tools by name: label, key, and what to do with it. */
 export const TOOLS = {
   points: { label: "Points", key: "p", how: "" },
-  brush: { label: "Mask: brush", key: "b", how: "Paint over the object; Shift takes away." },
-  polygon: { label: "Mask: polygon", key: "g", how: "Click its corners; C or the first corner closes it; Shift takes away." },
   box: { label: "Mask: box", key: "x", how: "Draw a box around the object: it is cut out by its colours." },
   vertical: { label: "Vertical edge", key: "u", how: "Draw along two or more vertical edges, far apart." },
 };
@@ -24,9 +19,7 @@ export class Marking {
     this.view = view;
     this.act = act;
     this.tool = "points";
-    this.radius = 14; // of the brush on the screen [px]
     this.path = []; // [px of the photo]
-    this.erases = false;
   }
 
   get active() {
@@ -47,41 +40,29 @@ export class Marking {
     return begun;
   }
 
-  press(uv, shift) {
-    this.erases = shift;
-    const isSecond = this.path.length > 0 && this.tool !== "brush";
-    if (this.tool === "polygon") this.corner(uv);
-    else if (isSecond) this.path[1] = uv;
+  press(uv) {
+    if (this.path.length > 0) this.path[1] = uv;
     else this.path = [uv];
-    this.started = uv;
     this.view.invalidate();
   }
 
   drag(uv) {
-    if (this.tool === "brush") this.path.push(uv);
-    else if (this.tool !== "polygon") this.path[1] = uv;
+    this.path[1] = uv;
     this.view.invalidate();
   }
 
   /** A box or an edge is drawn by dragging, or by two clicks. */
   release(uv, moved) {
-    if (this.tool === "brush") this.finish();
-    else if (this.tool !== "polygon" && (moved || this.path.length > 1)) {
-      this.path[1] = uv;
-      this.finish();
-    }
+    if (!moved && this.path.length < 2) return;
+    const ends = [this.path[0], uv];
+    this.cancel();
+    this.act(this.tool === "box" ? { do: "mask_cut", corners: ends } : { do: "vertical", ends });
   }
 
   /** The same by the keyboard, at the middle of the view. */
   confirm(uv) {
-    this.press(uv, false);
+    this.press(uv);
     this.release(uv, false);
-  }
-
-  corner(uv) {
-    const [first] = this.path;
-    if (this.path.length > 2 && this.gap(first, uv) < NEAR) this.finish();
-    else this.path.push(uv);
   }
 
   follow(uv) {
@@ -90,44 +71,23 @@ export class Marking {
     this.view.invalidate();
   }
 
-  finish() {
-    const { path, tool, erases } = this;
-    this.cancel();
-    if (tool === "brush") {
-      this.act({ do: "mask_paint", points: path, radius: this.radius / this.view.scale, adds: !erases });
-    } else if (tool === "polygon" && path.length > 2) {
-      this.act({ do: "mask_paint", points: path, adds: !erases });
-    } else if (tool === "box") {
-      this.act({ do: "mask_cut", corners: path });
-    } else if (tool === "vertical") {
-      this.act({ do: "vertical", ends: path });
-    }
-  }
-
-  gap(one, other) {
-    const [a, b] = [this.view.toView(one), this.view.toView(other)];
-    return Math.hypot(a.x - b.x, a.y - b.y);
-  }
-
   /** Draw the mask, the vertical edges and what is begun. */
   draw(context, evidence) {
     this.drawMask(context, evidence);
     for (const ends of evidence?.verticals ?? []) this.stroke(context, ends, VERTICAL, 3);
-    const path = this.hover && this.tool !== "brush" ? [...this.path, this.hover] : this.path;
+    const path = this.hover ? [this.path[0], this.hover] : this.path;
     if (!path.length) return;
     if (this.tool === "box" && path.length > 1) {
       const [[x1, y1], [x2, y2]] = path;
       this.stroke(context, [[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]], MASK, 2);
     } else {
-      const color = this.tool === "vertical" ? VERTICAL : this.erases ? "#ffffff" : MASK;
-      this.stroke(context, path, color, this.tool === "brush" ? 2 * this.radius : 2);
+      this.stroke(context, path, this.tool === "vertical" ? VERTICAL : MASK, 2);
     }
   }
 
   drawMask(context, evidence) {
     const key = evidence?.mask ?? null;
-    const { number: image, object } = this.view.state.image;
-    const of = addressOf("mask", { image, object });
+    const of = `mask/${this.view.state.image.number}`;
     if (key !== this.key || of !== this.of) {
       this.key = key;
       this.of = of;
@@ -146,7 +106,7 @@ export class Marking {
 
   async load(key, of) {
     const image = new Image();
-    image.src = `${of}&${key}`;
+    image.src = `${of}?${key}`;
     try {
       await image.decode();
     } catch {
@@ -167,8 +127,7 @@ export class Marking {
   stroke(context, path, color, width) {
     context.save();
     context.lineCap = context.lineJoin = "round";
-    const isWide = width > 4;
-    for (const [style, extra] of isWide ? [[color, 0]] : [["rgb(0 0 0 / 60%)", 2.5], [color, 0]]) {
+    for (const [style, extra] of [["rgb(0 0 0 / 60%)", 2.5], [color, 0]]) {
       context.beginPath();
       for (const uv of path) {
         const { x, y } = this.view.toView(uv);
@@ -178,7 +137,6 @@ export class Marking {
         const { x, y } = this.view.toView(path[0]);
         context.lineTo(x + 0.1, y);
       }
-      context.globalAlpha = isWide ? 0.55 : 1;
       context.strokeStyle = style;
       context.lineWidth = width + extra;
       context.stroke();

@@ -27,7 +27,7 @@ export class Panel {
 
   show(state, selected) {
     this.showAlignment(state.alignment);
-    this.showFocal(state.focal, state.shape);
+    this.showFocal(state.focal);
     this.showPriors(state.priors);
     this.evidence.show(state);
     this.showAdvice(state);
@@ -65,12 +65,11 @@ export class Panel {
       type: "number", min: "1", step: "any", inputMode: "decimal", "aria-label": "Focal length in pixels", onchange: choose,
     });
     this.note = h("p", { class: "soft" });
-    this.unknown = h("span");
     return h(
       "fieldset",
       { class: "focal" },
       h("legend", {}, "Focal length"),
-      h("label", {}, this.estimate, this.unknown),
+      h("label", {}, this.estimate, " estimate it"),
       h("label", {}, this.known, " known: ", this.pixels, " px"),
       this.note,
     );
@@ -83,8 +82,7 @@ export class Panel {
     this.handlers.act({ do: "focal", known, pixels: typed ? pixels : this.typedPixels ?? null });
   }
 
-  showFocal({ known, pixels, typed, note }, shape) {
-    this.unknown.textContent = shape ? " assume it" : " estimate it";
+  showFocal({ known, pixels, typed, note }) {
     this.known.checked = known;
     this.estimate.checked = !known;
     this.typedPixels = typed;

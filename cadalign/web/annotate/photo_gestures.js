@@ -47,7 +47,7 @@ export class PhotoGestures {
       return;
     }
     const marks = event.button === 0 && this.view.marking.active;
-    if (marks) this.view.marking.press(this.pixel(place), event.shiftKey);
+    if (marks) this.view.marking.press(this.pixel(place));
     const pair = event.button === 0 && !marks ? this.view.pairAt(place) : null;
     // The point does not jump to the pointer: it keeps its distance.
     const own = pair && this.view.toView(pair.uv);

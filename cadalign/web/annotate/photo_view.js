@@ -3,7 +3,6 @@ import { failureOf } from "./api.js";
 import { drawBadge, kindOf } from "./marker.js";
 import { drawPhotoLoupe, Loupe } from "./loupe.js";
 import { Marking } from "./marking.js";
-import { drawObjects } from "./object_boxes.js";
 import { PhotoGestures } from "./photo_gestures.js";
 
 const MARGIN = 12;
@@ -194,7 +193,6 @@ export class PhotoView {
       if (!hidden) this.marking.draw(this.context, this.state.evidence);
       if (mode !== "off" && !hidden) {
         this.context.globalAlpha = opacity;
-        drawObjects(this, this.state.objects);
         this.drawAlignment(this.state.alignment, mode);
         this.context.globalAlpha = 1;
       }

@@ -65,19 +65,17 @@ export class WorkList {
     this.grid.replaceChildren(...photos.filter((photo) => this.isShown(photo)).map((photo) => this.card(photo)));
   }
 
-  card({ number, name, state, pairs, rms, objects }) {
+  card({ number, name, state, pairs, rms }) {
     const quality = rms === null ? "" : `, ${rms.toFixed(1)} px`;
-    const several = objects.length > 1 ? `${objects.length} objects, ` : "";
-    const each = objects.map((one) => `${one.label}: ${one.pairs} pairs${one.rms === null ? "" : `, ${one.rms.toFixed(1)} px`}`);
     const picture = h("img", { src: `thumbnail/${number}`, alt: "", loading: "lazy", width: 120, height: 90 });
     const made = button("", () => {
       this.dialog.close();
       this.handlers.go(number);
-    }, { title: several ? each.join("\n") : null });
+    });
     made.append(
       picture,
       h("span", { class: "name" }, name),
-      h("span", { class: `state ${state.replace(" ", "-")}` }, `${state} · ${several}${pairs} pairs${quality}`),
+      h("span", { class: `state ${state.replace(" ", "-")}` }, `${state} · ${pairs} pairs${quality}`),
     );
     return h("li", { "aria-current": number === this.current ? "true" : null }, made);
   }

@@ -55,7 +55,7 @@ LINE = (35, 208, 255)
 # Layers by kind, and the kind's colour.
 KINDS = {
     "#e8e8ec": "errors names arrays compile",
-    "#d9e8f7": "geometry metrics io solvers shapes export estimation torch jax",
+    "#d9e8f7": "geometry metrics io solvers shapes export estimation torch",
     "#dcf0dc": "datasets render web",
     "#fbe9d0": "retrieval evaluation batch report annotate cli scripts",
 }

@@ -49,9 +49,8 @@ def test_examples_run(
         if error.name not in OPTIONAL:
             raise
         pytest.skip(f"the optional package {error.name} is not installed")
-    for extra in ("torch", "jax"):
-        if name.startswith(f"cadalign.{extra}."):
-            pytest.importorskip(extra, reason=f'needs pip install -e ".[{extra}]"')
+    if name.startswith("cadalign.torch."):
+        pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
     monkeypatch.chdir(tmp_path)  # what an example writes does not stay
     with capsys.disabled():
         results = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL)

@@ -16,7 +16,7 @@ import cadalign
 pytestmark = pytest.mark.long
 
 DOCS = ROOT / "docs"
-EXTRAS = ("torch", "jax")
+EXTRAS = ("torch",)
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.py"))
 PAGES = [
     page

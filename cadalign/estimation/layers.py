@@ -1,4 +1,4 @@
-"""Fits of a batch with their derivatives: what layers of PyTorch and JAX share.
+"""Fits of a batch with their derivatives: what the layer of PyTorch needs.
 
 The forward pass is the search of `cadalign.fit_batch`; a Newton step removes what its tolerance
 leaves. The backward pass solves one linear system for each problem, vectorised over the batch.
@@ -145,11 +145,6 @@ class BatchFits:
         """The fits."""
         return FitValues(*_joined(part.values for part in self.parts))
 
-    @property
-    def minima(self) -> BatchMinima:
-        """Minima of the search, from which the fits follow without another one."""
-        return BatchMinima(*_joined(part.minima for part in self.parts))
-
     def pulled_back(self, *slopes: FloatArray) -> tuple[FloatArray, ...]:
         """Slopes by points, pixels and sigmas from those by rotation, translation, scale, focal."""
         ends = np.cumsum([len(part.minima.found) for part in self.parts])[:-1]
@@ -198,9 +193,8 @@ def fits_of(
     pixels: FloatArray,
     sigmas: FloatArray,
     mask: BoolArray,
-    minima: BatchMinima | None = None,
 ) -> BatchFits:
-    """The fits of a batch, from ``minima`` where these are known.
+    """The fits of a batch.
 
     Points (B, n, 3), pixels (B, n, 2), sigmas and mask (B, n).
     """
@@ -215,10 +209,7 @@ def fits_of(
         present = mask[some] & np.isfinite(points[some]).all(axis=2)
         batch = KeypointBatch.of(pixels[some], sigmas[some], present, cameras)
         known = np.where(batch.present[..., None], points[some], 0.0)
-        if minima is None:
-            found = _searched(known, batch, options)
-        else:
-            found = BatchMinima(minima.poses[some], minima.focals[some], minima.found[some])
+        found = _searched(known, batch, options)
         return _polished(known, batch, options, found, exact=task.exact)
 
     return BatchFits(in_threads(run, len(points), task.workers))

@@ -19,8 +19,7 @@ from cadalign.cli.options import named_as_flags
 from cadalign.cli.runs import conclude, run_progress, write_run_report
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.demo import DemoOptions
-from cadalign.evaluation.methods.registry import load_plugin
-from cadalign.evaluation.options import ExperimentOptions, FunctionOptions, PluginOption, RunOptions
+from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.registry import Spec, known_options, spec_named, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.io.files import keeping, write_text
@@ -67,12 +66,9 @@ class RunCommand(JsonOption, RunOptions):
         from cadalign.evaluation.runs.run import execute
 
         kind = self.options_type
-        # What plugins print is not the command's output.
+        # What modules of users print is not the command's output.
         with redirect_stdout(sys.stderr), named_as_flags(self):
-            found = (load_plugin(text) for text in getattr(self, "plugin", ()))
-            names = tuple(name for name in found if name is not None)
             options = kind(**{field.name: getattr(self, field.name) for field in fields(kind)})
-            options = options.with_methods(names) if names else options
             folder = RunFolder(self.out or Path("runs") / options.run_name)
             plan, pool = prepared(options, folder, workers=self.workers, dask=self.dask)
         label = f"{kind.command.removesuffix('e')}ing"
@@ -91,17 +87,16 @@ def command_of(
 ) -> Any:
     """The command of an experiment: its options, those of every run, and those of its ``base``.
 
-    Experiments that run functions take plugins. ``about`` is its help, by default that of the
-    options; ``defaults`` are options that it gives and that cannot be typed.
+    ``about`` is its help, by default that of the options; ``defaults`` are options that it gives
+    and that cannot be typed.
     """
-    plugins = (PluginOption,) if issubclass(options, FunctionOptions) else ()
     given = [
         (name, Annotated[str, tyro.conf.Suppress], field(default=value))
         for name, value in defaults.items()
     ]
     namespace = {"options_type": options, "__doc__": about or options.__doc__}
     return make_dataclass(
-        options.__name__, given, bases=(*plugins, base, options), namespace=namespace, frozen=True
+        options.__name__, given, bases=(base, options), namespace=namespace, frozen=True
     )
 
 

@@ -10,9 +10,7 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import InputError, unknown
-from cadalign.evaluation.methods.method import names_of
-from cadalign.evaluation.methods.registry import register_method
-from cadalign.evaluation.metrics.registry import refuse_taken, register_metric
+from cadalign.evaluation.functions import check_metric_names
 from cadalign.evaluation.options import ExperimentOptions, absolute_paths, tuples
 from cadalign.evaluation.registry import spec_named
 from cadalign.evaluation.runs.folder import RunFolder
@@ -45,7 +43,7 @@ def evaluate(
         (``photos``), or a COLMAP or blind-PnP model (``correspondences``).
     experiment : {"keypointnet", "correspondences", "retrieval", "unseen", "photos",
         "tracks", "simulate", "demo"}
-        Or one that was registered; see `cadalign.evaluation.registry`.
+        Name of the experiment.
     workers : int, optional
         Processes; -1 for one for each core (the default; for running times it is 1), 0 for none.
     dask : str, optional
@@ -58,8 +56,8 @@ def evaluate(
         `cadalign.evaluation.experiments.keypointnet.KeypointNetOptions`: ``categories``, ``split``,
         ``noise_px``, ``min_visible``, ``views_per_model``, ``max_models``, ``methods``,
         ``shape``, ``visibility``, ``render``, ``metrics``, ``seed``. Among ``methods`` and
-        ``metrics`` may be functions of one's own, and names that they were registered by; see
-        `cadalign.evaluation.register_method` and `cadalign.evaluation.register_metric`.
+        ``metrics`` may be functions of one's own, as callables or as texts ``module:function``.
+        Worker processes import them; others need ``workers=0``.
 
     Returns
     -------
@@ -81,9 +79,9 @@ def evaluate(
     >>> table = evaluate("colmap_model", "correspondences", draws=5)  # doctest: +SKIP
     """
     source = () if root is None else (as_path(root, "root"),)
-    for name, register in (("methods", register_method), ("metrics", register_metric)):
-        if options.get(name) is not None:
-            options[name] = names_of(options[name], register, where=name)
+    for name in {"methods", "metrics"}.intersection(options):
+        if isinstance(options[name], str) or callable(options[name]):
+            options[name] = (options[name],)
     kind = spec_named(experiment).options
     _check_given(kind, experiment, source, options)
     chosen = kind(*source, **tuples(options))
@@ -170,5 +168,5 @@ def prepared(
     count = options.default_workers if workers is None else workers
     pool = workers_of(count, dask, threads=options.threads)
     spec = spec_named(options.experiment)
-    refuse_taken(getattr(options, "metrics", ()), [column.key for column in spec.columns])
+    check_metric_names(getattr(options, "metrics", ()), [column.key for column in spec.columns])
     return spec.plan(options, folder), pool

@@ -13,15 +13,15 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, TypeVar
 
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation.methods.method import LIMIT, Method, MethodInput
-from cadalign.evaluation.methods.registry import choose_methods, fingerprints
-from cadalign.evaluation.metrics.registry import (
+from cadalign.evaluation.functions import (
     Compared,
-    RegisteredMetric,
+    FunctionMethod,
+    FunctionMetric,
+    choose_methods,
     choose_metrics,
-    metrics_config,
 )
-from cadalign.evaluation.options import ExperimentOptions
+from cadalign.evaluation.methods.method import LIMIT, Method, MethodInput
+from cadalign.evaluation.options import ExperimentOptions, text_of
 from cadalign.evaluation.runs.work import (
     FAILED,
     AbortError,
@@ -141,7 +141,7 @@ class Benchmark:
     batched: frozenset[str] = frozenset()
     """Methods that are given all instances of a chunk at once, and share the time among them."""
     repeats: int = 1  # calls of a method on one instance, of which the quickest is timed
-    metrics: tuple[RegisteredMetric, ...] = ()  # further columns of the result table
+    metrics: tuple[FunctionMetric, ...] = ()  # further columns of the result table
 
     @classmethod
     def chosen(
@@ -153,7 +153,7 @@ class Benchmark:
         metrics: Iterable[str] = (),
         **how: Any,
     ) -> Benchmark:
-        """The benchmark of methods and registered metrics by their names; see `choose_methods`."""
+        """The benchmark of methods and of functions; see `cadalign.evaluation.functions`."""
         further = choose_metrics(metrics, setting.columns)
         return cls(setting, choose_methods(methods, own), metrics=further, **how)
 
@@ -175,17 +175,18 @@ class Benchmark:
     def plan(
         self, options: ExperimentOptions, tasks: Sequence[T], *, chunk: int, **more: Any
     ) -> Plan[T]:
-        """The plan of a run, with more of its configuration than the options and the functions."""
-        return Plan(self, tasks, options.as_config() | more | self.functions, chunk)
+        """The plan of a run, with more of its configuration than the options and the metrics."""
+        return Plan(self, tasks, options.as_config() | more | self.further, chunk)
 
     @property
-    def functions(self) -> dict[str, Any]:
-        """Users' functions in a run's configuration; empty without any."""
-        return fingerprints(self.methods) | metrics_config(self.metrics)
+    def further(self) -> dict[str, Any]:
+        """Metrics of users in a run's configuration; empty without any."""
+        functions = [text_of(each.function) for each in self.metrics]
+        return {"metrics": functions} if functions else {}
 
     def warm_up(self) -> None:
-        """Compile solvers and metrics; functions that users registered are not called."""
-        built_in = tuple(method for method in self.methods if not method.is_registered)
+        """Compile solvers and metrics; functions of users are not called."""
+        built_in = tuple(m for m in self.methods if not isinstance(m.solve, FunctionMethod))
         replace(self, methods=built_in).evaluate(self.setting.warm_up())
 
     def evaluate(self, tasks: Sequence[Any]) -> Rows:
@@ -259,7 +260,7 @@ class Benchmark:
         return [row for pair in pairs for row in self._measured(method, [pair])]
 
     def _further(self, pair: Pair, row: Row | Exception) -> Row | Exception:
-        """The cells of an estimate with those of registered metrics."""
+        """The cells of an estimate with those of further metrics."""
         if isinstance(row, Exception):
             return row
         instance, estimate = pair

@@ -7,16 +7,20 @@ it. These modules load quickly: `cadalign evaluate --help` imports them.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import copy
-from dataclasses import KW_ONLY, asdict, dataclass, fields, is_dataclass
+from dataclasses import KW_ONLY, dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, TypeVar, cast
+from typing import Annotated, Any, ClassVar, TypeVar, cast
 
 import tyro
 
 from cadalign.errors import InputError, unknown
 
 T = TypeVar("T")
+Function = str | Callable[..., Any]
+"""A function, or the text ``module:function`` by which it is imported."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,14 +62,10 @@ class ExperimentOptions:
 
         Some stand there only if they are given; others are left to the rest of it.
         """
-        options = asdict(self).items()
-        stored = {name: plain_value(each) for name, each in options if name not in self.not_stored}
+        options = plain_value(self).items()
+        stored = {name: each for name, each in options if name not in self.not_stored}
         config = {k: v for k, v in stored.items() if v is not None or k not in self.if_given}
         return {**config, "experiment": self.experiment}
-
-    def with_methods(self, names: tuple[str, ...]) -> Self:
-        """The options with further methods, for experiments that run functions."""
-        raise InputError(f"{self.experiment} runs no functions", where="plugin")
 
     def check_least(self, **bounds: float) -> None:
         """Check that options, if they are given, are not less than their bounds."""
@@ -94,8 +94,41 @@ class ExperimentOptions:
             object.__setattr__(self, name, value)
 
 
+def is_function(given: object) -> bool:
+    """True for a callable, and for a text ``module:function``."""
+    return callable(given) or (isinstance(given, str) and ":" in given)
+
+
+def name_of(function: Function) -> str:
+    """The name of a function in tables, that of its class for a callable object."""
+    if isinstance(function, str):
+        return function.rpartition(":")[2].rpartition(".")[2]
+    function = _innermost(function)
+    return str(getattr(function, "__name__", type(function).__name__))
+
+
+def text_of(function: Function) -> str:
+    """The function as ``module:function``, for a run's configuration."""
+    if isinstance(function, str):
+        return function
+    function = _innermost(function)
+    name = getattr(function, "__qualname__", type(function).__qualname__)
+    return f"{function.__module__}:{name}"
+
+
+def _innermost(function: Any) -> Any:
+    """The function itself of one whose arguments are bound by functools.partial."""
+    while isinstance(function, partial):
+        function = function.func
+    return function
+
+
 def plain_value(value: Any) -> Any:
-    """The value as JSON has it, the paths in it absolute."""
+    """The value as JSON has it, the paths in it absolute, functions by their names."""
+    if is_dataclass(value):
+        return {each.name: plain_value(getattr(value, each.name)) for each in fields(value)}
+    if callable(value):
+        return text_of(value)
     if isinstance(value, dict):
         return {name: plain_value(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
@@ -107,29 +140,19 @@ def plain_value(value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class FunctionOptions(ExperimentOptions):
-    """Options of experiments that take functions of one's own, as methods and as metrics."""
+    """Options of experiments that take functions of one's own, as methods and as metrics.
+
+    Each is a callable or a text ``module:function``; see `cadalign.evaluation.functions`.
+    """
 
     metrics: tuple[str, ...] = ()
-    """Metrics of one's own, beside the experiment's: names that a plugin registers."""
-
-    def with_methods(self, names: tuple[str, ...]) -> Self:
-        """The options with further methods, those of plugins.
-
-        Raises InputError if the other methods are not given.
-        """
-        methods: tuple[str, ...] = getattr(self, "methods", ())
-        if not methods:
-            fix = "give --methods, too: the functions, and methods to compare them with"
-            raise InputError("the other methods are not given", where="plugin", fix=fix)
-        found = copy(self)
-        found.replace_values(methods=tuple(dict.fromkeys((*methods, *names))))
-        return found
+    """Metrics of one's own, beside the experiment's: module:function."""
 
     def check_methods(self, own: tuple[str, ...] | None = None) -> None:
-        """Check the names of methods, each once; ``own`` are the experiment's, if it has any."""
-        from cadalign.evaluation.methods.registry import checked_names
+        """Check methods, each once; ``own`` are the names of the experiment's, if it has any."""
+        from cadalign.evaluation.functions import checked_methods
 
-        self.replace_values(methods=checked_names(getattr(self, "methods", ()), own))
+        self.replace_values(methods=checked_methods(getattr(self, "methods", ()), own))
 
 
 @dataclass(frozen=True)
@@ -230,16 +253,6 @@ class RunOptions:
     """Processes; -1 for one for each core (the default; for running times it is 1), 0 for none."""
     dask: str | None = None
     """Address of a Dask scheduler, whose workers are used instead."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PluginOption:
-    """Methods of one's own on the command line."""
-
-    plugin: tuple[str, ...] = ()
-    """Functions to run beside the methods, module:function or name=module:function; the module may
-    be a file, such as mine.py:solve. They take points_3d, points_2d and a camera, or a model and
-    its views, and return an alignment. A module alone registers its methods itself."""
 
 
 def absolute_paths(value: T) -> T:

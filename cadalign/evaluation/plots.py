@@ -105,7 +105,7 @@ def look_of(method: str) -> Look:
     names = [name for name in dict.fromkeys([*fit_methods(), *_LABELS]) if name != LIMIT]
     if method in names:
         place = mark = names.index(method)
-    else:  # of a registered one by its name, wherever it is drawn
+    else:  # of a function by its name, wherever it is drawn
         place = crc32(method.encode())
         mark = place // len(COLORS)
     return Look(label, COLORS[place % len(COLORS)], _MARKERS[mark % len(_MARKERS)], "-")

@@ -1,12 +1,8 @@
 """Specifications of experiments, all that command line, report and `evaluate show` know of them.
 
-Experiments are the modules of `cadalign.evaluation.experiments`, and those of users, each of which
-needs a single file, anywhere: options (`cadalign.evaluation.options`), tasks and an experiment
-(`cadalign.evaluation.runs.work`), a specification, and ::
-
-    SPEC = register(Spec(options=MyOptions, plan=plan, columns=COLUMNS, summarize=summarize))
-
-Import that file before the command line runs; its runs, tables, page and `evaluate show` follow.
+An experiment is a module of `cadalign.evaluation.experiments`: options
+(`cadalign.evaluation.options`), tasks and an experiment (`cadalign.evaluation.runs.work`), and a
+specification. Its runs, tables, page and `evaluate show` follow.
 """
 
 from __future__ import annotations
@@ -115,7 +111,7 @@ class Spec:
         return ConsoleTable.of("Medians per group and method", lines, columns, labels=labels)
 
     def shown_columns(self, lines: Summaries, runs: Sequence[Run]) -> list[Metric]:
-        """The columns that some line has a value of, those of registered metrics last."""
+        """The columns that some line has a value of, those of further metrics last."""
         further = {metric.key: metric for run in runs for metric in run.metrics}
         columns = (*self.columns, *further.values())
         return [c for c in columns if told(c, [line.number(c.key) for line in lines])]
@@ -132,49 +128,36 @@ class Spec:
         return summaries
 
 
-# In the order in which they are named to users.
-_MODULES = (
-    "keypointnet",
-    "demo",
-    "simulation",
-    "correspondences",
-    "retrieval",
-    "unseen",
-    "photos",
-    "tracks",
-)
-_REGISTERED: dict[str, Spec] = {}
-
-
-def register(spec: Spec) -> Spec:
-    """Make an experiment known; returns its specification."""
-    _REGISTERED[spec.name] = spec
-    return spec
-
-
-def known_specs() -> Iterator[Spec]:
-    """The specifications of all experiments."""
-    for name in _MODULES:
-        spec: Spec = import_module(f"cadalign.evaluation.experiments.{name}").SPEC
-        yield spec
-    yield from _REGISTERED.values()
+# In the order in which they are named to users, with their modules.
+_EXPERIMENTS = {
+    name: f"cadalign.evaluation.experiments.{module}"
+    for name, module in {
+        "keypointnet": "keypointnet",
+        "demo": "demo",
+        "simulate": "simulation",
+        "correspondences": "correspondences",
+        "retrieval": "retrieval",
+        "unseen": "unseen",
+        "photos": "photos",
+        "tracks": "tracks",
+    }.items()
+}
+BATCHES: dict[str, str] = {}
+"""Modules of runs over many observations, which `cadalign.report` shows as experiments are."""
 
 
 def known_options() -> Iterator[type[ExperimentOptions]]:
     """The options of all experiments."""
-    return (spec.options for spec in known_specs())
+    return (spec_named(name).options for name in _EXPERIMENTS)
 
 
 def spec_named(name: str) -> Spec:
     """The specification of an experiment."""
-    if name in _REGISTERED:
-        return _REGISTERED[name]
-    known = []
-    for spec in known_specs():
-        if spec.name == name:
-            return spec
-        known.append(spec.name)
-    raise unknown("experiment", name, known)
+    module = (_EXPERIMENTS | BATCHES).get(name)
+    if module is None:
+        raise unknown("experiment", name, list(_EXPERIMENTS))
+    spec: Spec = import_module(module).SPEC
+    return spec
 
 
 def spec_of(run: Run) -> Spec:

@@ -194,7 +194,7 @@ def medians(run: Run, columns: Sequence[Metric], *, group: Metric = CATEGORY) ->
 def by_category_and_method(run: Run, statistics: Statistics) -> list[Summary]:
     """A summary of each category's cells for every method, and of all where there are several.
 
-    Statistics are of the rows that are ok. Medians of registered metrics are added.
+    Statistics are of the rows that are ok. Medians of further metrics are added.
     """
 
     def summarize(category: str, method: str, cells: Cells) -> Summary:

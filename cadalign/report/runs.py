@@ -8,17 +8,15 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from cadalign.batch import libraries, spec
 from cadalign.errors import InputError
 from cadalign.evaluation.methods.method import LIMIT
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.registry import Spec, register, spec_of, spec_of_config
+from cadalign.evaluation.registry import BATCHES, Spec, spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import as_path, refuse_nul
 
-for many in (spec, libraries):  # runs over many observations are shown as experiments are
-    register(many.SPEC)
+BATCHES.update(fit="cadalign.batch.spec", retrieve="cadalign.batch.libraries")
 
 _LABELS = {
     "root": "dataset",

@@ -8,6 +8,7 @@ import pytest
 from cadalign import Alignment, fit
 from cadalign.arrays import FloatArray
 from cadalign.errors import DegenerateError, InputError, TooFewVisibleError
+from cadalign.evaluation.functions import checked_methods
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view, sample_hull_views
 from cadalign.evaluation.instances.instance import (
     KEYPOINT_CAMERA,
@@ -16,7 +17,6 @@ from cadalign.evaluation.instances.instance import (
     make_hull_instances,
 )
 from cadalign.evaluation.methods.method import LIMIT, fit_methods, fit_options
-from cadalign.evaluation.methods.registry import checked_names
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.box import Box
@@ -205,7 +205,7 @@ def test_every_method_solves_an_easy_problem(name: str) -> None:
 
 def test_an_unknown_method_is_named_with_the_nearest() -> None:
     with pytest.raises(InputError, match="did you mean 'optimal'"):
-        checked_names(["optimum"])
+        checked_methods(["optimum"])
     with pytest.raises(InputError, match="none is given"):
-        checked_names([])
-    assert checked_names(["aepnp", "aepnp"]) == ("aepnp",)
+        checked_methods([])
+    assert checked_methods(["aepnp", "aepnp"]) == ("aepnp",)

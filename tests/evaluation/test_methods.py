@@ -1,10 +1,11 @@
-"""Methods of one's own: registered, given as functions, plugins and entry points."""
+"""Methods of one's own, given as functions or as texts ``module:function``."""
 
 from __future__ import annotations
 
 import json
 import re
-import threading
+import subprocess
+import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -14,71 +15,18 @@ import numpy as np
 import pytest
 from support.pages import embedded_payload
 from support.refusals import refusal_line
+from support.solving import BAD, joint, linear, weighted
 
 import cadalign
-from cadalign import Alignment, Camera, Model, Result, View
+from cadalign import Alignment, Camera, Model
 from cadalign.cli import main
 from cadalign.errors import DataError, InputError
-from cadalign.evaluation import register_method
 from cadalign.evaluation.experiments.photos import PhotosOptions
-from cadalign.evaluation.methods import registry
+from cadalign.evaluation.functions import choose_methods
 from cadalign.evaluation.methods.method import MethodInput
-from cadalign.evaluation.methods.registry import choose_methods, registered_method
-from cadalign.evaluation.photos.objects import photos_benchmark
+from cadalign.evaluation.methods.pnp import PNP_METHODS
 from cadalign.evaluation.plots import look_of
-from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.simulation import simulate_problem
-
-
-@pytest.fixture(autouse=True)
-def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forget what a test registers."""
-    registry.known_names(())  # the examples stay
-    monkeypatch.setattr(registry, "_REGISTERED", dict(registry._REGISTERED))
-
-
-def linear(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
-    return cadalign.fit(points_3d, points_2d, camera, method="aepnp").alignment
-
-
-def joint(model: Any, views: list[View]) -> Result:
-    return cadalign.align(model, views)
-
-
-def weighted(points_3d: Any, points_2d: Any, camera: Camera, *, sigma: float) -> Result:
-    assert sigma == 2.0
-    return cadalign.fit(points_3d, points_2d, camera, sigma=sigma)
-
-
-def raising(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
-    raise RuntimeError("out of luck")
-
-
-def leaving(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
-    raise SystemExit(4)
-
-
-def of_one(points: Any) -> Alignment:
-    raise AssertionError
-
-
-def mapping(points_3d: Any, points_2d: Any, camera: Camera) -> Any:
-    return {"R": np.eye(3)}
-
-
-def unchecked(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
-    points_2d *= np.nan
-    return Alignment(points_3d[:3] * np.nan, np.zeros(3), np.ones(3), is_valid=True)
-
-
-BAD = {
-    raising: "RuntimeError: out of luck",
-    leaving: "it called for an exit (4)",
-    of_one: "TypeError: of_one() takes 1 positional argument but 3 were given",
-    mapping: "method: it returned dict, no alignment; return a cadalign.Alignment, or the result "
-    "of cadalign.fit or cadalign.align",
-    unchecked: "rotation: NaN or infinite values in rows 0, 1, 2; remove or repair these",
-}
 
 
 def simulate(methods: Any, **options: Any) -> Any:
@@ -89,11 +37,11 @@ def simulate(methods: Any, **options: Any) -> Any:
 # --- functions as methods ----------------------------------------------------------------------
 
 
-def test_a_registered_function_stands_beside_built_in_methods() -> None:
-    register_method("mine", linear)
-    table = simulate(["mine", "aepnp"])
-    assert table.method.tolist() == ["mine", "aepnp"] * 3
-    mine, built_in = (table[table.method == name] for name in ("mine", "aepnp"))
+@pytest.mark.parametrize("given", [linear, "support.solving:linear"])
+def test_a_function_stands_beside_built_in_methods(given: Any) -> None:
+    table = simulate([given, "aepnp"])
+    assert table.method.tolist() == ["linear", "aepnp"] * 3
+    mine, built_in = (table[table.method == name] for name in ("linear", "aepnp"))
     np.testing.assert_allclose(mine.rotation_error_deg, built_in.rotation_error_deg, rtol=1e-6)
 
 
@@ -132,43 +80,32 @@ def test_what_is_given_to_functions_of_views_is_what_align_takes() -> None:
     assert view.sigma == 2.0
 
 
-@pytest.mark.parametrize(
-    ("name", "function", "message"),
-    [
-        ("optimal", linear, "'optimal' is a built-in method; choose another name"),
-        ("", linear, "'' is not a name"),
-        ("mine", 3, "3 is not a function"),
-    ],
-)
-def test_what_cannot_be_registered_is_refused(name: str, function: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        register_method(name, function)
-
-
 def test_functions_without_a_name_of_their_own_are_refused() -> None:
     with pytest.raises(InputError, match="a function that is called <lambda> has no name"):
         simulate([lambda a, b, c: None])
-    with pytest.raises(InputError, match="'linear' is the name of more than one function"):
+    with pytest.raises(InputError, match="'linear' is the name of more than one"):
         simulate([linear, partial(linear)])
 
 
 def test_names_that_are_unknown_are_refused_with_all_that_are_known() -> None:
-    register_method("mine", linear)
-    with pytest.raises(InputError, match=r"unknown method 'mime', did you mean 'mine'\?") as caught:
-        simulate(["mime"])
-    for name in ("optimal", "limit", "opencv-sqpnp", "poselib", "mine"):
-        assert name in str(caught.value)
+    with pytest.raises(
+        InputError, match=r"unknown method 'optimum', did you mean 'optimal'\?"
+    ) as e:
+        simulate(["optimum"])
+    for name in ("optimal", "limit", "opencv-sqpnp", "poselib"):
+        assert name in str(e.value)
 
 
 def test_a_method_of_an_experiment_is_not_hidden(tmp_path: Path) -> None:
-    register_method("shape", linear)
-    with pytest.raises(InputError, match="'shape' is a method of the experiment; register"):
-        cadalign.evaluate(tmp_path, "unseen", methods=["shape"])
-    register_method("rigid", linear)
-    options = PhotosOptions(tmp_path, methods=("rigid",))
-    with pytest.raises(InputError, match="'rigid' is a method of the experiment; register"):
-        photos_benchmark(options, (), RunFolder(tmp_path))
-    with pytest.raises(InputError, match="unknown: 'linear'; known are optimal, optimal-"):
+    def shape(model: Any, views: Any) -> Any: ...
+
+    def rigid(model: Any, views: Any) -> Any: ...
+
+    with pytest.raises(InputError, match="'shape' is the name of more than one; give the func"):
+        cadalign.evaluate(tmp_path, "unseen", methods=[shape])
+    with pytest.raises(InputError, match="'rigid' is the name of more than one; give the func"):
+        PhotosOptions(tmp_path, methods=(rigid,))  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="known are optimal, optimal-"):
         cadalign.evaluate(tmp_path, "retrieval", methods=["linear"])
 
 
@@ -231,7 +168,7 @@ def run_bytes(out: Path, **options: Any) -> bytes:
 
 
 @pytest.mark.long
-def test_worker_processes_get_functions_of_this_file(tmp_path: Path) -> None:
+def test_worker_processes_import_functions(tmp_path: Path) -> None:
     alone = run_bytes(tmp_path / "alone")
     assert run_bytes(tmp_path / "processes", workers=1) == alone
 
@@ -246,46 +183,56 @@ def cluster() -> Iterator[Any]:
 
 
 @pytest.mark.long
-def test_a_dask_cluster_gets_functions_of_this_file(tmp_path: Path, cluster: Any) -> None:
+def test_a_dask_cluster_imports_functions(tmp_path: Path, cluster: Any) -> None:
     alone = run_bytes(tmp_path / "alone")
     dask = cluster.scheduler_address
     assert run_bytes(tmp_path / "dask", workers=None, dask=dask) == alone
 
 
 @pytest.mark.long
-def test_a_function_that_cannot_be_sent_is_named() -> None:
-    lock = threading.Lock()
+def test_a_local_function_runs_without_workers_alone() -> None:
+    def local(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
+        return linear(points_3d, points_2d, camera)
 
-    def locked(points_3d: Any, points_2d: Any, camera: Camera) -> Alignment:
-        with lock:
-            return linear(points_3d, points_2d, camera)
-
-    assert (simulate([locked]).status == "ok").all()
-    with pytest.raises(InputError, match="'locked' cannot be sent to worker processes"):
-        simulate([locked], workers=1)
+    assert (simulate([local]).status == "ok").all()
+    with pytest.raises(InputError, match="workers: a function cannot be sent to worker") as caught:
+        simulate([local], workers=1)
+    assert "define it in a module that they can import, or name it module:f" in str(caught.value)
 
 
-@pytest.mark.usefixtures("no_figures")
-def test_a_run_does_not_go_on_with_another_function(tmp_path: Path) -> None:
-    module = tmp_path / "changing.py"
-    code = "import cadalign\ndef solve(a, b, c):\n    return cadalign.fit(a, b, c)\n"
-    module.write_text(code)
-    command = ["simulate", "points", "--values", "8", "--runs", "2", "--methods", "aepnp"]
-    command += ["--workers", "0", "--out", str(tmp_path / "run"), "--plugin", f"{module}:solve"]
-    assert main(command) == 0
-    assert main(command) == 0
-    module.write_text(f"{code}# changed\n")
-    assert main(command) == 1
+_SCRIPT = """
+import cadalign
+def mine(points_3d, points_2d, camera):
+    return cadalign.fit(points_3d, points_2d, camera, method="aepnp")
+def simulate(methods):
+    return cadalign.simulate("points", values=[20], runs=2, workers=1, methods=methods)
+print((simulate(["aepnp"]).status == "ok").all())
+try:
+    simulate([mine])
+except cadalign.CadalignError as error:
+    print(error)
+"""
+
+
+@pytest.mark.long
+def test_a_script_needs_no_guard_and_its_functions_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(_SCRIPT)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "script.py")], capture_output=True, text=True, check=True
+    )
+    good, refused = done.stdout.splitlines()
+    assert good == "True"
+    assert "(it is defined in a script or a notebook); define it in a module that" in refused
+
+
+def test_a_run_names_its_functions(tmp_path: Path) -> None:
+    simulate([linear, "aepnp"], out=tmp_path / "run")
+    simulate(["support.solving:linear", "aepnp"], out=tmp_path / "run")
     config = json.loads((tmp_path / "run" / "run.json").read_text())
-    assert list(config["functions"]) == ["solve"]
+    assert config["sweep"]["methods"] == ["support.solving:linear", "aepnp"]
 
 
-def test_runs_without_functions_are_as_they_were(tmp_path: Path) -> None:
-    simulate(["aepnp", "opencv-epnp"], out=tmp_path / "run")
-    assert "functions" not in json.loads((tmp_path / "run" / "run.json").read_text())
-
-
-# --- plugins and entry points ------------------------------------------------------------------
+# --- on the command line -----------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -308,21 +255,15 @@ def command(*options: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("text", "name"),
-    [
-        ("my_plugin:solve", "solve"),
-        ("mine=my_plugin:solve", "mine"),
-        ("my_plugin.py:solve", "solve"),
-    ],
-)
+@pytest.mark.parametrize("workers", ["0", "1"])
 @pytest.mark.usefixtures("no_figures")
-def test_a_plugin_runs_beside_the_methods(
-    plugin: Path, capsys: pytest.CaptureFixture[str], text: str, name: str
+def test_a_function_of_a_module_is_a_method(
+    plugin: Path, capsys: pytest.CaptureFixture[str], workers: str
 ) -> None:
-    assert main(command("--plugin", text, "--methods", "epnp", "--json")) == 0
+    methods = ["--methods", "epnp", "my_plugin:solve"]
+    assert main([*command(*methods, "--json"), "--workers", workers]) == 0
     found = json.loads(capsys.readouterr().out)["summary"]
-    assert {each["method"] for each in found} == {"epnp", name}
+    assert {each["method"] for each in found} == {"epnp", "solve"}
 
 
 @pytest.mark.parametrize(
@@ -332,40 +273,13 @@ def test_a_plugin_runs_beside_the_methods(
         ("my_plugin:number", "the module 'my_plugin' has no function 'number'; "),
         ("none_such:solve", "'none_such' cannot be imported (ModuleNotFoundError: No module "),
         ("broken:solve", "'broken' cannot be imported (ModuleNotFoundError: No module named "),
-        ("optimal=my_plugin:solve", "'optimal' is a built-in method; name it otherwise: "),
     ],
 )
-def test_plugins_that_cannot_be_used_are_refused(
+def test_functions_that_cannot_be_used_are_refused(
     plugin: Path, capsys: pytest.CaptureFixture[str], text: str, message: str
 ) -> None:
-    line = refusal_line(capsys, *command("--plugin", text))
-    assert line.startswith(f"--plugin: {message}")
-
-
-def test_photos_need_the_other_methods_with_a_plugin(
-    plugin: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["evaluate", "photos", str(plugin), "--plugin", "my_plugin:solve"]
-    assert refusal_line(capsys, *arguments).startswith("--plugin: the other methods are not given")
-
-
-@pytest.mark.slow
-def test_entry_points_are_methods(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "installed_solver.py").write_text(
-        "import cadalign\ndef solve(model, views):\n    return cadalign.align(model, views)\n"
-    )
-    info = tmp_path / "installed_solver-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: installed-solver\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text(
-        "[cadalign.methods]\ninstalled = installed_solver:solve\nbroken = no_such_module:solve\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    assert (simulate(["installed"]).status == "ok").all()
-    with pytest.raises(InputError, match="the entry point 'broken' cannot be loaded"):
-        simulate(["broken"])
-    with pytest.raises(InputError, match=r"known are .*installed, broken"):
-        simulate(["unknown"])
+    line = refusal_line(capsys, *command("--methods", text))
+    assert line.startswith(f"--methods: {message}")
 
 
 # --- the examples ------------------------------------------------------------------------------
@@ -378,7 +292,7 @@ def test_foreign_solvers_find_the_pose_of_a_model_as_it_is(name: str) -> None:
     rng = np.random.default_rng(1)
     problem = simulate_problem(rng, points=12, noise_px=0.0, stretch=(1.0, 1.0))
     given = MethodInput(problem.points_3d, problem.points_2d, problem.camera, 1.0)
-    found = registered_method(name).solve(given)
+    found = PNP_METHODS[name].solve(given)
     np.testing.assert_allclose(found.rotation, problem.alignment.rotation, atol=1e-4)
     np.testing.assert_allclose(found.translation, problem.alignment.translation, atol=1e-3)
 
@@ -395,7 +309,7 @@ def test_a_missing_poselib_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(table.reason) == {"PoseLib is not installed; pip install poselib"}
 
 
-def test_all_built_in_methods_are_of_the_registry() -> None:
+def test_built_in_methods_are_chosen_by_name() -> None:
     names = ["optimal", "aepnp", "ransac-optimal", "limit"]
     assert [method.name for method in choose_methods(names)] == names
     with pytest.raises(DataError):
@@ -410,4 +324,4 @@ def test_the_how_to_runs(
     (block,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
     monkeypatch.chdir(tmp_path)
     exec(block, {})
-    assert "trimmed" in capsys.readouterr().out
+    assert "refined_twice" in capsys.readouterr().out

@@ -23,7 +23,7 @@ from cadalign.evaluation.api import run
 from cadalign.evaluation.metrics import CATEGORY, FAILED, INSTANCES, Metric
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, Trace
-from cadalign.evaluation.registry import Spec, register
+from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import Run
@@ -128,8 +128,7 @@ SPEC = Spec(
 
 @pytest.fixture(autouse=True)
 def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
-    register(SPEC)
+    monkeypatch.setitem(registry._EXPERIMENTS, "middle", __name__)
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, opened
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import Plan
 
-# --- a new experiment on photos: this module, and a call of `register` -------------------------
+# --- a new experiment on photos: this module, and its line in the table -------------------------
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,7 @@ SPEC = replace(photos.SPEC, options=WrongClickOptions, plan=plan, topic="wrong c
 def test_a_new_experiment_on_photos_is_one_module_and_its_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(registry, "_REGISTERED", {})
-    registry.register(SPEC)
+    monkeypatch.setitem(registry._EXPERIMENTS, "wrong-click", __name__)
     opened.cache_clear()
     root, out = write_pix3d(tmp_path / "data"), tmp_path / "run"
     command = ["evaluate", "wrong-click", root, "--out", out, "--workers", "0", "--pictures", "1"]
@@ -96,7 +95,7 @@ def test_a_new_experiment_on_photos_is_one_module_and_its_line(
 
 
 def test_columns_scores_and_summaries_follow_from_the_line_of_a_metric() -> None:
-    """A function of one's own is a metric by `register_metric`: see `test_metrics`."""
+    """A function of one's own is a metric, too: see `test_metrics`."""
     depth = Metric("depth_off", "depth error", "m")
     extended = replace(
         metrics.VIEWPOINT,

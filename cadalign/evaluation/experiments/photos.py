@@ -16,7 +16,7 @@ import tyro
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.methods.registry import is_registered
+from cadalign.evaluation.methods.pnp import PNP_METHODS
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.bop import BOP
 from cadalign.evaluation.metrics.photos import DEPTH as DEPTH_ERROR
@@ -33,7 +33,7 @@ from cadalign.evaluation.metrics.photos import (
 )
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.metrics.table import BOX_IOU
-from cadalign.evaluation.options import FunctionOptions, PhotoOptions
+from cadalign.evaluation.options import FunctionOptions, PhotoOptions, is_function
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.plots import cumulative_curves
 from cadalign.evaluation.registry import Spec, count_failures
@@ -101,9 +101,12 @@ class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
             raise InputError(f"{self.similar_sigma} is not positive", where="similar_sigma")
         self.replace_values(methods=tuple(dict.fromkeys(self.methods)))
         protocols.check_evidence(self.evidence, self.methods)
-        for name in self.methods:
-            if protocols.is_own(name) or not is_registered(name):
-                protocols.check_method(name)
+        names = [each for each in self.methods if not is_function(each)]
+        own = [name for name in names if name not in PNP_METHODS]
+        for name in own:
+            protocols.check_method(name)
+        if self.methods:
+            self.check_methods((*protocols.BASES, protocols.TRUTH, *own))
 
 
 GALLERY = (

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Annotated, Literal, Self
+from dataclasses import KW_ONLY, dataclass, fields, replace
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -22,7 +22,7 @@ from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.metrics.table import Metric
-from cadalign.evaluation.options import FunctionOptions
+from cadalign.evaluation.options import FunctionOptions, name_of, plain_value
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import OK, Columns, Plan, Row
@@ -120,10 +120,6 @@ class SweepOptions(FunctionOptions):
             self.replace_values(values=tuple(float(value) for value in self.values))
         _check_values(self.kind)
         refuse_unused(self, [self.kind.column], "where it is varied")
-
-    def with_methods(self, names: tuple[str, ...]) -> Self:
-        """The options with further methods beside the sweep's own."""
-        return replace(self, methods=(*self.kind.methods, *names))
 
     @property
     def kind(self) -> SweepKind:
@@ -267,7 +263,7 @@ def kind_of(run: Run) -> SweepKind:
         found: SweepKind = convert(given, SweepKind, "sweep")
         if any(abs(value) > sys.float_info.max for value in found.values):
             raise DataError("a value is beyond all numbers", where="sweep.values")
-    return found
+    return replace(found, methods=tuple(map(name_of, found.methods)))
 
 
 def varied(run: Run) -> Metric:
@@ -380,9 +376,9 @@ def plan(options: SweepOptions, folder: RunFolder) -> Plan[SweepTask]:
     """Plan a sweep."""
     kind = options.kind
     benchmark = sweep_benchmark(kind, options.seed, options.metrics)
-    config = {"experiment": options.experiment, "seed": options.seed, "sweep": asdict(kind)}
+    config = {"experiment": options.experiment, "seed": options.seed, "sweep": plain_value(kind)}
     chunk = _CHUNK_TIMED if kind.is_timed else _CHUNK
-    return Plan(benchmark, sweep_tasks(kind), config | benchmark.functions, chunk)
+    return Plan(benchmark, sweep_tasks(kind), config | benchmark.further, chunk)
 
 
 def _describe(run: Run) -> str:

@@ -1,1 +1,1 @@
-"""Methods that benchmarks run on instances: built-in ones, and those that users register."""
+"""Methods that benchmarks run on instances."""

@@ -1,27 +1,16 @@
-"""Methods, what they are given and may answer, those of `cadalign.fit`, and how users' travel.
-
-A function of a user is sent to worker processes and clusters wherever it was written.
-"""
+"""Methods, what they are given and may answer, and those of `cadalign.fit`."""
 
 from __future__ import annotations
 
-import inspect
-import pickle
-import sysconfig
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from itertools import groupby
-from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from cadalign.arrays import BoolArray, FloatArray
-from cadalign.errors import CadalignError, InputError, quote
+from cadalign.errors import CadalignError, InputError
 from cadalign.estimation.options import METHODS, RansacOptions
-from cadalign.evaluation.runs.work import fingerprint
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
 
@@ -36,8 +25,6 @@ LIMIT = "limit"
 """The pseudo-method of the Cramer-Rao bound; see `cadalign.evaluation.metrics.cramer_rao`."""
 SHAPE = "shape"
 """The alignment of a category's learned shape, in runs that have one."""
-POINTS, VIEWS = "points", "views"
-"""Arguments of a registered function: arrays and a camera, or a model and its views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,55 +70,6 @@ class Method:
     has_statistics: bool = False
     """``solve`` states uncertainties and alternatives, ``solve_many`` does not."""
     is_robust: bool = False  # it searches for inliers
-
-    @property
-    def is_registered(self) -> bool:
-        """True for a function that a user, or a module of examples, has registered."""
-        return isinstance(self.solve, RegisteredFunction)
-
-
-@dataclass(frozen=True)
-class RegisteredFunction:
-    """A registered function as the estimate of a general method.
-
-    ``takes`` is `POINTS` or `VIEWS`; the standard deviation of the keypoints is passed on where
-    the function ``takes_sigma``.
-    """
-
-    function: Portable
-    takes: str
-    takes_sigma: bool
-
-    def __call__(self, given: MethodInput) -> Alignment | Result:
-        """The function's answer, checked."""
-        told = {"sigma": given.sigma} if self.takes_sigma else {}
-        arguments: tuple[Any, ...]
-        if self.takes == VIEWS:
-            arguments = given.model_and_views()
-        else:  # copies: what the function does to them must not reach other methods
-            arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
-        try:
-            return checked_answer(self.function(*arguments, **told))
-        except SystemExit as error:
-            raise CadalignError(f"it called for an exit ({error})") from None
-
-
-def checked_answer(answer: object) -> Alignment | Result:
-    """The answer of a function, if it is a valid alignment or a result.
-
-    Raises InputError if it is something else, or its alignment is none.
-    """
-    from cadalign.estimation.result import Result
-
-    if not isinstance(answer, Alignment | Result):
-        kind = type(answer).__name__
-        fix = "return a cadalign.Alignment, or the result of cadalign.fit or cadalign.align"
-        raise InputError(f"it returned {kind}, no alignment", where="method", fix=fix)
-    found = answer if isinstance(answer, Alignment) else answer.alignment
-    parts = (found.rotation, found.translation, found.scale)  # which may not have been checked
-    rotation, translation, scale = map(np.asarray, parts)
-    checked = Alignment(rotation, translation, scale)
-    return checked if isinstance(answer, Alignment) else answer
 
 
 # Names for a method together with options of `cadalign.fit`.
@@ -213,131 +151,3 @@ def _bound(given: MethodInput) -> Alignment:
         raise InputError("the Cramer-Rao bound needs the true alignment", where="methods")
     kept = slice(None) if given.inliers is None else given.inliers
     return limit_estimate(given.points_3d[kept], given.points_2d[kept], given.camera, given.gt)
-
-
-class Portable:
-    """A function that is pickled by its code, unless it is of an installed package.
-
-    Workers need not be able to import the script, notebook or test that it was written in. They
-    unpickle it at its first call, so that what is missing there is an error of that call.
-    """
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function: Callable[..., Any] | None = function
-        self._pickled: bytes | None = None
-
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        """Call the function."""
-        return self.function(*args, **options)
-
-    @property
-    def function(self) -> Callable[..., Any]:
-        """The function itself."""
-        if self._function is None:
-            assert self._pickled is not None
-            self._function = _unpickled(self._pickled)
-        return self._function
-
-    def __getstate__(self) -> bytes:
-        if self._pickled is None:
-            self._pickled = _pickled(self.function)
-        return self._pickled
-
-    def __setstate__(self, state: bytes) -> None:
-        self._function, self._pickled = None, state
-
-
-# One object for all chunks of a process: what the function keeps at hand is not made anew.
-@lru_cache(maxsize=64)
-def _unpickled(pickled: bytes) -> Callable[..., Any]:
-    function: Callable[..., Any] = pickle.loads(pickled)
-    return function
-
-
-def _pickled(function: Callable[..., Any]) -> bytes:
-    import cloudpickle
-
-    module = module_of(function)
-    by_value = module is not None and not is_installed(module)
-    try:
-        if by_value:
-            cloudpickle.register_pickle_by_value(module)
-        try:
-            return bytes(cloudpickle.dumps(function))
-        finally:
-            if by_value:
-                cloudpickle.unregister_pickle_by_value(module)
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}"[:200]
-        raise InputError(
-            f"{quote(name_of(function))} cannot be sent to worker processes ({reason})",
-            fix="let the function make what it needs, or do without processes (workers=0)",
-        ) from None
-
-
-def module_of(function: Callable[..., Any]) -> ModuleType | None:
-    """The module that a function was written in, if it is known."""
-    return inspect.getmodule(_innermost(function))
-
-
-def is_installed(module: ModuleType) -> bool:
-    """True for modules of this package, of installed ones, and of Python itself."""
-    if module.__name__.partition(".")[0] == __name__.partition(".")[0]:
-        return True
-    file = getattr(module, "__file__", None)
-    if file is None:
-        return module.__name__ != "__main__"
-    places = (sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))
-    return any(Path(file).is_relative_to(place) for place in places)
-
-
-def name_of(function: Callable[..., Any]) -> str:
-    """The name of a function, that of its class for a callable object."""
-    function = _innermost(function)
-    return str(getattr(function, "__name__", type(function).__name__))
-
-
-def _innermost(function: Any) -> Any:
-    """The function itself of one whose arguments are bound by functools.partial."""
-    while isinstance(function, partial):
-        function = function.func
-    return function
-
-
-def names_of(values: Any, register: Callable[[str, Any], object], *, where: str) -> tuple[str, ...]:
-    """Names of methods or metrics, of which functions are registered by their own names.
-
-    Raises InputError if a function has no name of its own, or two have the same.
-    """
-    names: list[str] = []
-    functions: dict[str, Any] = {}
-    for each in [values] if isinstance(values, str) or callable(values) else values:
-        if not callable(each):
-            names.append(each)
-            continue
-        name = name_of(each)
-        what = f"{quote(name)} is the name of more than one function"
-        if not name.isidentifier():
-            what = f"a function that is called {name} has no name for tables"
-        if not name.isidentifier() or functions.get(name, each) is not each:
-            fix = "register it by a name, and give that"
-            raise InputError(what, where=where, fix=fix)
-        functions[name] = each
-        register(name, each)
-        names.append(name)
-    return tuple(names)
-
-
-def code_hash(function: Callable[..., Any]) -> str:
-    """Hash of the code of the module that a function is of.
-
-    In notebooks and scripts, in which other things change, it is that of the function alone.
-    """
-    module = module_of(function)
-    is_script = module is None or module.__name__ == "__main__"
-    code: Any = _innermost(function) if is_script else module
-    try:
-        text = inspect.getsource(code)
-    except (OSError, TypeError):
-        text = repr(getattr(getattr(function, "__code__", None), "co_code", name_of(function)))
-    return fingerprint(text)

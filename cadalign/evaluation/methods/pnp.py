@@ -1,4 +1,4 @@
-"""OpenCV's and PoseLib's solvers as methods: examples of registered functions.
+"""OpenCV's and PoseLib's solvers as methods.
 
 They estimate the pose of the model as it is, without a stretch, as do programs for known objects.
 A lens distortion is removed before they are called.
@@ -6,33 +6,26 @@ A lens distortion is removed before they are called.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import cv2
 import numpy as np
 
-from cadalign.arrays import FloatArray
 from cadalign.errors import CadalignError, DegenerateError
-from cadalign.evaluation.methods.registry import register_method
+from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.geometry.alignment import Alignment
-from cadalign.geometry.camera import Camera
 
-OPENCV_FLAGS = {
-    "opencv-epnp": cv2.SOLVEPNP_EPNP,
-    "opencv-sqpnp": cv2.SOLVEPNP_SQPNP,
-    "opencv-iterative": cv2.SOLVEPNP_ITERATIVE,
-}
 _INLIER_BOUND = 3.5  # standard deviations, as of the built-in robust methods
 
 
-def solve_pnp(
-    points_3d: FloatArray, points_2d: FloatArray, camera: Camera, *, flag: int
-) -> Alignment:
+def _solve_pnp(given: MethodInput, *, flag: str) -> Alignment:
     """The pose of ``cv2.solvePnP`` with one of its flags."""
-    rays = camera.normalize(points_2d)
+    import cv2
+
+    rays, flags = given.camera.normalize(given.points_2d), int(getattr(cv2, flag))
     try:
-        is_found, vector, shift = cv2.solvePnP(points_3d, rays, np.eye(3), None, flags=flag)
+        is_found, vector, shift = cv2.solvePnP(given.points_3d, rays, np.eye(3), None, flags=flags)
     except cv2.error as error:
         raise DegenerateError(f"OpenCV: {error.err}") from None
     if not is_found:
@@ -41,14 +34,13 @@ def solve_pnp(
     return Alignment(rotation, np.asarray(shift, dtype=float).ravel(), np.ones(3))
 
 
-def poselib_pose(
-    points_3d: FloatArray, points_2d: FloatArray, camera: Camera, *, sigma: float
-) -> Alignment:
+def _poselib_pose(given: MethodInput) -> Alignment:
     """The pose of PoseLib's LO-RANSAC on the minimal solver P3P, refined on the inliers."""
     try:
         import poselib
     except ImportError:
         raise CadalignError("PoseLib is not installed", fix="pip install poselib") from None
+    camera = given.camera
     focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     pinhole = {
         "model": "PINHOLE",
@@ -56,14 +48,18 @@ def poselib_pose(
         "height": camera.height,
         "params": [*focal.tolist(), *center.tolist()],
     }
-    pixels = camera.normalize(points_2d) * focal + center
-    how: dict[str, Any] = {"max_reproj_error": _INLIER_BOUND * sigma}
-    pose, found = poselib.estimate_absolute_pose(pixels, points_3d, pinhole, how, {})
+    pixels = camera.normalize(given.points_2d) * focal + center
+    how: dict[str, Any] = {"max_reproj_error": _INLIER_BOUND * given.sigma}
+    pose, found = poselib.estimate_absolute_pose(pixels, given.points_3d, pinhole, how, {})
     if not sum(found["inliers"]):
         raise DegenerateError("PoseLib finds no pose")
     return Alignment(np.asarray(pose.R), np.asarray(pose.t), np.ones(3))
 
 
-for _name, _flag in OPENCV_FLAGS.items():
-    register_method(_name, partial(solve_pnp, flag=_flag))
-register_method("poselib", poselib_pose)
+_SOLVERS: dict[str, Callable[[MethodInput], Alignment]] = {
+    "opencv-epnp": partial(_solve_pnp, flag="SOLVEPNP_EPNP"),
+    "opencv-sqpnp": partial(_solve_pnp, flag="SOLVEPNP_SQPNP"),
+    "opencv-iterative": partial(_solve_pnp, flag="SOLVEPNP_ITERATIVE"),
+    "poselib": _poselib_pose,
+}
+PNP_METHODS = {name: Method(name, solve, is_general=True) for name, solve in _SOLVERS.items()}

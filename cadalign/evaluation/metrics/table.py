@@ -77,6 +77,11 @@ def told(metric: Metric, numbers: Sequence[float | None]) -> bool:
     return any(known) if metric == SKIPPED else bool(known)
 
 
+def metric_named(name: str) -> Metric:
+    """The metric of a user's function of this name."""
+    return Metric(name, name.replace("_", " "), digits=3, log=False)
+
+
 def rate(key: str, label: str, symbol: str = "", *, head: str = "", **look: Any) -> Metric:
     """A share of objects, in per cent."""
     shown = {"digits": 1, "better": HIGH, **look}

@@ -40,6 +40,7 @@ from cadalign.evaluation.instances.record import (
 )
 from cadalign.evaluation.methods.method import Method, MethodInput
 from cadalign.evaluation.metrics.photos import score_alignment
+from cadalign.evaluation.options import is_function
 from cadalign.evaluation.photos.methods import (
     PhotoEstimate,
     Sighting,
@@ -149,7 +150,7 @@ def photos_benchmark(
     own = {
         name: Method(name, partial(estimate_object, method=name, **how))
         for name in options.methods
-        if is_own(name)
+        if not is_function(name) and is_own(name)
     }
     setting = PhotoObjects(options, drawn_in)
     return Benchmark.chosen(setting, options.methods, own, metrics=options.metrics)

@@ -34,7 +34,7 @@ from types import ModuleType
 from typing import Any, ParamSpec, TypeVar
 
 from cadalign.arrays import worker_count
-from cadalign.errors import CadalignError, DataError
+from cadalign.errors import CadalignError, DataError, InputError
 from cadalign.evaluation.runs.work import AbortError, Experiment, Rows, reason_of
 from cadalign.io.files import printable
 
@@ -241,13 +241,26 @@ def _cannot_work(reason: str) -> CadalignError:
     return CadalignError(
         f"a worker cannot work: {reason}",
         where="workers",
-        fix="cadalign must be installed there, in the same version as here",
+        fix="cadalign must be installed there, in the same version as here, and modules of your "
+        "functions, too",
     )
 
 
 def _pickled(experiment: Experiment[Any]) -> bytes:
-    """The experiment for other processes; raises InputError if these could not read it."""
-    return pickle.dumps(experiment)
+    """The experiment for other processes; raises InputError for functions they cannot import."""
+    try:
+        pickled = pickle.dumps(experiment)
+        reason = "it is defined in a script or a notebook" if b"__main__" in pickled else ""
+    except Exception as error:
+        reason = reason_of(error)[:200]
+    if reason:
+        raise InputError(
+            f"a function cannot be sent to worker processes ({reason})",
+            where="workers",
+            fix="define it in a module that they can import, or name it module:function; or do "
+            "without them (0)",
+        )
+    return pickled
 
 
 # One object for all chunks of a process: what it keeps at hand is not made anew.

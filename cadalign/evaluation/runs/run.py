@@ -5,8 +5,6 @@ which appears whole or not at all. Started again, a run does the chunks that hav
 tables are damaged. Chunks are the same whatever the number of workers, and their rows follow from
 the run's seed and the tasks' names, so nothing in ``results.parquet`` shows how often the run was
 interrupted or who did the work.
-
-An experiment of one's own is a `Spec` (`cadalign.evaluation.registry`).
 """
 
 from __future__ import annotations

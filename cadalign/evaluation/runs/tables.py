@@ -17,7 +17,8 @@ import pyarrow.parquet as pq
 
 from cadalign.arrays import is_number
 from cadalign.errors import DataError, quote
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.metrics.table import Metric, metric_named
+from cadalign.evaluation.options import name_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import COLUMNS, Columns, Row
 from cadalign.io.documents import convert, in_file, read_json
@@ -213,9 +214,10 @@ class Run:
 
     @cached_property
     def metrics(self) -> tuple[Metric, ...]:
-        """Registered metrics, as the run's configuration describes them."""
+        """Metrics of users' functions, which the run's configuration names."""
         with in_file(self.folder.config_file):
-            return convert(self.config.get("metrics") or (), tuple[Metric, ...], "metrics")
+            functions = convert(self.config.get("metrics") or (), tuple[str, ...], "metrics")
+        return tuple(metric_named(name_of(each)) for each in functions)
 
     @property
     def noise_px(self) -> float | None:

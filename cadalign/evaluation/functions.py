@@ -1,0 +1,268 @@
+"""Functions of users as methods and metrics: callables, or ``module:function`` to be imported.
+
+A function of ``(points_3d, points_2d, camera)`` or of ``(model, views)`` that returns an alignment
+or a result is a method, a function of keywords such as ``est`` and ``gt`` that returns a number a
+metric::
+
+    cadalign.evaluate("keypointnet", methods=[my_function, "my_module:solve", "optimal"])
+
+On the command line, ``--methods my_module:solve optimal`` does the same. Worker processes import
+the module; a function that they cannot import runs without workers.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Callable, Collection, Container, Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cadalign.arrays import is_number, is_real
+from cadalign.errors import CadalignError, InputError, quote, unknown
+from cadalign.evaluation.methods.method import Method, MethodInput, fit_methods
+from cadalign.evaluation.methods.pnp import PNP_METHODS
+from cadalign.evaluation.metrics.table import Metric, metric_named
+from cadalign.evaluation.options import Function, is_function, name_of
+from cadalign.evaluation.runs.work import Columns
+from cadalign.geometry.alignment import Alignment
+
+if TYPE_CHECKING:
+    from cadalign.estimation.result import Result
+
+_OF_ESTIMATES = ("est", "gt", "result")
+_ARGUMENTS = (*_OF_ESTIMATES, "points_3d", "points_2d", "camera", "sigma", "bounds")
+_FIX = "give module:function"
+
+
+@lru_cache(maxsize=64)
+def imported(text: str, *, where: str) -> Callable[..., Any]:
+    """Import ``module:function``; the working directory is searched, too.
+
+    Raises InputError if the module cannot be imported, or has no such function.
+    """
+    module_name, _, name = text.partition(":")
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        found: Any = import_module(module_name)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"[:200]
+        what = f"{quote(module_name)} cannot be imported ({reason})"
+        raise InputError(what, where=where, fix=_FIX) from None
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    if not callable(found):
+        what = f"the module {quote(module_name)} has no function {quote(name)}"
+        raise InputError(what, where=where, fix=_FIX)
+    function: Callable[..., Any] = found
+    return function
+
+
+def _loaded(function: Function, where: str) -> Callable[..., Any]:
+    return imported(function, where=where) if isinstance(function, str) else function
+
+
+def _check_names(functions: Iterable[Function], taken: Container[str], where: str) -> None:
+    """Check that functions have names for tables, which differ from those that are taken."""
+    known: set[str] = set()
+    for function in functions:
+        name = name_of(function)
+        if not name.isidentifier():
+            what = f"a function that is called {name} has no name for tables"
+            raise InputError(what, where=where, fix="define it by def")
+        if name in known or name in taken:
+            what = f"{quote(name)} is the name of more than one"
+            raise InputError(what, where=where, fix="give the function another name")
+        known.add(name)
+
+
+# Methods ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FunctionMethod:
+    """A function as the estimate of a general method.
+
+    It takes points or views; the standard deviation of the keypoints is passed on where the
+    function ``takes_sigma``.
+    """
+
+    function: Function
+    takes_views: bool
+    takes_sigma: bool
+
+    @classmethod
+    def of(cls, function: Function) -> FunctionMethod:
+        """A function of two required arguments takes views."""
+        required, takes_sigma = _positional(_loaded(function, "methods"))
+        return cls(function, required == 2, takes_sigma)
+
+    def __call__(self, given: MethodInput) -> Alignment | Result:
+        """The function's answer, checked."""
+        told = {"sigma": given.sigma} if self.takes_sigma else {}
+        arguments: tuple[Any, ...]
+        if self.takes_views:
+            arguments = given.model_and_views()
+        else:  # copies: what the function does to them must not reach other methods
+            arguments = given.points_3d.copy(), given.points_2d.copy(), given.camera
+        try:
+            return checked_answer(_loaded(self.function, "methods")(*arguments, **told))
+        except SystemExit as error:
+            raise CadalignError(f"it called for an exit ({error})") from None
+
+
+def checked_answer(answer: object) -> Alignment | Result:
+    """The answer of a function, if it is a valid alignment or a result.
+
+    Raises InputError if it is something else, or its alignment is none.
+    """
+    from cadalign.estimation.result import Result
+
+    if not isinstance(answer, Alignment | Result):
+        kind = type(answer).__name__
+        fix = "return a cadalign.Alignment, or the result of cadalign.fit or cadalign.align"
+        raise InputError(f"it returned {kind}, no alignment", where="method", fix=fix)
+    found = answer if isinstance(answer, Alignment) else answer.alignment
+    parts = (found.rotation, found.translation, found.scale)  # which may not have been checked
+    checked = Alignment(*parts)
+    return checked if isinstance(answer, Alignment) else answer
+
+
+def _positional(function: Callable[..., Any]) -> tuple[int, bool]:
+    """Number of required arguments besides ``sigma``, and whether there is such a parameter."""
+    try:
+        parameters = inspect.signature(function).parameters
+    except (TypeError, ValueError):  # of some functions that are not written in Python
+        return 3, False
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    required = [
+        name
+        for name, each in parameters.items()
+        if each.kind in positional and each.default is each.empty and name != "sigma"
+    ]
+    takes_sigma = "sigma" in parameters and parameters["sigma"].kind is not positional[0]
+    return len(required), takes_sigma
+
+
+def choose_methods(
+    chosen: Iterable[Any], own: Mapping[str, Method] | None = None
+) -> tuple[Method, ...]:
+    """The methods of these names and functions, each once.
+
+    ``own`` are a benchmark's own methods by name, by default those of `cadalign.fit`. Raises
+    InputError if a method is unknown, or none is given.
+    """
+    table = PNP_METHODS | dict(fit_methods() if own is None else own)
+    return tuple(
+        Method(name_of(each), FunctionMethod.of(each), is_general=True)
+        if is_function(each)
+        else table[each]
+        for each in checked_methods(chosen, own)
+    )
+
+
+def checked_methods(chosen: Iterable[Any], own: Collection[str] | None = None) -> tuple[Any, ...]:
+    """The names and functions, each once, if all are known; see `choose_methods`."""
+    known = [*(fit_methods() if own is None else own), *PNP_METHODS]
+    found = tuple(dict.fromkeys(chosen))
+    if not found:
+        fix = f"known are {', '.join(known)}"
+        raise InputError("none is given", where="methods", fix=fix)
+    functions = [each for each in found if is_function(each)]
+    for each in found:
+        if not is_function(each) and each not in known:
+            raise unknown("method", each, known, where="methods")
+    _check_names(functions, known, "methods")
+    for function in functions:
+        FunctionMethod.of(function)  # which imports it
+    return found
+
+
+# Metrics ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """An estimated alignment, the true one if it is known, and the result it is of, if any."""
+
+    est: Alignment
+    gt: Alignment | None
+    result: Result | None = None
+
+    @classmethod
+    def of(cls, estimate: Any, gt: Alignment | None) -> Compared:
+        """An alignment, a result, or another estimate with an ``alignment`` and perhaps one."""
+        from cadalign.estimation.result import Result
+
+        if isinstance(estimate, Alignment):
+            return cls(estimate, gt)
+        result = estimate if isinstance(estimate, Result) else getattr(estimate, "result", None)
+        return cls(estimate.alignment, gt, result)
+
+
+@dataclass(frozen=True)
+class FunctionMetric:
+    """A metric with the function that measures it, and the names of its parameters."""
+
+    metric: Metric
+    function: Function
+    parameters: tuple[str, ...]
+
+    @classmethod
+    def of(cls, function: Function) -> FunctionMetric:
+        """A function of keywords, any of those that it may have."""
+        if not is_function(function):
+            raise InputError(f"{quote(function)} is no function", where="metrics", fix=_FIX)
+        parameters = inspect.signature(_loaded(function, "metrics")).parameters.values()
+        variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        required = [p.name for p in parameters if p.default is p.empty and p.kind not in variable]
+        others = [name for name in required if name not in _ARGUMENTS]
+        if others:
+            raise unknown("parameter", others[0], _ARGUMENTS, where="metrics")
+        taken = tuple(each.name for each in parameters if each.name in _ARGUMENTS)
+        return cls(metric_named(name_of(function)), function, taken)
+
+    def measure(self, found: Compared, given: MethodInput) -> float | None:
+        """The number of an estimate; None for NaN, and where the truth is not known.
+
+        Raises InputError if the function raises, or returns no number.
+        """
+        if "gt" in self.parameters and found.gt is None:
+            return None
+        where = f"metric {self.metric.key}"
+        arguments = {
+            name: getattr(found if name in _OF_ESTIMATES else given, name)
+            for name in self.parameters
+        }
+        try:
+            value = _loaded(self.function, "metrics")(**arguments)
+        except Exception as error:
+            raise InputError(f"{type(error).__name__}: {error}", where=where) from None
+        if value is None or (is_real(value) and value != value):
+            return None
+        if not is_number(value):
+            of_kind = f"{type(value).__name__}, no number"
+            what = f"{quote(value)}, which is not finite" if is_real(value) else of_kind
+            raise InputError(f"it returned {what}", where=where)
+        return float(value)
+
+
+def choose_metrics(
+    functions: Iterable[Function], columns: Columns = ()
+) -> tuple[FunctionMetric, ...]:
+    """The functions as metrics, each once.
+
+    Raises InputError if one is none, or has the name of a column that is there already.
+    """
+    found = tuple(FunctionMetric.of(each) for each in dict.fromkeys(functions))
+    check_metric_names((each.function for each in found), ("seconds", *dict(columns)))
+    return found
+
+
+def check_metric_names(functions: Iterable[Function], taken: Collection[str]) -> None:
+    """Raise InputError for a metric with the name of a column that is there already."""
+    _check_names(functions, taken, "metrics")

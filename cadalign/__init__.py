@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.scene import AlignedScene, align_scene
-    from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.tracks.motion import Motion, Trajectory
     from cadalign.estimation.tracks.tracker import Tracker
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
@@ -39,7 +37,6 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
-    "AlignedScene",
     "Alignment",
     "Box",
     "CadalignError",
@@ -58,7 +55,6 @@ __all__ = [
     "RansacOptions",
     "Result",
     "Results",
-    "SceneObject",
     "ShapeModel",
     "Size",
     "Symmetry",
@@ -67,7 +63,6 @@ __all__ = [
     "View",
     "align",
     "align_batch",
-    "align_scene",
     "datasets",
     "errors",
     "evaluate",

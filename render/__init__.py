@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
-    from cadalign.render.drawing.model_overlay import OverlayStyle, overlay_model, overlay_models
+    from cadalign.render.drawing.model_overlay import OverlayStyle, overlay_model
     from cadalign.render.drawing.movie import contact_sheet, write_movie
     from cadalign.render.drawing.overlay import draw_overlay
     from cadalign.render.drawing.pictures import (
@@ -58,7 +58,6 @@ __all__ = [
     "make_renderer",
     "normal_picture",
     "overlay_model",
-    "overlay_models",
     "pose_in_view",
     "probe_renderer",
     "sample_view",

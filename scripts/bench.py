@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import tyro
 from benchmarks.accuracy import solvers, unknown_focal, wide_lenses
 from benchmarks.annotator import annotator
-from benchmarks.cameras import photo_lenses, scenes
+from benchmarks.cameras import photo_lenses
 from benchmarks.cars import real_detections
 from benchmarks.clicks import clicks, outline_methods
 from benchmarks.coverage import coverage
@@ -53,7 +53,6 @@ USUAL: dict[str, Callable[..., Tables]] = {
     "focal": unknown_focal,
     "focal_shapes": focal_shapes,
     "lenses": photo_lenses,
-    "scenes": scenes,
     "calibration": coverage,
     "render": rendering,
     "annotator": annotator,

@@ -131,7 +131,7 @@ def require_run(folder: RunFolder) -> None:
         raise DataError("not a finished run of fits", where=where, fix=fix)
     fits = [path.parent.name for path in listed(folder.path, "*/fit.json")]
     fix = "give a fit.json, its folder, or the folder of a run"
-    if fits:  # as of the objects of a scene
+    if fits:
         fix = f"give the folder of one of the fits in it: {brief(', '.join(fits))}"
     raise DataError("neither a fit nor a run of fits", where=where, fix=fix)
 

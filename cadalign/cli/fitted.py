@@ -136,17 +136,13 @@ class FittedFile:
 def written_files(folder: Path) -> list[Path]:
     """The files that a fit wrote to a folder, by its fit.json: this, and the pictures."""
     path = folder / "fit.json"
-    count = len(list_in(path, "views"))
-    return [path, *_picture_paths(folder / "overlay.png", count)] if count else []
-
-
-def list_in(path: Path, key: str) -> list[Any]:
-    """The list in an earlier JSON file; empty where there is none."""
     found: Any = None
     with suppress(DataError):
         found = read_json(path)
-    value = found.get(key) if isinstance(found, dict) else None
-    return value if isinstance(value, list) else []
+    views = found.get("views") if isinstance(found, dict) else None
+    if not isinstance(views, list) or not views:
+        return []
+    return [path, *_picture_paths(folder / "overlay.png", len(views))]
 
 
 def _picture_paths(path: Path, count: int) -> list[Path]:

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.scene import AlignedScene, align_scene
-    from cadalign.estimation.scene_messages import SceneObject
     from cadalign.estimation.tracks.motion import Motion, PoseAt, Trajectory
     from cadalign.estimation.tracks.tracker import Tracker, TrackUpdate
     from cadalign.estimation.uncertainty.next_best import Advice, rank_evidence
@@ -37,7 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Advice",
-    "AlignedScene",
     "Alternative",
     "Contribution",
     "EvidenceSummary",
@@ -52,7 +49,6 @@ __all__ = [
     "RansacOptions",
     "Result",
     "Results",
-    "SceneObject",
     "Sensitivity",
     "Size",
     "TrackUpdate",
@@ -62,7 +58,6 @@ __all__ = [
     "View",
     "ViewResult",
     "align_batch",
-    "align_scene",
     "fit_batch",
     "model_of",
     "object_of",

@@ -28,7 +28,7 @@ def known_directions(prior: ShapePrior, views: Sequence[View]) -> Directions:
         _across(up, views[number].up_sigma_deg) for number, up in zip(told, ups, strict=True)
     ]
     return Directions(
-        np.array([upward("up", prior, number) for number in told], dtype=float).reshape(-1, 3),
+        np.array([_upward("up", prior, number) for number in told], dtype=float).reshape(-1, 3),
         np.array(ups, dtype=float).reshape(-1, 3),
         np.array(told, dtype=np.int64),
         np.array(whitening).reshape(-1, 3, 3),
@@ -72,8 +72,8 @@ def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None)
     for number, view in enumerate(views):
         if view.camera_height is None:
             continue
-        up = upward("camera_height", prior, number)
-        lowest = corners + lowest_corner(up)
+        up = _upward("camera_height", prior, number)
+        lowest = corners + _lowest_corner(up)
         ends.append((lowest, _CAMERA))
         images.append(number)
         directions.append(up)
@@ -89,15 +89,14 @@ def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None)
     )
 
 
-def upward(field: str, prior: ShapePrior, view: int | None = None) -> FloatArray:
+def _upward(field: str, prior: ShapePrior, view: int) -> FloatArray:
     """The model's up axis (3,); without one an InputError names the ``field`` that asks for it."""
     if prior.up is None:
         fix = f"learn it with an up axis, or leave `{field}` away"
-        where = field if view is None else f"views[{view}].{field}"
-        raise InputError("the model has no up axis", where=where, fix=fix)
+        raise InputError("the model has no up axis", where=f"views[{view}].{field}", fix=fix)
     return prior.up
 
 
-def lowest_corner(up: FloatArray) -> int:
+def _lowest_corner(up: FloatArray) -> int:
     """Row of the box's two corners that lies in its lowest face."""
     return 0 if up.sum() > 0 else 1

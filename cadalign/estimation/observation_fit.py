@@ -224,7 +224,7 @@ class ObservationFit:
             return "the file's views"
         if observation.depths is not None:
             return "the file's depth"
-        rest = "size" if observation.size else "init" if observation.init else "objects"
+        rest = "size" if observation.size else "init"
         return f"the file's {next(iter(observation.evidence.given), rest)}"
 
     def read(

@@ -9,7 +9,7 @@ import numpy as np
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.rotations import rotation_from_quat_wxyz, rotation_from_vector
+from cadalign.geometry.rotations import rotation_from_quat_wxyz
 
 SIMULATION_CAMERA = Camera(width=640, height=480, fx=150.0, fy=150.0, cx=319.5, cy=239.5)
 """The paper's virtual camera."""
@@ -69,51 +69,6 @@ def simulate_problem(
     outliers[rng.choice(points, size=count, replace=False)] = True
     points_2d[outliers] = rng.uniform(-0.5, [camera.width - 0.5, camera.height - 0.5], (count, 2))
     return Problem(points_3d, points_2d, camera, alignment, outliers)
-
-
-UNIT_BOUNDS: FloatArray = np.array([[-0.5] * 3, [0.5] * 3])
-"""Lowest and highest coordinates of a unit cube."""
-
-
-def simulate_standing_boxes(
-    rng: np.random.Generator,
-    *,
-    objects: int,
-    camera: Camera,
-    camera_height: float = 1.6,
-    points: int = 10,
-    noise_px: float = 1.0,
-) -> tuple[list[Problem], FloatArray]:
-    """Draw objects that stand on the ground, 3 to 5 ahead of a camera that looks down at them.
-
-    They have a unit cube's bounds, stretched. Returns the problem of each, and the direction (3,)
-    against gravity in the camera.
-
-    Examples
-    --------
-    >>> camera = Camera(640, 480, 700, 700, 319.5, 239.5)
-    >>> boxes, up = simulate_standing_boxes(np.random.default_rng(0), objects=2, camera=camera)
-    >>> lowest = [each.alignment.apply(UNIT_BOUNDS)[0] for each in boxes]
-    >>> np.round([-up @ corner for corner in lowest], 6).tolist()
-    [1.6, 1.6]
-    """
-    tilt = rotation_from_vector(np.array([rng.uniform(0.17, 0.5), 0.0, 0.0]))
-    up: FloatArray = tilt @ [0.0, -1.0, 0.0]
-    ahead = np.array([0.0, 0.0, 1.0]) - up * up[2]
-    problems: list[Problem] = []
-    while len(problems) < objects:
-        model = rng.uniform(-0.5, 0.5, (points, 3))
-        scale = np.array([1.0, *np.exp(rng.normal(0.0, 0.2, 2))])
-        turn = rotation_from_vector(np.array([0.0, rng.uniform(0, 2 * np.pi), 0.0]))
-        upright = tilt @ rotation_from_vector(np.array([np.pi, 0.0, 0.0]))
-        place = rng.uniform(3, 5) * ahead / np.linalg.norm(ahead)
-        place = place + [rng.uniform(-1, 1), 0.0, 0.0] - up * (camera_height - scale[1] / 2)
-        pose = Alignment(upright @ turn, place, scale)
-        pixels = camera.project(pose.apply(model))
-        if camera.contains(pixels).all():
-            pixels = pixels + noise_px * rng.normal(size=pixels.shape)
-            problems.append(Problem(model, pixels, camera, pose, None))
-    return problems, up
 
 
 def random_rotation(rng: np.random.Generator) -> FloatArray:

@@ -151,9 +151,6 @@ class Observation(ObservedImage):
         if isinstance(data, Mapping) and "alignment" in data:
             fix = "give the observation that was fitted"
             raise DataError("the result of a fit, not an observation", fix=fix)
-        if isinstance(data, Mapping) and "objects" in data:
-            fix = "give it alone to `cadalign fit`, which writes an observation of each"
-            raise DataError("several objects of one photo, not one observation", fix=fix)
         read, fields = read_fields(data)
         images = []
         for number, each in enumerate(fields):
@@ -308,8 +305,6 @@ def kind_of(data: object) -> str:
     if {"annotations", "instance_info"} & set(data):
         return DETECTOR
     is_meant = "views" in data or ("keypoints" in data and "format" not in data)
-    # Of several objects: refused as such, not passed over; what a fit writes of them has warnings.
-    is_meant |= {"objects", "camera"} <= set(data) and "warnings" not in data
     return OBSERVATION if is_meant else OTHER
 
 

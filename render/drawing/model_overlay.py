@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -120,21 +119,6 @@ def overlay_model(
         axes=box if chosen.axes else False,
         legend=False,
     )
-
-
-def overlay_models(
-    image: npt.ArrayLike,
-    camera: Camera,
-    placed: Sequence[tuple[Mesh | Scene, Alignment]],
-    *,
-    style: OverlayStyle | None = None,
-) -> ByteImage:
-    """Draw several models over one photo, the farthest first; see `overlay_model`."""
-    by_depth = sorted(placed, key=lambda each: -each[1].translation[2])
-    drawn = np.asarray(image)
-    for mesh, alignment in by_depth:
-        drawn = overlay_model(drawn, camera, mesh, alignment, style=style)
-    return np.asarray(drawn)
 
 
 def _drawn(scene: Scene, camera: Camera, alignment: Alignment, mode: str) -> Geometry | None:

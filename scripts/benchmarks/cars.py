@@ -1,10 +1,8 @@
-"""Real cars of KITTI: a detector's noise, runs over keypoints of networks, tracks and scenes."""
+"""Real cars of KITTI: runs over keypoints of networks, and tracks."""
 
 from __future__ import annotations
 
-import json
 import tempfile
-from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -15,22 +13,17 @@ import numpy as np
 import cadalign
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign.arrays import FloatArray, instance_rng
+from cadalign.arrays import FloatArray
 from cadalign.datasets import open as open_data
-from cadalign.datasets.photos.kitti import KittiLabel, read_labels
 from cadalign.datasets.photos.kitti_keypoints import (
-    SIZE,
-    TRACKS,
     car_bounds,
     car_shape,
     yaw_of_car,
 )
 from cadalign.evaluation.experiments.tracks import TracksOptions
 from cadalign.evaluation.instances.tracks import pose_of, recorded_videos
-from cadalign.metrics import rotation_error
 
 _LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6
-_WIDTHS = 0.06  # relative standard deviation of cars' widths
 _SIGMA = 3.0  # [px] of the network's keypoints
 
 
@@ -155,73 +148,3 @@ def _poses(shape: cadalign.ShapeModel, views: Sequence[cadalign.View], way: str)
         result = cadalign.align(shape, views, motion=motion, ransac=ransac)
         middle, known = _middle(result), [view.alignment for view in result.views]
     return np.array([pose_of(each, middle) for each in known])
-
-
-# Scenes -------------------------------------------------------------------------------------------
-
-
-def car_scenes(folder: Path, sigma: float) -> list[Row]:
-    """Errors of a street's cars, alone and together, whose keypoints are simulated."""
-    mean = np.array(json.loads((folder / TRACKS).read_text())["model_xyz"])
-    frames: dict[int, list[KittiLabel]] = defaultdict(list)
-    for label in read_labels(folder / "label_02" / "0010.txt", tracking=True):
-        if label.kind == "Car" and 5 < label.numbers[12] < 35:
-            frames[label.frame].append(label)
-    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for frame, labels in frames.items():
-        if 2 <= len(labels) <= 4 and frame % 2 == 0:
-            truths = [_pose_of(label, mean) for label in labels]
-            for name, results in _scene_results(frame, truths, mean, sigma):
-                for result, truth in zip(results, truths, strict=True):
-                    for column, error in _scene_errors(result, truth, mean).items():
-                        found[name][column].append(error)
-    return [
-        {"method": name, "cars": len(columns["yaw deg"])}
-        | {column: section.spread(errors) for column, errors in columns.items()}
-        for name, columns in found.items()
-    ]
-
-
-def _scene_results(
-    frame: int, truths: list[cadalign.Alignment], mean: FloatArray, sigma: float
-) -> Iterator[tuple[str, Sequence[Any]]]:
-    """Results of the cars of a frame, by every method."""
-    camera = cadalign.Camera(*SIZE, 721.5, 721.5, 609.6, 172.9)
-    rng = instance_rng(frame, "kitti")
-    seen = [section.seen_in(camera, each, mean, sigma, rng) for each in truths]
-    model = cadalign.Model(points_3d=mean, stretch_sigma=0.1, up_axis="z")
-    size = cadalign.Size(width=float(np.ptp(mean[:, 0])), sigma=_WIDTHS)
-    ground = {"up": (0.0, -1.0, 0.0), "camera_height": 1.65, "camera_height_sigma": 0.03}
-    for name, evidence, share in (
-        ("each alone", {}, ()),
-        ("each on the ground", ground, ()),
-        ("together, gravity shared", {}, ("gravity",)),
-        ("together, on one ground", ground, ("ground",)),
-    ):
-        objects = [
-            cadalign.SceneObject(
-                model, cadalign.View(camera, each.points_2d, sigma=sigma, **evidence), size
-            )
-            for each in seen
-        ]
-        yield name, cadalign.align_scene(objects, share=share).results
-
-
-def _pose_of(label: KittiLabel, mean: FloatArray) -> cadalign.Alignment:
-    """Pose of the mean car stretched to a label's box."""
-    box = label.box(np.zeros(3))
-    scale, middle = box.extents / np.ptp(mean, axis=0), (mean.min(axis=0) + mean.max(axis=0)) / 2
-    return cadalign.Alignment(box.rotation, box.center - box.rotation @ (scale * middle), scale)
-
-
-def _scene_errors(result: Any, truth: cadalign.Alignment, mean: FloatArray) -> dict[str, float]:
-    """Errors of a car; one without result counts as wrong as can be."""
-    if not isinstance(result, cadalign.Result):
-        return {"yaw deg": 180.0, "depth %": 100.0, "length %": 100.0}
-    est, center = result.alignment, mean.mean(axis=0)
-    depth = pose_of(est, center)[-1] / pose_of(truth, center)[-1]
-    return {
-        "yaw deg": rotation_error(est=est, gt=truth),
-        "depth %": 100 * abs(depth - 1),
-        "length %": 100 * abs(est.scale[1] / truth.scale[1] - 1),
-    }

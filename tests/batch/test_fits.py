@@ -27,6 +27,7 @@ from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
+from cadalign.io.images import write_image
 from cadalign.io.observation import DetectorOptions, ObservationChanges
 
 CAMERA = Camera(640, 480, 700.0, 700.0, 319.5, 239.5)
@@ -233,6 +234,25 @@ def test_bad_observations_are_rows_and_stop_nothing(tmp_path: Path) -> None:
     assert [row["object"] for row in table[6:8]] == ["car", "car"]
     assert table[1]["status"] == "failed"
     assert table[1]["qw"] is None
+
+
+def test_several_objects_of_a_photo_are_several_files_of_a_folder(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    write_image(folder / "photo.png", np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8))
+    seen = list(observations(2))
+    for number, each in enumerate(seen, 1):
+        one = replace(each, image=folder / "photo.png", object_name=f"chair {number}")
+        one.save(folder / f"photo-{number}.json")
+    results = cadalign.fit_many(folder, out=tmp_path / "run")
+    for each, found in zip(seen, results, strict=True):
+        assert isinstance(found, Result)
+        alone = cadalign.fit(each.points_3d, each.points_2d, CAMERA)
+        np.testing.assert_array_equal(found.alignment.packed, alone.alignment.packed)
+    rows = pq.read_table(tmp_path / "run" / "results.parquet").to_pylist()
+    assert [row["object"] for row in rows] == ["chair 1", "chair 2"]
+    assert [Path(row["source"]).name for row in rows] == ["photo-1.json", "photo-2.json"]
+    assert {Path(row["image"]).name for row in rows} == {"photo.png"}
 
 
 def test_another_input_or_option_is_refused(tmp_path: Path) -> None:

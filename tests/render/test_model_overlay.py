@@ -18,7 +18,6 @@ from cadalign.render import (
     feature_lines,
     look_at,
     overlay_model,
-    overlay_models,
 )
 from cadalign.render.drawing.canvas import linear_from_bytes
 from cadalign.render.drawing.overlay import AXIS_COLORS, EST_COLOR
@@ -99,16 +98,6 @@ def test_box_and_axes_are_drawn_where_they_are_asked_for():
     axes = overlay_model(plain(CAMERA, 0), CAMERA, MESH, POSE,
                          style=OverlayStyle("lines", lines=False, box=False))  # fmt: skip
     assert all(has_color(axes, color).any() for color in AXIS_COLORS)
-
-
-def test_of_several_models_the_nearer_one_is_in_front():
-    far = look_at(azimuth=35, elevation=30, distance=9)
-    style = OverlayStyle(opacity=1.0, **BARE)
-    for placed in ([(MESH, POSE), (MESH, far)], [(MESH, far), (MESH, POSE)]):
-        both = overlay_models(plain(CAMERA, 0), CAMERA, placed, style=style)
-        alone = overlay_model(plain(CAMERA, 0), CAMERA, MESH, POSE, style=style)
-        inside = cover_of(CAMERA, MESH, POSE) > 0.999
-        np.testing.assert_array_equal(both[inside], alone[inside])
 
 
 def test_what_is_no_style_is_refused():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
@@ -18,7 +18,7 @@ from cadalign.cli.common import (
     say,
     waiting,
 )
-from cadalign.cli.fitted import FittedFile, overlay_style
+from cadalign.cli.fitted import FittedFile
 from cadalign.cli.options import (
     CameraOptions,
     EvidenceOptions,
@@ -27,7 +27,7 @@ from cadalign.cli.options import (
     flag_of,
     named_as_flags,
 )
-from cadalign.errors import refuse_unused
+from cadalign.errors import InputError, refuse_unused
 from cadalign.estimation.focal import PriorOption
 from cadalign.estimation.observation_fit import ObservationFit
 from cadalign.estimation.options import FitOptions, RansacOptions, Sigma
@@ -42,8 +42,6 @@ from cadalign.io.observation import (
 )
 
 if TYPE_CHECKING:
-    from cadalign.estimation.result import Result
-    from cadalign.estimation.view import View
     from cadalign.render import OverlayStyle
 
 
@@ -122,9 +120,11 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         data = read_json(path) if is_read else None
         if len(self.observations) > 1 or is_of_many(path, data):
             return self._fit_many()
-        with named_as_flags(self):
+        with named_as_flags(self, self.fitting, self.ransac):
             self.refuse_of_many()
-        return self._write(self._fit_file(path, data), path)
+            data = read_json(path) if data is None else data
+            observation = self.read(data, str(path), folder=path.parent, changes=self.changes)
+        return self._write(self._fitted(observation, path, {"observation": path}), path)
 
     def _write(self, fitted: FittedFile, path: Path) -> int:
         """Write and print what was fitted of a file; returns the exit code."""
@@ -149,26 +149,20 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         with named_as_flags(self, self.fitting, self.ransac):
             self.refuse_of_many("model")
             observation = self.changes.applied_to(seen)
-            style, status = self._style(observation, mask), waiting("fitting")
-            result, views = self.fit(observation, str(mask), note=say, status=status)
-        # What was fitted, for the commands that go on from the fit.
         path = (self.out or beside(mask, "_fit")) / "fit.observation.json"
+        fitted = self._fitted(observation, mask, {"mask": mask, "observation": path})
+        # What was fitted, for the commands that go on from the fit.
         with keeping(observation.files):
             make_folder(path.parent)
             observation.save(path)
-        fitted = self._fitted(path, observation, result, views, style=style)
-        return self._write(replace(fitted, sources={"mask": mask} | fitted.sources), mask)
+        return self._write(fitted, mask)
 
     def _fit_many(self) -> int:
         """Align all observations; returns the exit code."""
         from cadalign.batch.experiment import FitRunOptions
         from cadalign.cli.runs import inputs_of, run_command, run_folder, write_overlays
 
-        style = None
-        if self.overlay is not None:
-            style = overlay_style(
-                self.overlay, mode=self.overlay_mode, opacity=self.overlay_opacity, has_model=True
-            )
+        style = self._style
         with named_as_flags(self, self.fitting, self.ransac):
             options = FitRunOptions(estimate=self.estimate, **inputs_of(self, self.changes))
             code = run_command(self, options, done="aligned")
@@ -181,37 +175,17 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
         """Values of the options in the place of an observation's own."""
         return replace(self.of_camera, evidence=self.given, size=self.known_size)
 
-    def _fit_file(self, path: Path, data: Any) -> FittedFile:
-        """Fit what a file holds; ``data`` is its parsed content, if it was read already."""
+    def _fitted(self, observation: Observation, path: Path, sources: dict[str, Path]) -> FittedFile:
+        """Fit an observation, which messages call ``path``, and draw it; see `FittedFile`."""
+        shape, style = self.shape_of(observation), self._style
+        if shape is not None:
+            sources = {**sources, "shape": shape}
+        if style is not None and shape is None and observation.model is None:
+            fix = "give the file's `model` a mesh, or leave out the option"
+            raise InputError(f"{path} names no model to draw", where="--overlay", fix=fix)
         with named_as_flags(self, self.fitting, self.ransac):
-            data = read_json(path) if data is None else data
-            observation = self.read(data, str(path), folder=path.parent, changes=self.changes)
-            style = self._style(observation, path)
             status = waiting("fitting")
             result, views = self.fit(observation, str(path), note=say, status=status)
-        return self._fitted(path, observation, result, views, style=style)
-
-    def _style(self, observation: Observation, path: Path) -> OverlayStyle | None:
-        """The style of the overlay, where one is asked for."""
-        if self.overlay is None:
-            return None
-        has_model = self.shape_of(observation) is not None or observation.model is not None
-        return overlay_style(
-            path, mode=self.overlay_mode, opacity=self.overlay_opacity, has_model=has_model
-        )
-
-    def _fitted(
-        self,
-        path: Path,
-        observation: Observation,
-        result: Result,
-        views: tuple[View, ...] | None,
-        *,
-        style: OverlayStyle | None = None,
-    ) -> FittedFile:
-        """The result of the observation in a file, with its pictures; see `FittedFile.drawn`."""
-        shape = self.shape_of(observation)
-        sources = {"observation": path} | ({} if shape is None else {"shape": shape})
         found = FittedFile(
             result,
             sources,
@@ -219,3 +193,16 @@ class Fit(ManyCommand, ObservationFit, CameraOptions, EvidenceOptions):
             inputs=(*observation.files, *sources.values()),
         )
         return found.drawn(observation, views=views, picture=self.picture, style=style)
+
+    @property
+    def _style(self) -> OverlayStyle | None:
+        """The style of overlays, where some are asked for."""
+        if self.overlay is None:
+            return None
+        from cadalign.render import OverlayStyle
+
+        try:
+            return OverlayStyle(mode=self.overlay_mode, opacity=self.overlay_opacity)
+        except InputError as error:
+            flag = f"--overlay-{error.where}"
+            raise InputError(error.what, where=flag, fix=error.fix) from None

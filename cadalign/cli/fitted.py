@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,18 +31,18 @@ _HEADS = ("standard deviations", "rotation", "position", "x", "y", "z", "focal l
 class FittedFile:
     """Result of a fit of one file, and pictures of each view.
 
-    ``sources`` are the files of the observation and of the learned shape, which fit.json states;
-    ``inputs`` those and what the observation names, which are not written over. ``overlays`` are
-    those of the model that were asked for. ``is_tabulated`` adds the contributions of the pieces of
-    evidence.
+    ``sources`` are the files of the observation, of the learned shape and of a mask alone, which
+    fit.json states; ``inputs`` those and what the observation names, which are not written over.
+    ``overlays`` are those of the model that were asked for. ``is_tabulated`` adds the contributions
+    of the pieces of evidence.
     """
 
     result: Result
-    sources: dict[str, Path] = field(default_factory=dict)
-    is_tabulated: bool = False
+    sources: dict[str, Path]
+    is_tabulated: bool
+    inputs: tuple[Path, ...]
     pictures: tuple[ByteImage, ...] = ()
     overlays: tuple[ByteImage, ...] = ()
-    inputs: tuple[Path, ...] = ()
 
     @property
     def table(self) -> str:
@@ -50,17 +50,13 @@ class FittedFile:
         return tabulate_contributions(self.result) if self.is_tabulated else ""
 
     def text(self, out: Path) -> str:
-        """The `document` as JSON text."""
-        return json.dumps(self.document(out), indent=2) + "\n"
-
-    def document(self, out: Path) -> dict[str, Any]:
-        """The result in the form of JSON for a folder, which its sources are relative to."""
+        """The result as JSON for a folder, which its sources are relative to."""
         sources = {
             name: written_path(path.absolute(), folder=out.absolute())
             for name, path in self.sources.items()
         }
         added = list_contributions(self.result) if self.is_tabulated else {}
-        return self.result.to_dict() | added | sources
+        return json.dumps(self.result.to_dict() | added | sources, indent=2) + "\n"
 
     def write(self, out: Path, *, overlay: Path | None = None) -> list[Path]:
         """Write fit.json and the pictures to a folder; returns the pictures' paths.
@@ -69,7 +65,7 @@ class FittedFile:
         fit are removed.
         """
         make_folder(out)
-        earlier = {path.absolute() for path in written_files(out)}
+        earlier = {path.absolute() for path in _written_files(out)}
         with keeping(self.inputs):
             # First what somebody names, which may be refused.
             further = [] if overlay is None else _write_pictures(overlay, self.overlays)
@@ -133,7 +129,7 @@ class FittedFile:
         return replace(found, overlays=tuple(overlays))
 
 
-def written_files(folder: Path) -> list[Path]:
+def _written_files(folder: Path) -> list[Path]:
     """The files that a fit wrote to a folder, by its fit.json: this, and the pictures."""
     path = folder / "fit.json"
     found: Any = None
@@ -161,29 +157,6 @@ def _write_pictures(path: Path, pictures: tuple[ByteImage, ...]) -> list[Path]:
     for each, picture in zip(paths, pictures, strict=True):
         write_image(each, picture)
     return paths
-
-
-def overlay_style(path: Path, *, mode: Any, opacity: float, has_model: bool) -> OverlayStyle:
-    """The style that the options ask for.
-
-    Raises
-    ------
-    InputError
-        If the opacity is out of range, or the observation, read from ``path``, names no model.
-    """
-    from cadalign.render import OverlayStyle
-
-    if not has_model:
-        raise InputError(
-            f"{path} names no model to draw",
-            where="--overlay",
-            fix="give the file's `model` a mesh, or leave out the option",
-        )
-    try:
-        return OverlayStyle(mode=mode, opacity=opacity)
-    except InputError as error:
-        flag = f"--overlay-{error.where}"
-        raise InputError(error.what, where=flag, fix=error.fix) from None
 
 
 def tabulate_contributions(result: Result) -> str:

@@ -73,7 +73,7 @@ def known_distances(prior: ShapePrior, views: Sequence[View], size: Size | None)
         if view.camera_height is None:
             continue
         up = _upward("camera_height", prior, number)
-        lowest = corners + _lowest_corner(up)
+        lowest = corners + (0 if up.sum() > 0 else 1)  # the corner that lies in the lowest face
         ends.append((lowest, _CAMERA))
         images.append(number)
         directions.append(up)
@@ -95,8 +95,3 @@ def _upward(field: str, prior: ShapePrior, view: int) -> FloatArray:
         fix = f"learn it with an up axis, or leave `{field}` away"
         raise InputError("the model has no up axis", where=f"views[{view}].{field}", fix=fix)
     return prior.up
-
-
-def _lowest_corner(up: FloatArray) -> int:
-    """Row of the box's two corners that lies in its lowest face."""
-    return 0 if up.sum() > 0 else 1

@@ -281,18 +281,27 @@ class ObservationFit:
         else:
             from cadalign.estimation.align import align
 
-            model, views, options = self.problem(observation, where, notes.append)
-            known: dict[str, Any] = {"size": observation.size, "init": observation.init}
+            model, views, options = self._problem(observation, where, notes.append)
             with status or nullcontext(), self._located(where):
-                result = align(model, views, ransac=ransac, **known, **options.of_views)
+                result = align(
+                    model,
+                    views,
+                    size=observation.size,
+                    init=observation.init,
+                    loss=options.loss,
+                    loss_scale=options.loss_scale,
+                    focal=options.focal,
+                    focal_prior=options.focal_prior,
+                    ransac=ransac,
+                )
         for text in notes:
             note(text)
         return result, views
 
-    def problem(
-        self, observation: Observation, where: str, note: Note = lambda text: None
+    def _problem(
+        self, observation: Observation, where: str, note: Note
     ) -> tuple[Model | ShapeModel, tuple[View, ...], FitOptions]:
-        """Model, views and options of an observation for `cadalign.align`, as `fit` takes them."""
+        """Model, views and options of an observation for `cadalign.align`."""
         from cadalign.estimation.observed import views_of
 
         self.check_for(observation)

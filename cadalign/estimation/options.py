@@ -178,12 +178,6 @@ class FitOptions(AlignmentOptions):
         )
 
     @property
-    def of_views(self) -> dict[str, Any]:
-        """The options that `cadalign.align` takes, too, by their names."""
-        names = ("loss", "loss_scale", "focal", "focal_prior")
-        return {name: getattr(self, name) for name in names}
-
-    @property
     def unknowns(self) -> int:
         """The number of unknowns that are estimated."""
         return 6 + len(self.stretched_axes) + (self.focal == "estimate")

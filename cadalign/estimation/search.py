@@ -183,12 +183,7 @@ def minima_at_noise(
 
 def _is_bare(evidence: Evidence) -> bool:
     """True where priors alone would move a given start whose size is to be found by outlines."""
-    told = (
-        evidence.sightings.point,
-        evidence.directions.image,
-        evidence.offsets.image,
-        evidence.image_depths.image,
-    )
+    told = evidence.sightings.point, evidence.directions.image, evidence.offsets.image
     return bool(evidence.scales.free.all()) and not any(map(len, told))
 
 

@@ -134,7 +134,7 @@ def silhouette_of(
     corner = low - 4 * cell
     width, height = (np.ceil((high - low) / cell).astype(int) + 9).tolist()
     sight = Sight(surface.caster, camera, pose)
-    inside = covered_cells(sight, corner, cell, (height, width))
+    inside = _covered_cells(sight, corner, cell, (height, width))
     rough = contour_of(inside)
     if not len(rough.points):
         return None
@@ -150,7 +150,7 @@ def silhouette_of(
     return Silhouette(inside, corner, cell, *found)
 
 
-def covered_cells(
+def _covered_cells(
     sight: Sight, corner: FloatArray, cell: float, shape: tuple[int, int]
 ) -> BoolArray:
     """Cells (h, w) of the image that the object covers; see `Silhouette`.

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.options import RansacOptions
     from cadalign.estimation.result import Result
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.tracks.motion import Motion, Trajectory
-    from cadalign.estimation.tracks.tracker import Tracker
     from cadalign.estimation.uncertainty.summary import Contribution, EvidenceSummary
     from cadalign.estimation.view import View
     from cadalign.evaluation.api import evaluate, simulate
@@ -50,7 +48,6 @@ __all__ = [
     "Material",
     "Mesh",
     "Model",
-    "Motion",
     "Observation",
     "RansacOptions",
     "Result",
@@ -58,8 +55,6 @@ __all__ = [
     "ShapeModel",
     "Size",
     "Symmetry",
-    "Tracker",
-    "Trajectory",
     "View",
     "align",
     "align_batch",

@@ -6,10 +6,10 @@ from cadalign.names import lazy_names
 
 if TYPE_CHECKING:
     from cadalign.render.drawing.model_overlay import OverlayStyle, overlay_model
-    from cadalign.render.drawing.movie import contact_sheet, write_movie
     from cadalign.render.drawing.overlay import draw_overlay
     from cadalign.render.drawing.pictures import (
         Angles,
+        contact_sheet,
         depth_picture,
         draw_still,
         face_picture,
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
         line_picture,
         normal_picture,
         pose_in_view,
-        turntable,
     )
     from cadalign.render.probe import Probe, make_renderer, probe_renderer
     from cadalign.render.raycast.renderer import RaycastRenderer, cast_geometry
@@ -62,9 +61,7 @@ __all__ = [
     "probe_renderer",
     "sample_view",
     "silhouette_iou",
-    "turntable",
     "visible_keypoints",
-    "write_movie",
 ]
 
 __getattr__ = lazy_names(__name__)

@@ -37,7 +37,6 @@ from benchmarks.runs import evaluation, fits, ransac
 from benchmarks.section import BenchmarkData, NotGivenError, Row, Tables
 from benchmarks.shapes import align, focal_shapes, similar
 from benchmarks.speed import calls, cold, rendering
-from benchmarks.tracks import tracks
 from benchmarks.warned import warned
 from rich.console import Console
 from rich.table import Table
@@ -76,7 +75,6 @@ ON_REQUEST: dict[str, Callable[..., Tables]] = {
     "detections": real_detections,
     "unseen_retrieval": unseen_retrieval,
     "similar": similar,
-    "tracks": tracks,
     "warned": warned,
 }
 SECTIONS = USUAL | ON_REQUEST

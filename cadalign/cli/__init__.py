@@ -103,7 +103,6 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
     ),
     "fit": ("fit.Fit", "Align a model to what an observation file holds, and draw the result."),
     "observe": ("observe.Observe", "Pair the keypoints of a detector in a photo with a model's."),
-    "track": ("track.TrackCommand", "Track objects of a learned shape through a video."),
     "annotate": (
         "annotate.Annotate",
         "Mark keypoints on photos and a model in the browser, and see the alignment as you go.",
@@ -123,7 +122,7 @@ COMMANDS = {  # the class of each in its module, and the first sentence of its d
     "export": ("export.Export", "Write a fit for another tool."),
     "render": (
         "render.Render",
-        "Draw a model: a still, a contact sheet of several views, or a turntable.",
+        "Draw a model: a still, or a contact sheet of several views.",
     ),
     "doctor": (
         "doctor.Doctor",

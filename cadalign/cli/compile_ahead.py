@@ -71,8 +71,6 @@ def _align_shape(views: int) -> None:
         few = View(_CAMERA, pixels[:2], ids=(0, 1), sigma=1.0)
         align(shape, [few] * views, init=[_POSE] * views)
     align(shape, seen)
-    if views > 1:
-        align(shape, seen, motion="smooth")
 
 
 def _align_with_mask() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -34,7 +34,6 @@ from cadalign.datasets.detections.image_keypoints import photo_in
 from cadalign.errors import CadalignError, DataError, InputError, brief, refuse_unused
 from cadalign.geometry.camera import Camera
 from cadalign.io.documents import in_file, read_json
-from cadalign.io.evidence import ObservedImage
 from cadalign.io.files import keeping, listed
 from cadalign.io.images import photo_size, read_grey, read_mask, write_image
 from cadalign.io.observation import OBSERVATION, Observation, kind_of, with_lens
@@ -78,14 +77,9 @@ class Observe(CameraOptions, EvidenceOptions):
     every: bool = False
     """Write an observation of every object of every photo, instead of one; --image is then the
     photos' folder."""
-    tracks: bool = False
-    """With --every, write one observation of each track, whose views are its photos: its pose is
-    another one in each, its stretch is the same. Masks are left out."""
 
     def run(self) -> int:
         """Write the observation, or those of all objects; returns the exit code."""
-        if self.tracks and not self.every:
-            raise InputError("given without --every", where="--tracks", fix="give both")
         if not self.weigh:
             with named_as_flags(self):
                 fix = "give both, or the fit `--sigma`"
@@ -125,16 +119,6 @@ class Observe(CameraOptions, EvidenceOptions):
         observation = self.add_to(observation, mask=drawn)
         observation.save(out)
         return observation
-
-    def observe_track(
-        self, found: Sequence[ImageKeypoints], model: ModelKeypoints, out: Path
-    ) -> None:
-        """Write the observation of one object in several photos of a folder."""
-        views = [self._joined(each, model, _photo(each, self.image)) for each in found]
-        first, *others = [self.add_to(each) for each in views]
-        names = [each.name for each in fields(ObservedImage)]
-        images = [ObservedImage(**{name: getattr(each, name) for name in names}) for each in others]
-        replace(first, others=tuple(images), object_name=found[0].track).save(out)
 
     def _joined(
         self, found: ImageKeypoints, model: ModelKeypoints, image: Path | None
@@ -210,22 +194,11 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
     folder = command.out or beside(command.keypoints, "_observations")
     make_folder(folder)
     failed, written = 0, set[Path]()
-    if command.tracks:
-        tracks: dict[str | None, list[ImageKeypoints]] = {}  # those without are one
-        for each in objects:
-            tracks.setdefault(each.track, []).append(each)
-        groups, texts = list(tracks.values()), list(tracks)
-    else:
-        groups = [[each] for each in objects]
-        texts = [Path(each.image or "").stem or "photo" for each in objects]
-    named = zip(groups, _slugs(texts), strict=True)
-    for found, name in tracked(named, "observing", total=len(groups)):
+    named = zip(objects, _names([each.image for each in objects]), strict=True)
+    for found, name in tracked(named, "observing", total=len(objects)):
         out = folder / f"{name}.json"
         try:
-            if command.tracks:
-                command.observe_track(found, model, out)
-            else:
-                command.observe(found[0], model, _photo(found[0], command.image), out)
+            command.observe(found, model, _photo(found, command.image), out)
         except CadalignError as error:
             failed += 1
             say(f"left out: {name}: {error}")
@@ -236,9 +209,8 @@ def _observe_all(command: Observe, objects: Sequence[ImageKeypoints], model: Mod
     if others:
         names = brief(", ".join(others))
         say(f"Not written now, but in the folder, too, which a fit takes whole: {names}")
-    kind = "tracks" if command.tracks else "objects"
-    answer(f"{len(groups) - failed} of {len(groups)} {kind}: {folder}")
-    return exit_code(failed, len(groups))
+    answer(f"{len(objects) - failed} of {len(objects)} objects: {folder}")
+    return exit_code(failed, len(objects))
 
 
 def _is_observation(path: Path) -> bool:
@@ -255,12 +227,12 @@ def _photo(found: ImageKeypoints, folder: Path | None) -> Path | None:
     return photo_in(folder, found.image)
 
 
-def _slugs(texts: Sequence[str | None]) -> list[str]:
-    """File names of texts, numbered where several are the same."""
-    stems = [file_stem(text, "track") for text in texts]
+def _names(images: Sequence[str | None]) -> list[str]:
+    """File names of images' objects, numbered where several are of one image."""
+    stems = [file_stem(Path(image or "").stem or "photo", "photo") for image in images]
     counts, seen = Counter(stems), Counter[str]()
     names = []
     for stem in stems:
         names.append(stem if counts[stem] == 1 else f"{stem}_{seen[stem]}")
         seen[stem] += 1
-    return file_stems(names, "track")
+    return file_stems(names, "photo")

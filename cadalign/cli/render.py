@@ -1,4 +1,4 @@
-"""`cadalign render`: images and turntables of one model."""
+"""`cadalign render`: images of one model."""
 
 from __future__ import annotations
 
@@ -17,16 +17,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Render:
-    """Draw a model: a still, a contact sheet of several views, or a turntable.
+    """Draw a model: a still, or a contact sheet of several views.
 
-    One view gives a still, several give a contact sheet, and an --out that ends in .mp4,
-    .webm or .gif gives a turntable, which starts in the view.
+    One view gives a still, several give a contact sheet.
     """
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """OBJ, PLY, GLB, glTF, STL or OFF file."""
     out: Path = Path("render.png")
-    """File to write: .png or .jpg; .mp4 (H.264), .webm (VP9) or .gif for a turntable."""
+    """File to write: .png or .jpg."""
     view: tuple[str, ...] = ("iso",)
     """Views: iso, front, right, back, left, top, bottom, azimuth,elevation[,roll] in
     degrees (write --view=-30,20 if it begins with a minus), all, or the folder of a COLMAP model,
@@ -48,10 +47,6 @@ class Render:
     """Rays per pixel at edges; 1 turns antialiasing off."""
     renderer: Literal["auto", "raycast", "pyrender", "open3d"] = "auto"
     """Renderer of the colour."""
-    seconds: float = 4.0
-    """Duration of a turntable [s]."""
-    fps: int = 30
-    """Frames per second of a turntable."""
 
     def run(self) -> int:
         """Draw and write; returns the exit code."""
@@ -61,17 +56,10 @@ class Render:
             return self._draw(RenderJob.of(self))
 
     def _draw(self, job: RenderJob) -> int:
-        from cadalign.cli.runs import tracked
         from cadalign.io.images import write_image
-        from cadalign.render import write_movie
-        from cadalign.render.drawing.movie import MOVIES
 
         make_folder_of(self.out)
-        if self.out.suffix.lower() in MOVIES:
-            frames, count = job.movie()
-            write_movie(self.out, tracked(frames, "drawing", total=count), fps=self.fps)
-        else:
-            write_image(self.out, job.picture())
+        write_image(self.out, job.picture())
         drawn_by = job.renderer.drawn_by(job.scene, samples=self.samples)
         say(f"Written: {self.out} (drawn by {drawn_by})")
         return 0

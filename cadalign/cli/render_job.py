@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,14 +19,13 @@ from cadalign.io.documents import read_json
 from cadalign.io.images import JPEG_ENDING
 from cadalign.io.meshes.files import load_mesh
 from cadalign.render.drawing.canvas import ByteImage, composite
-from cadalign.render.drawing.movie import MOVIES, contact_sheet
 from cadalign.render.drawing.pictures import (
     VIEWS,
     Angles,
+    contact_sheet,
     draw_still,
     keypoint_picture,
     pose_in_view,
-    turntable,
 )
 from cadalign.render.probe import make_renderer
 from cadalign.render.scene import LIGHT_GREY, Renderer, Scene, check_image_size
@@ -36,8 +35,7 @@ if TYPE_CHECKING:
     from cadalign.cli.render import Render
 
 _COLORS = {"grey": LIGHT_GREY, "white": (255, 255, 255), "black": (0, 0, 0)}
-_MAX_FRAMES = 10_000
-STILLS = (".png", JPEG_ENDING)
+_ENDINGS = (".png", JPEG_ENDING)
 
 LabelledView = tuple[str, Angles | tuple[Camera, Alignment]]
 """A label, and angles or a whole camera."""
@@ -62,11 +60,10 @@ class RenderJob:
         camera = Camera.from_fov(*parse_size(command.size), fov_x=command.fov)
         check_image_size(camera)
         ending = command.out.suffix.lower()
-        if ending not in (*STILLS, *MOVIES):
+        if ending not in _ENDINGS:
+            fix = f"give a name that ends in {' or '.join(_ENDINGS)}"
             raise InputError(
-                f"{command.out.name} is neither a PNG nor an MP4 file, and no JPEG, WebM or GIF",
-                where="--out",
-                fix=f"give a name that ends in {', '.join((*STILLS, *MOVIES))}",
+                f"{command.out.name} is neither a PNG nor a JPEG file", where="--out", fix=fix
             )
         color = parse_background(command.background)
         stretch = as_floats(command.scale, name="--scale", shape=(3,))
@@ -77,11 +74,7 @@ class RenderJob:
             refuse_unused(command, ["size", "fov"], "beside a model of COLMAP, which has its own")
         if not views:
             raise InputError("no view is given", where="--view", fix="give one or more")
-        if ending in MOVIES:
-            _refuse_no_turntable(views)
-        else:
-            refuse_unused(command, ["seconds", "fps"], "on a still")
-            _refuse_several_sizes(views, camera)
+        _refuse_several_sizes(views, camera)
         path = command.keypoints
         if color is None and (ending != ".png" or len(views) > 1 or path is not None):
             what = "only a PNG still without keypoints can be transparent"
@@ -120,21 +113,6 @@ class RenderJob:
         background = self.background or LIGHT_GREY
         return contact_sheet(images, [label for label, _ in self.views], background=background)
 
-    def movie(self) -> tuple[Iterator[ByteImage], int]:
-        """Draw a turntable that starts in the first view: its frames, and their number."""
-        seconds, fps = self.command.seconds, self.command.fps
-        frames = seconds * fps
-        if not 1 <= frames <= _MAX_FRAMES:
-            raise InputError(
-                f"{seconds:g} s at {fps:g} frames a second are not 1 to {_MAX_FRAMES} frames",
-                where="--seconds",
-            )
-        view = self.views[0][1]
-        assert isinstance(view, Angles)  # `_refuse_no_turntable`
-        count, scale = round(frames), self.command.scale
-        poses = turntable(self.scene, self.camera, view, count=count, scale=scale)
-        return (self._draw(self.camera, pose) for pose in poses), count
-
 
 def parse_size(text: str) -> tuple[int, int]:
     """Read an image size ``WIDTHxHEIGHT``."""
@@ -170,17 +148,6 @@ def read_keypoints(path: Path, model: Path, mesh: Mesh) -> FloatArray:
         return as_points(data, name="keypoints", dimension=3)
     except InputError as error:
         raise DataError(error.what, where=str(path), fix="give a list of [x, y, z]") from None
-
-
-def _refuse_no_turntable(views: Sequence[LabelledView]) -> None:
-    """Refuse views that a turntable cannot start in."""
-    if len(views) > 1:
-        what, fix = f"a turntable starts in one view, not in {len(views)}", "give one"
-        raise InputError(what, where="--view", fix=fix)
-    if not isinstance(views[0][1], Angles):
-        raise InputError(
-            "a turntable starts from angles, not a COLMAP model's camera", where="--view"
-        )
 
 
 def _refuse_several_sizes(views: Sequence[LabelledView], camera: Camera) -> None:

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.tracks.motion import Motion, PoseAt, Trajectory
-    from cadalign.estimation.tracks.tracker import Tracker, TrackUpdate
     from cadalign.estimation.uncertainty.next_best import Advice, rank_evidence
     from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import (
@@ -44,16 +42,11 @@ __all__ = [
     "MaskResiduals",
     "Misfit",
     "Model",
-    "Motion",
-    "PoseAt",
     "RansacOptions",
     "Result",
     "Results",
     "Sensitivity",
     "Size",
-    "TrackUpdate",
-    "Tracker",
-    "Trajectory",
     "Uncertainty",
     "View",
     "ViewResult",

@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from cadalign.estimation.joint_mistakes import joint_mistake, mistake_beside, no
 from cadalign.estimation.model import Model
 from cadalign.estimation.options import FitOptions, RansacOptions
 from cadalign.estimation.prepared_views import (
-    Align,
     align_facing,
     align_without,
     starts_by_one_view,
@@ -58,9 +57,6 @@ from cadalign.geometry.camera import needs_facing
 from cadalign.io.evidence import Size
 from cadalign.shapes.model import ShapeModel
 
-if TYPE_CHECKING:
-    from cadalign.estimation.tracks.motion import Motion
-
 T = TypeVar("T")
 
 
@@ -76,7 +72,6 @@ def align(
     ransac: RansacOptions | None = None,
     focal: str = FitOptions.focal,
     focal_prior: PriorOption = FitOptions.focal_prior,
-    motion: Motion | Literal["smooth"] | None = None,
 ) -> Result:
     """Estimate an object's pose, stretch and shape from one or more views.
 
@@ -107,11 +102,6 @@ def align(
         cameras share one. ``result.cameras`` have the estimates.
     focal_prior : FocalPrior, "usual" or None
         Prior on focal lengths to be estimated, as for `cadalign.fit`.
-    motion : Motion or "smooth", optional
-        The views are frames of a video (``View.time``) in which the object, or the camera, moves
-        smoothly. Frames of few keypoints or none take part, and with ``ransac`` so do frames whose
-        keypoints are all wrong. ``cam_from_rig`` is then the pose of a camera that moves itself,
-        and ``result.trajectory`` has the poses at all times.
 
     Returns
     -------
@@ -147,21 +137,12 @@ def align(
     options = FitOptions(loss=loss, loss_scale=loss_scale, focal=focal, focal_prior=focal_prior)
     Lenses.of(given, focal, focal_prior)  # checks the cameras
     _check_numbers(model, given)
-    align_some: Align
-    if motion is not None:
-        from cadalign.estimation.tracks.motion import Motion
-        from cadalign.estimation.tracks.smooth import align_track  # with the kernels of tracks
-
-        align_some = partial(align_track, model, Motion.of(motion), size, options, ransac)
-    elif size is None and init is None and is_plain(model, given):
+    if size is None and init is None and is_plain(model, given):
         exact = cast(Model, model)
         return align_plain(exact, given[0], options=options, ransac=ransac)
-    else:
-        align_some = partial(_align_all, model, size, options, ransac, start)
+    align_some = partial(_align_all, model, size, options, ransac, start)
     if needs_facing([view.camera for view in given]):
-        is_still = motion is not None and given[0].cam_from_rig is None
-        surrounds = ransac is not None
-        return align_facing(given, inits, align_some, may_surround=surrounds, is_still=is_still)
+        return align_facing(given, inits, align_some, may_surround=ransac is not None)
     return align_some(given, inits)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -30,9 +29,6 @@ from cadalign.io.documents import (
     convert,
     within,
 )
-
-if TYPE_CHECKING:
-    from cadalign.estimation.tracks.motion import Trajectory
 
 VERSION = 1
 Matrix = list[list[Finite]]
@@ -145,28 +141,6 @@ class _Mask(ForeignDocument):
         _check_lengths(self, names, len(self.points), "for {} points")
 
 
-class _Motion(ForeignDocument):
-    angular_sigma: Positive | None
-    linear_sigma: Positive | None
-
-
-class _Trajectory(ForeignDocument):
-    """The fields of `Trajectory`."""
-
-    times: list[Finite]
-    poses: Matrix
-    velocities: Matrix
-    frames: list[Matrix]
-    links: list[Matrix]
-    scale: tuple[Positive, Positive, Positive]
-    motion: _Motion
-    correlation: Finite
-
-    def __post_init__(self) -> None:
-        if not self.times or any(b <= a for a, b in pairwise(self.times)):
-            raise InputError("expected increasing times", where="times")
-
-
 class _Result(ForeignDocument):
     """The fields of `cadalign.Result`; ``rms``, ``std`` and ``box`` follow from them."""
 
@@ -198,7 +172,6 @@ class _Result(ForeignDocument):
     equal_under_symmetry: str = ""
     rig_from_model: Any = None
     mask_residuals: tuple[_Mask | None, ...] = ()
-    trajectory: _Trajectory | None = None
 
     def __post_init__(self) -> None:
         if not self.views:
@@ -259,14 +232,7 @@ def write_result(result: ResultData) -> dict[str, Any]:
         "equal_under_symmetry": result.equal_under_symmetry,
         "rig_from_model": result.rig_from_model and result.rig_from_model.to_dict(),
         "mask_residuals": [each and _written_mask(each) for each in result.mask_residuals],
-        "trajectory": result.trajectory and _written_trajectory(result.trajectory),
         "stats": {**vars(result.stats)},
-    }
-
-
-def _written_trajectory(path: Trajectory) -> dict[str, Any]:
-    return {name: _plain(value) for name, value in vars(path).items()} | {
-        "motion": {**vars(path.motion)}
     }
 
 
@@ -349,7 +315,6 @@ def _result(read: _Result, kind: type[Kind]) -> Kind:
         symmetry=None if read.symmetry is None else Symmetry.from_dict(read.symmetry),
         rig_from_model=read.rig_from_model and Alignment.from_dict(read.rig_from_model),
         mask_residuals=tuple(map(_mask, read.mask_residuals)),
-        trajectory=None if read.trajectory is None else _trajectory(read.trajectory),
         own_bounds=_array(read.bounds, "bounds", 2, 3),
         own_stretch=None if read.stretch is None else np.array(read.stretch),
         own_equal=read.equal_under_symmetry,
@@ -389,25 +354,6 @@ def _mask(read: _Mask | None) -> MaskResiduals | None:
         read.correlation,
         read.offset,
         read.is_used,
-    )
-
-
-def _trajectory(read: _Trajectory) -> Trajectory:
-    from cadalign.estimation.tracks.motion import Motion, Trajectory  # of tracks alone
-
-    count = len(read.times)
-    shapes = {"poses": (12,), "velocities": (6,), "frames": (12, 12), "links": (12, 12)}
-    with within("trajectory"):
-        arrays = {
-            name: as_floats(getattr(read, name), name=name, shape=(count, *shape))
-            for name, shape in shapes.items()
-        }
-    return Trajectory(
-        np.array(read.times),
-        **arrays,
-        scale=np.array(read.scale),
-        motion=Motion(read.motion.angular_sigma, read.motion.linear_sigma),
-        correlation=read.correlation,
     )
 
 

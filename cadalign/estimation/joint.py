@@ -41,7 +41,7 @@ from cadalign.estimation.symmetry import (
 from cadalign.estimation.uncertainty.contradictions import warnings_of
 from cadalign.estimation.uncertainty.evidence import AnyBasis, Basis, summaries_of
 from cadalign.estimation.uncertainty.misfit import unexplained
-from cadalign.estimation.uncertainty.shape_posterior import ShapeTails, misfits
+from cadalign.estimation.uncertainty.shape_posterior import ShapeTails
 from cadalign.estimation.uncertainty.summary import (
     EvidenceSummary,
     another_pose,
@@ -56,7 +56,7 @@ from cadalign.geometry.symmetry import Symmetry
 from cadalign.geometry.symmetry_group import group_of
 from cadalign.shapes.model import ShapeModel
 from cadalign.shapes.parts import inflation_with
-from cadalign.solvers.joint.covariance import JointCovariance, joint_covariance
+from cadalign.solvers.joint.covariance import joint_covariance
 from cadalign.solvers.joint.evidence import points_of
 from cadalign.solvers.linalg import cholesky, solve_cholesky
 
@@ -234,11 +234,7 @@ def result_of_minima(
         turned = nearest_rotation(rotation.T @ pose.rotation)
         in_rig = Alignment(turned, rotation.T @ (pose.translation - camera[9:]), best.scale)
     tails = ShapeTails(inflation, prior.degrees_of_freedom)
-    track = minimum.track
-    if track is None:
-        warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails)
-    else:
-        warnings = misfits(minimum.cost, track.redundancy, tails)
+    warnings = warnings_of(minimum.evidence, minimum.state, minimum.cost, tails)
     if problem.lacks_sigma:
         pixels = [view.pixels for view in views if view.sigma is None]
         warnings = (*unexplained(problem.noise, pixels), *warnings)
@@ -251,7 +247,7 @@ def result_of_minima(
         is_curved=symmetry is None and not is_exact(minimum.evidence),
         warnings=warnings if mistake is None else (mistake,),
         evidence=summaries_of(minimum.evidence, minimum.state, best.cameras),
-        basis=None if track else Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
+        basis=Basis(*widened(minimum.evidence, minimum.state, prior.inflation)),
         cost=minimum.cost,
         stats=stats,
         component=minimum.component,
@@ -287,14 +283,7 @@ def _estimate(minimum: Minimum, likelihood: float, prior: ShapePrior) -> Estimat
     if len(evidence.shape.modes):  # a box whose corners were estimated holds what is seen
         sighted = np.unique(evidence.sightings.point)
         widen_box(stretched, sighted[sighted < keypoints])
-    track = minimum.track
-    if track is None:
-        found = joint_covariance(evidence, state)
-    else:
-        from cadalign.solvers.joint.tracks import Path, moving_covariance  # kernels of tracks
-
-        moving = moving_covariance(evidence, track.motion, Path(state, track.velocities)).joint
-        found = JointCovariance(*(track.widening * part for part in moving))
+    found = joint_covariance(evidence, state)
     return Estimate(
         stretched / scale,
         scale,

@@ -49,13 +49,11 @@ def evidence_of(
     options: FitOptions = _PLAIN,
     lenses: Lenses | None = None,
     noise: float = 1.0,
-    frames: Sequence[int] | None = None,
 ) -> Evidence:
     """Evidence of the views, of the size and of the first component of the prior.
 
     Of the ``options`` the loss counts. By default the views' focal lengths are known. Keypoints
-    without a sigma have the standard deviation ``noise`` [px]. ``frames`` number the poses of the
-    views of a moving object.
+    without a sigma have the standard deviation ``noise`` [px].
 
     Raises InputError if a view names a keypoint that the model lacks, lacks evidence, or has some
     of an up axis that the model lacks, or if only some views have a known pose.
@@ -65,7 +63,7 @@ def evidence_of(
     rows = []
     for number, view in enumerate(views):
         rows.append(prior.rows_of(view.keypoint_ids, f"views[{number}].ids"))
-        if frames is None and not tells_something(view):
+        if not tells_something(view):
             fix = "give keypoints, a mask or a direction, or leave the view away"
             raise InputError("tells nothing about the object", where=f"views[{number}]", fix=fix)
     offsets = known_distances(prior, views, size)
@@ -81,12 +79,12 @@ def evidence_of(
     return Evidence(
         prior.components[0],
         _sightings(rows, views, lenses.cameras, noise, options),
-        _rig(views, frames),
+        _rig(views),
         lenses.focals(),
         directions,
         offsets,
         _image_depths(prior.components[0], rows, views),
-        scale_priors(prior, _is_metric(offsets, views, frames)),
+        scale_priors(prior, _is_metric(offsets, views)),
     )
 
 
@@ -101,13 +99,12 @@ def told_by(evidence: Evidence, views: BoolArray) -> Evidence:
     )
 
 
-def _is_metric(offsets: Offsets, views: Sequence[View], frames: Sequence[int] | None) -> bool:
+def _is_metric(offsets: Offsets, views: Sequence[View]) -> bool:
     """True if the object's size is told: by distances, depths, or known camera poses."""
     depths = [cast(FloatArray, view.depth) for view in views if view.depth is not None]
     if len(offsets.value) or any(np.isfinite(depth).any() for depth in depths):
         return True
-    times = 1 if frames is None else len(set(frames))  # of several cameras each
-    return len(views) > times and views[0].cam_from_rig is not None
+    return len(views) > 1 and views[0].cam_from_rig is not None
 
 
 def tells_something(view: View) -> bool:
@@ -157,7 +154,7 @@ def _depths(view: View, count: int) -> FloatArray:
     return found
 
 
-def _rig(views: Sequence[View], frames: Sequence[int] | None) -> Rig:
+def _rig(views: Sequence[View]) -> Rig:
     posed = [view.cam_from_rig is not None for view in views]
     if any(posed) != all(posed):
         raise InputError(
@@ -168,9 +165,8 @@ def _rig(views: Sequence[View], frames: Sequence[int] | None) -> Rig:
     is_rig = all(posed)
     motions = [view.cam_from_rig if is_rig else np.eye(4) for view in views]
     rows = [np.append(pose[:3, :3], pose[:3, 3]) for pose in cast("list[FloatArray]", motions)]
-    if frames is None:
-        frames = [0] * len(views) if is_rig else range(len(views))
-    return Rig(np.array(rows), np.array(frames, dtype=np.int64))
+    poses = [0] * len(views) if is_rig else range(len(views))
+    return Rig(np.array(rows), np.array(poses, dtype=np.int64))
 
 
 def _image_depths(shape: Shape, rows: Sequence[list[int]], views: Sequence[View]) -> ImageDepths:

@@ -247,15 +247,14 @@ def _factor_amid(center: FloatArray, middles: Sequence[tuple[FloatArray, FloatAr
     return -float(first @ second / squares) if squares > 0 else 0.0
 
 
-def facing_view(view: View, shown: FloatArray | None = None) -> View:
+def facing_view(view: View) -> View:
     """The view in the frame that faces what it shows; ``up`` and the like stay in the lens's.
 
-    It faces the pixels (n, 2) that are ``shown``, by default those of `_shown_by`. Depths, along
-    the lens's axis as they are given, become those along the frame's.
+    Depths, along the lens's axis as they are given, become those along the frame's.
     """
     if not needs_facing([view.camera]):
         return view
-    camera = faced(view.camera, _shown_by(view) if shown is None else shown)
+    camera = faced(view.camera, _shown_by(view))
     rig = view.cam_from_rig
     if rig is not None:
         turn = np.eye(4)
@@ -304,15 +303,12 @@ def align_facing(
     align_some: Align,
     *,
     may_surround: bool,
-    is_still: bool = False,
 ) -> Result:
     """Align views in the frames of `facing_view`; the result is in those that were given.
 
-    Where the camera ``is_still``, all of its views have one frame. Raises InputError if keypoints
-    lie all around a wide lens, unless they ``may_surround`` it.
+    Raises InputError if keypoints lie all around a wide lens, unless they ``may_surround`` it.
     """
-    shown = np.concatenate([_shown_by(view) for view in given]) if is_still else None
-    views = [facing_view(view, shown) for view in given]
+    views = [facing_view(view) for view in given]
     for view in views:
         if view.camera.is_wide and not may_surround:
             rays_ahead(view.pixels, view.camera)
@@ -339,13 +335,11 @@ def align_facing(
         replace(each, alignment=turned_alignment(each.alignment, turn), camera=given[0].camera)
         for each in result.alternatives
     ]
-    path = result.trajectory
     return replace(
         result,
         views=tuple(turned),
         statistics=statistics,
         alternatives=tuple(others),
-        trajectory=path.turned(turn) if path is not None and is_still else path,
     )
 
 

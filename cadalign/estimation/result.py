@@ -42,7 +42,7 @@ class Result(ResultData):
         Raises
         ------
         InputError
-            If the result was read from a file, which does not hold the evidence, or has a motion.
+            If the result was read from a file, which does not hold the evidence.
 
         Examples
         --------
@@ -58,10 +58,6 @@ class Result(ResultData):
         if self.statistics.basis is None:
             if self.method != "align":
                 return ()
-            if self.trajectory is not None:
-                what = "an estimate with a motion has none"
-                fix = "align its frames without `motion`"
-                raise InputError(what, where="contributions", fix=fix)
             what = "the result holds no evidence: it was read from a file"
             raise InputError(what, where="contributions", fix="align again")
         from cadalign.estimation.uncertainty.evidence import contributions_of
@@ -92,7 +88,7 @@ class Result(ResultData):
         Raises
         ------
         InputError
-            If the result was read from a file, has a motion, or minimises no cost.
+            If the result was read from a file, or minimises no cost.
         DegenerateError
             If the evidence beside keypoints of one view leaves unknowns undetermined.
 

@@ -32,7 +32,6 @@ from cadalign.geometry.symmetry import Symmetry
 
 if TYPE_CHECKING:
     from cadalign.estimation.model import Model
-    from cadalign.estimation.tracks.motion import Trajectory
     from cadalign.estimation.uncertainty.summary import EvidenceSummary, MaskResiduals, Misfit
     from cadalign.geometry.mesh import Mesh
     from cadalign.shapes.model import ShapeModel
@@ -90,8 +89,6 @@ class ResultData:
         The alignment in the frame that views with ``cam_from_rig`` share; None without them.
     mask_residuals : tuple of MaskResiduals or None
         Agreement of the contour of every view's mask with the estimate; empty without masks.
-    trajectory : Trajectory, optional
-        Poses at all times, where a motion was estimated; a file of the result does not hold it.
     own_bounds, own_stretch, own_equal : optional
         ``bounds``, ``stretch`` and ``equal_under_symmetry`` where they do not follow.
     """
@@ -118,7 +115,6 @@ class ResultData:
     own_bounds: FloatArray | None = None
     own_stretch: FloatArray | None = None
     own_equal: str | None = None
-    trajectory: Trajectory | None = None
 
     @property
     def alignment(self) -> Alignment:

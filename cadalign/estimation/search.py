@@ -33,7 +33,7 @@ from cadalign.solvers.joint.evidence import Evidence, Shape, State, points_of
 from cadalign.solvers.joint.search import refine_joint, score_state, search_joint
 
 if TYPE_CHECKING:
-    from cadalign.solvers.joint.motion import MotionPrior
+    pass
 
 _MOST_PER_FOCAL = 8  # starts of one pose, at each focal length of the grid
 _MOST_PER_FOCAL_OF_SEVERAL = 3
@@ -63,7 +63,6 @@ class JointProblem(NamedTuple):
     options: FitOptions
     lenses: Lenses
     noise: float = 1.0  # [px], where it is not given
-    frames: tuple[int, ...] | None = None  # of the views, where the object moves
 
     @property
     def lacks_sigma(self) -> bool:
@@ -86,21 +85,8 @@ class JointProblem(NamedTuple):
             options=self.options,
             lenses=lenses,
             noise=self.noise,
-            frames=self.frames,
         )
         return everything._replace(shape=shape)
-
-
-class Track(NamedTuple):
-    """The motion of an estimate: its prior and velocities (P, 6).
-
-    ``redundancy`` is that of all evidence, ``widening`` a factor on the variances.
-    """
-
-    motion: MotionPrior
-    velocities: FloatArray
-    redundancy: int = 0
-    widening: float = 1.0
 
 
 class Minimum(NamedTuple):
@@ -117,7 +103,6 @@ class Minimum(NamedTuple):
     cost: float
     score: float
     lenses: Lenses
-    track: Track | None = None
     outline_score: float | None = None
 
     @property
@@ -322,8 +307,6 @@ def find_minima(
         return problem, *minima_at_noise(problem, inits, ransac)
     counts = [len(view.keypoint_ids) for view in problem.views if view.sigma is None]
     poses = 1 if problem.views[0].cam_from_rig is not None else len(problem.views)
-    if problem.frames is not None:
-        poses = max(problem.frames) + 1
     if 2 * sum(counts) <= 6 * poses:
         raise no_redundancy_error(sum(counts))
     effort = np.zeros(2, dtype=int)

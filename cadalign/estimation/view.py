@@ -57,8 +57,6 @@ class View(BeyondKeypoints):
         for all views that have none, by its likelihood under a weak prior about 2 px.
     scores : (n,) float, optional
         Confidences of the keypoints, for a robust search.
-    time : float, optional
-        When the image was taken [s], for an estimate with a motion: views of one time share a pose.
     depth : (n,) or (h, w) float, or path, optional
         Depths of the keypoints, their z in the camera's frame, also of a wide lens, or an image of
         such depths that is registered to the photo, as an array or as a 16-bit PNG [model units, or
@@ -117,7 +115,6 @@ class View(BeyondKeypoints):
     sigma: Sigma | None = 1.0
     scores: npt.ArrayLike | None = None
     image: npt.ArrayLike | str | os.PathLike[str] | None = field(default=None, kw_only=True)
-    time: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         for name, value in _DEFAULTS.items():
@@ -134,8 +131,6 @@ class View(BeyondKeypoints):
         object.__setattr__(self, "ids", ids)
         for name in ("sigma", "scores", "depth_sigma", "up_sigma_deg"):
             object.__setattr__(self, name, copied(getattr(self, name)))
-        if self.time is not None and not (is_number(self.time) and np.isfinite(self.time)):
-            raise InputError(f"{quote(self.time)} is not a finite number", where="time")
         if self.depth is not None:
             self._keep("depth", _depths(self.depth, camera, len(points), self.depth_scale))
             object.__setattr__(self, "depth_scale", None)  # a changed copy is not scaled again

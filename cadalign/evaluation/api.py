@@ -39,10 +39,10 @@ def evaluate(
     ----------
     root : str or path-like, optional
         The dataset, for experiments that have one: a folder in KeypointNet's layout
-        (``keypointnet``, ``retrieval``, ``unseen``, ``tracks``), a data set of photos
+        (``keypointnet``, ``retrieval``, ``unseen``), a data set of photos
         (``photos``), or a COLMAP or blind-PnP model (``correspondences``).
     experiment : {"keypointnet", "correspondences", "retrieval", "unseen", "photos",
-        "tracks", "simulate", "demo"}
+        "simulate", "demo"}
         Name of the experiment.
     workers : int, optional
         Processes; -1 for one for each core (the default; for running times it is 1), 0 for none.

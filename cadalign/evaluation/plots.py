@@ -78,10 +78,6 @@ _LABELS = {
     "stretched+gravity": "stretched + gravity",
     "shape+gravity": "shape model + gravity",
     "truth": "the truth itself",
-    "frames": "frame by frame",
-    "shared": "one shape",
-    "smooth": "one shape, smooth motion",
-    "online": "online, smooth motion",
     LIMIT: "Cramer-Rao bound",
 }
 

@@ -139,7 +139,6 @@ _EXPERIMENTS = {
         "retrieval": "retrieval",
         "unseen": "unseen",
         "photos": "photos",
-        "tracks": "tracks",
     }.items()
 }
 BATCHES: dict[str, str] = {}

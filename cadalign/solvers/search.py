@@ -9,7 +9,6 @@ the functions here is a family of kernels with a member for each system, in that
 `focal.FocalObjective`      the same, and the focal length
 `marginal.equations.Posed`  a pose, the shape integrated out
 `joint.system.Joint`        poses, scales, focal lengths and shape from all evidence
-`joint.tracks.Moving`       the same, and velocities, with a prior on motion between poses
 =========================  =====================================================================
 
 Costs are -2 log of a likelihood times a prior, up to a constant; equations hold half the cost's

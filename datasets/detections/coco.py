@@ -49,7 +49,6 @@ class _Object(ForeignDocument):
     category_id: _Id | None = None
     num_keypoints: int | None = None
     frame_id: _Id | None = None
-    track_id: _Id | None = None
     instances: list[_Object] | None = None
     segmentation: Any = None
 
@@ -201,7 +200,6 @@ def _image_keypoints(entry: _Object, where: str, *, names: list[str] | None) -> 
         names=None if names is None else tuple(names),
         image=None if entry.image_id is None else str(entry.image_id),
         score=next((score for score in given if score is not None), None),
-        track=None if entry.track_id is None else str(entry.track_id),
         segmentation=entry.segmentation or None,
         source=where,
     )

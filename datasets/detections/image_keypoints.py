@@ -47,8 +47,6 @@ class ImageKeypoints:
     """How sure the detector is of the whole object."""
     source: str = "keypoints"
     """The file and the place in it, for messages."""
-    track: str | None = field(default=None, kw_only=True)
-    """Name or number of the object through the images of a video."""
     camera: Camera | None = field(default=None, kw_only=True)
     """The calibrated camera, where the file has it."""
     segmentation: Any = field(default=None, kw_only=True)

@@ -13,19 +13,15 @@ import numpy as np
 from cadalign.datasets.detections.coco import read_coco_keypoints
 from cadalign.datasets.detections.image_keypoints import VISIBILITY_SCORES, ImageKeypoints
 from cadalign.datasets.photos.dataset import leaving_out
-from cadalign.datasets.photos.kitti_keypoints import TRACKS, read_track_keypoints
 from cadalign.errors import DataError, InputError, brief, quote
 from cadalign.io.documents import Finite, Text, convert, in_file
 from cadalign.io.files import as_path, read_text
 
-_Key = tuple[str | None, str | None]
-"""Image and track of an object."""
 _OTHER_NAMES = {"x": "u", "y": "v"}
 _COLUMNS: dict[str, Any] = {
     "u": Finite,
     "v": Finite,
     "image": str,
-    "track": str,
     "name": Text,
     "semantic_id": Finite,  # programs write whole numbers as 2.0 in columns with gaps
     "score": Finite,
@@ -37,13 +33,12 @@ _COLUMNS: dict[str, Any] = {
 def read_image_keypoints(
     path: str | os.PathLike[str], *, problems: dict[str, DataError] | None = None
 ) -> list[ImageKeypoints]:
-    """Read a file of keypoints: COCO's JSON and its relatives, CSV, or KITTI's tracks of cars.
+    """Read a file of keypoints: COCO's JSON and its relatives, or CSV.
 
     Parameters
     ----------
     path : str or path-like
-        A .csv or JSON file as described in docs/formats/detections.md, or a folder with
-        ``car_tracks.json``.
+        A .csv or JSON file as described in docs/formats/detections.md.
     problems : dict of str to DataError, optional
         Gets the reasons why objects of COCO's JSON and CSV could not be read, by their places;
         without it, and where none could be read, the first is raised.
@@ -59,11 +54,6 @@ def read_image_keypoints(
         If the file is missing, malformed or of no known kind; names file and field.
     """
     path = as_path(path)
-    if path.name == TRACKS or (path / TRACKS).is_file():
-        return read_track_keypoints(path if path.name == TRACKS else path / TRACKS)
-    if path.is_dir():
-        fix = "give a file of a detector's keypoints, JSON or CSV"
-        raise DataError(f"the folder has no {TRACKS}", where=str(path), fix=fix)
     read = read_csv_keypoints if path.suffix.lower() == ".csv" else read_coco_keypoints
     return read(path, problems)
 
@@ -71,34 +61,34 @@ def read_image_keypoints(
 def read_csv_keypoints(
     path: Path, problems: dict[str, DataError] | None = None
 ) -> list[ImageKeypoints]:
-    """Read a CSV file, one object for each image, or for each track in it.
+    """Read a CSV file, one object for each image.
 
     For ``problems`` see `read_image_keypoints`.
     """
-    by_image: dict[_Key, list[dict[str, Any]]] = {}
-    bad: dict[_Key, DataError] | None = None if problems is None else {}
+    by_image: dict[str | None, list[dict[str, Any]]] = {}
+    bad: dict[str | None, DataError] | None = None if problems is None else {}
     try:
         lines = csv.reader(io.StringIO(read_text(path)), strict=True)
         header = _header(next(lines, []), f"{path}, line 1")
         for line in lines:
             cells = {name: cell.strip() for name, cell in zip(header, line, strict=False)}
-            key = cells.get("image") or None, cells.get("track") or None
-            with leaving_out(key, bad):
+            image = cells.get("image") or None
+            with leaving_out(image, bad):
                 row = _row(header, line, cells, f"{path}, line {lines.line_num}")
                 if row is not None:
-                    by_image.setdefault(key, []).append(row)
+                    by_image.setdefault(image, []).append(row)
     except csv.Error as error:
         raise DataError(f"cannot be read ({brief(error)})", where=str(path)) from None
     objects = []
-    for key, rows in by_image.items():
-        if key not in (bad or {}):
-            with leaving_out(key, bad):
-                objects.append(_object(path, key, rows))
+    for image, rows in by_image.items():
+        if image not in (bad or {}):
+            with leaving_out(image, bad):
+                objects.append(_object(path, image, rows))
     if not objects:
         none = DataError("there are no keypoints", where=str(path))
         raise next(iter((bad or {}).values()), none)
     if problems is not None and bad is not None:
-        problems |= {_place(path, key): error for key, error in bad.items()}
+        problems |= {_place(path, image): error for image, error in bad.items()}
     return objects
 
 
@@ -144,17 +134,17 @@ def _row(
 def _value(name: str, cell: str) -> str | float:
     """A cell as a number in the columns that hold numbers, where it is a finite one."""
     try:
-        number = np.nan if name in ("image", "name", "track") else float(cell)
+        number = np.nan if name in ("image", "name") else float(cell)
     except ValueError:
         return cell
     return number if np.isfinite(number) else cell
 
 
-def _place(path: Path, key: _Key) -> str:
-    return ", ".join(map(str, filter(None, (path, *key))))
+def _place(path: Path, image: str | None) -> str:
+    return str(path) if image is None else f"{path}, {image}"
 
 
-def _object(path: Path, key: _Key, rows: list[dict[str, Any]]) -> ImageKeypoints:
+def _object(path: Path, image: str | None, rows: list[dict[str, Any]]) -> ImageKeypoints:
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     scores = columns.get("score")
     if "visibility" in columns:
@@ -166,7 +156,6 @@ def _object(path: Path, key: _Key, rows: list[dict[str, Any]]) -> ImageKeypoints
         names=None if names is None else tuple(names),
         ids=None if ids is None or names is not None else tuple(map(int, ids)),
         sigma=None if sigma is None else np.array(sigma),
-        image=key[0],
-        track=key[1],
-        source=_place(path, key),
+        image=image,
+        source=_place(path, image),
     )

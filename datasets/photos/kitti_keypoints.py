@@ -214,35 +214,6 @@ def list_tracks(
                 yield KeypointFrame(name, path, f"{place}.frames[{row}]", frame, model, track)
 
 
-def read_track_keypoints(path: Path) -> list[ImageKeypoints]:
-    """Read the keypoints of ``car_tracks.json``, with camera, track and frame, as detectors' files.
-
-    The image of a frame is called ``<sequence>/<frame>.png``.
-
-    Raises DataError if the file, or a frame in it, cannot be read.
-    """
-    found = []
-    for each in list_tracks(path):
-        assert each.track is not None
-        assert each.model is not None
-        with in_file(path), within(each.place):
-            frame = convert(each.entry, _Frame)
-        keypoints = ImageKeypoints(
-            np.array(frame.uv, dtype=float).reshape(-1, 2),
-            scores=None if frame.score is None else np.array(frame.score),
-            names=tuple(each.model.names),
-            image=f"{each.track.sequence:04d}/{frame.frame:06d}.png",
-            size=SIZE,
-            source=f"{path}: {each.place}",
-            track=str(each.track.track),
-            camera=_camera(each.track.K),
-        )
-        found.append(keypoints)
-    if not found:
-        raise DataError("there are no tracks", where=str(path))
-    return found
-
-
 def car_bounds(points: FloatArray) -> FloatArray:
     """The box (2, 3) of the mean car with these keypoints (k, 3), which lie within it.
 

@@ -1,1 +1,1 @@
-"""Draw on images: overlays, pictures of geometry, stills and movies."""
+"""Draw on images: overlays, pictures of geometry, stills."""

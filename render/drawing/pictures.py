@@ -1,13 +1,14 @@
-"""Pictures of one model: depth, normals, faces, keypoints, lines; stills and turntables."""
+"""Pictures of one model: depth, normals, faces, keypoints, lines; stills and contact sheets."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.arrays import as_points
 from cadalign.errors import InputError, unknown
@@ -37,6 +38,7 @@ _LINE_COLOR = (30, 34, 40)
 _EDGE_ANGLE = 25.0
 # And those whose depths differ by more than this share of what the slope explains.
 _DEPTH_STEP = 0.02
+_TEXT_COLOR = (70, 76, 84)
 _FILL = 0.88  # of the image, by a still's model
 
 
@@ -261,39 +263,52 @@ def draw_still(
     return _PICTURES[style](cast_geometry(scene, camera, cam_from_model))
 
 
-def turntable(
-    scene: Scene,
-    camera: Camera,
-    angles: Angles,
+def contact_sheet(
+    images: Sequence[ByteImage],
+    labels: Sequence[str],
     *,
-    count: int,
-    scale: npt.ArrayLike = (1.0, 1.0, 1.0),
-) -> Iterator[Alignment]:
-    """Poses that turn a model once about its y axis, at a distance that fits all of them.
+    columns: int | None = None,
+    background: tuple[int, int, int] = (255, 255, 255),
+) -> ByteImage:
+    """Put pictures of one size side by side, each with a label beneath.
 
     Parameters
     ----------
-    scene : Scene
-    camera : Camera
-    angles : Angles
-        Direction of the first pose.
-    count : int
-        Number of poses.
-    scale : (3,) float
+    images : sequence of (h, w, 3) uint8
+    labels : sequence of str
+    columns : int, optional
+        By default about as many as rows.
+    background : tuple of 3 int
+
+    Returns
+    -------
+    (H, W, 3) uint8
+
+    Raises
+    ------
+    InputError
+        If there are no images, they differ in size, or there is not a label for each.
     """
-    low, high = scene.bounds
-    # The box about all the turned boxes: as wide as the farthest corner from the axis is.
-    stretch = np.asarray(scale, dtype=float)
-    middle, half = (low + high) / 2, (high - low) / 2 * stretch
-    reach = float(np.hypot(half[0], half[2]))
-    wide = np.array([reach, half[1], reach])
-    first = look_at(azimuth=angles.azimuth, elevation=angles.elevation, distance=1.0).rotation
-    placed = frame_object(np.array([-wide, wide]), camera, rotation=first, fill=_FILL)
-    depth = placed.translation
-    for number in range(count):
-        turned = replace(angles, azimuth=angles.azimuth + 360.0 * number / count)
-        rotation = look_at(**asdict(turned), distance=1.0).rotation
-        yield Alignment(rotation, depth - rotation @ (middle * stretch), stretch)
+    if not images or len(images) != len(labels):
+        raise InputError(f"{len(images)} images and {len(labels)} labels", where="images")
+    if len({image.shape for image in images}) > 1:
+        raise InputError("all must have the same size", where="images")
+    height, width = images[0].shape[:2]
+    across = columns or int(np.ceil(np.sqrt(len(images))))
+    down = -(-len(images) // across)
+    gap = max(4, min(height, width) // 40)
+    line = max(14, height // 16)
+    size = (across * (width + gap) + gap, down * (height + line + gap) + gap)
+    sheet = Image.new("RGB", size, background)
+    pen = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=0.72 * line)
+    for number, (image, label) in enumerate(zip(images, labels, strict=True)):
+        left = gap + number % across * (width + gap)
+        top = gap + number // across * (height + line + gap)
+        sheet.paste(Image.fromarray(image), (left, top))
+        middle = (left + width / 2, top + height + line / 2)
+        pen.text(middle, label, fill=_TEXT_COLOR, font=font, anchor="mm")
+    return np.array(sheet)
 
 
 def _smooth_lines(scene: Scene, camera: Camera, cam_from_model: Alignment) -> ByteImage:

@@ -1,9 +1,9 @@
-"""Real cars of KITTI: runs over keypoints of networks, and tracks."""
+"""Real cars of KITTI: runs over keypoints of networks."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,6 @@ from cadalign.datasets.photos.kitti_keypoints import (
     car_shape,
     yaw_of_car,
 )
-from cadalign.evaluation.experiments.tracks import TracksOptions
-from cadalign.evaluation.instances.tracks import pose_of, recorded_videos
 
 _LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6
 _SIGMA = 3.0  # [px] of the network's keypoints
@@ -91,7 +89,7 @@ def _detections_row(name: str, cars: list[_Car], web: Path, options: dict[str, A
     for each, (_, box, middle) in zip(found, cars, strict=True):
         if isinstance(each, cadalign.Result):
             center = _middle(each) if each.method == "align" else middle
-            depth = pose_of(each.alignment, center)[-1]
+            depth = each.alignment.apply([center])[0, 2]
             yaw = _yaw_error(each.alignment.rotation, box.rotation)
             errors.append((yaw, abs(depth / box.center[2] - 1)))
     yaws, depths = np.array(errors).T
@@ -101,50 +99,3 @@ def _detections_row(name: str, cars: list[_Car], web: Path, options: dict[str, A
         photos = cadalign.fit_many(web, **options)
         row["web photos aligned"] = f"{int(photos.solved.sum())} of {len(photos)}"
     return row
-
-
-# Tracks -------------------------------------------------------------------------------------------
-
-
-def car_tracks(folder: Path) -> Iterator[Row]:
-    """Yaw, depth and jitter of KITTI's tracks by five ways."""
-    shape, options = car_shape(folder), TracksOptions(folder, noise_px=_SIGMA)
-    videos, _, _ = recorded_videos(folder, options)
-    for way in ("frame by frame", "shape shared", "smooth", "smooth, robust", "online"):
-        yaws, depths, jitters = [], [], []
-        for video in videos:
-            views, truth = video.made(options)
-            poses = _poses(shape, views, way)
-            true = truth[-len(poses) :]
-            own = np.array([yaw_of_car(each[:9].reshape(3, 3)) for each in poses])
-            yaws += [
-                _yaw_error(each[:9].reshape(3, 3), gt[:9].reshape(3, 3))
-                for each, gt in zip(poses, true, strict=True)
-            ]
-            depths.append(100 * np.abs(poses[:, 11] / true[:, 11] - 1))
-            jitters.append(np.degrees(np.diff(np.unwrap(own), 2)))
-        yield {
-            "way": way,
-            "frames": len(yaws),
-            "yaw, deg": section.spread(yaws),
-            "depth, %": float(np.median(np.concatenate(depths))),
-            "jitter, deg": float(np.concatenate(jitters).std()),
-        }
-
-
-def _poses(shape: cadalign.ShapeModel, views: Sequence[cadalign.View], way: str) -> FloatArray:
-    """Poses (P, 12) of the box's axes and centre, of every frame that has one."""
-    if way == "frame by frame":
-        results = [cadalign.align(shape, view) for view in views]
-        return np.array([pose_of(each.alignment, _middle(each)) for each in results])
-    if way == "online":
-        tracker = cadalign.Tracker(shape)
-        found = [tracker.update(view).pose for view in views]
-        middle = _middle(tracker.smooth())
-        known = [each.alignment for each in found if each is not None]
-    else:
-        ransac = cadalign.RansacOptions() if "robust" in way else None
-        motion = None if way == "shape shared" else cadalign.Motion()
-        result = cadalign.align(shape, views, motion=motion, ransac=ransac)
-        middle, known = _middle(result), [view.alignment for view in result.views]
-    return np.array([pose_of(each, middle) for each in known])

@@ -73,12 +73,11 @@ def photos(given: BenchmarkData, *, composites: int = 200, draws: int = 10) -> T
 
 
 def photo_times(given: BenchmarkData, *, composites: int = 12, frames: int = 40) -> Tables:
-    """Time [s of a processor] that a photo takes beyond the keypoints, and a track by photos alone.
+    """Time [s of a processor] that a photo takes beyond the keypoints, and by the photo alone.
 
     Composites of 2 megapixels with six rough clicks; and a clip of 640 x 480 px in which an object
     turns by 2 degrees and moves by 1 % of its distance from frame to frame, each frame aligned from
-    the pose of the last by its photo alone. Short clips are also aligned as smooth tracks, by half
-    of their keypoints in each frame, with an error of 4 px, and with the pictures.
+    the pose of the last by its photo alone.
 
     Parameters
     ----------
@@ -104,8 +103,6 @@ def photo_times(given: BenchmarkData, *, composites: int = 12, frames: int = 40)
     yield "photos of 2 megapixels beside six clicks: medians", table
     clips = list(_clips(given, frames)) if frames else []
     yield "frame by frame, by photos of 640 x 480 px", [_frame_row(clip) for clip in clips]
-    short = list(_clips(given, _SMOOTH_FRAMES)) if frames else []
-    yield "smooth tracks, rms of the rotation", [_smooth_row(given, clip) for clip in short]
 
 
 def _compared(clicks: PhotoClicks) -> Row:
@@ -355,28 +352,6 @@ def _frame_row(clip: _Clip) -> Row:
         "R": float(np.median(errors)),
         "lost": int((np.array(errors) > _LOST_DEG).sum()),
     }
-
-
-def _smooth_row(given: BenchmarkData, clip: _Clip) -> Row:
-    """A smooth track by rough keypoints, and with the pictures: errors and time."""
-    rng, points = np.random.default_rng([given.seed, 9]), clip.model.keypoints.xyz
-    own = Model(points_3d=points, mesh=clip.mesh, stretch="none", symmetry=clip.model.symmetry)
-    sigma, row = _CLICK_SHARE * _CAMERA.width, Row(model=clip.model.category)
-    seen = []
-    for truth in clip.truths:
-        kept = np.sort(rng.permutation(len(points))[: max(len(points) // 2, 3)])
-        places = _CAMERA.project(truth.apply(points[kept]))
-        seen.append((places + rng.normal(0, sigma, places.shape), kept.tolist()))
-    for name, pictures in (("keypoints", [None] * len(seen)), ("with pictures", clip.pictures)):
-        views = [
-            View(_CAMERA, pixels, ids=ids, sigma=sigma, image=picture, time=number / _RATE)
-            for number, ((pixels, ids), picture) in enumerate(zip(seen, pictures, strict=True))
-        ]
-        _, busy, result = section.clocked(partial(align, own, views, motion="smooth"))
-        errors = [clip.error(k, view.alignment) for k, view in enumerate(result.views)]
-        row[name] = float(np.sqrt(np.mean(np.square(errors))))
-        row[f"s a frame, {name}"] = busy / len(seen)
-    return row
 
 
 def _hidden(

@@ -14,10 +14,9 @@ from cadalign.cli import main
 
 PATHS = (
     *("demo", "fit", "observe", "annotate", "retrieve", "report", "export", "render", "doctor"),
-    "track",
     *("library build", "library show", "shape learn", "shape show"),
     *("evaluate keypointnet", "evaluate unseen", "evaluate photos"),
-    *("evaluate tracks", "evaluate correspondences", "evaluate retrieval", "evaluate show"),
+    *("evaluate correspondences", "evaluate retrieval", "evaluate show"),
     *("simulate noise", "simulate points", "simulate outliers", "simulate runtime"),
 )
 

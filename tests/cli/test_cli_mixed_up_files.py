@@ -137,12 +137,6 @@ def test_another_name_of_the_photo_is_said(
     assert "found.json calls the photo elsewhere.jpg; its keypoints count for photo.png" in said
 
 
-def test_folder_without_tracks_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "empty").mkdir()
-    line = refusal_line(capsys, "track", "empty")
-    assert line.startswith("empty: the folder has no car_tracks.json; give a file")
-
-
 def test_unknown_field_is_answered_by_fields(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,7 +16,7 @@ from support.refusals import refusal_line
 
 from cadalign import Alignment, Camera, FocalPrior, Result, fit
 from cadalign.cli import main
-from cadalign.cli.observe import _slugs
+from cadalign.cli.observe import _names
 from cadalign.datasets import ModelKeypoint, ModelKeypoints
 from cadalign.evaluation.simulation import Problem, random_rotation
 from cadalign.io.observation import Observation
@@ -375,35 +375,6 @@ def test_malformed_mask_is_refused(masked: Path, capsys: pytest.CaptureFixture[s
     )
 
 
-def test_the_photos_of_a_track_are_views_of_one_observation(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """One stretch, and a pose for each photo; keypoints of other tracks are other observations."""
-    rng = np.random.default_rng(7)
-    lines = ["image,track,name,u,v"]
-    poses = [Alignment(random_rotation(rng), [0.1, -0.2, 4.0], ALIGNMENT.scale) for _ in range(3)]
-    for number, (track, pose) in enumerate(zip(("1", "1", "car b"), poses, strict=True)):
-        pixels = TRUE.project(pose.apply(POINTS_3D)) + rng.normal(scale=0.3, size=(24, 2))
-        rows = zip(NAMES, pixels, strict=True)
-        lines += [f"{number}.jpg,{track},{name},{u},{v}" for name, (u, v) in rows]
-    (folder / "found.csv").write_text("\n".join(lines))
-    (folder / "camera.json").write_text(json.dumps(TRUE.to_dict()))
-    command = observing(folder, "--every", "--tracks", "--camera", str(folder / "camera.json"))
-    command[1] = str(folder / "found.csv")
-    assert main(command) == 0
-    out = folder / "found_observations"
-    said = capsys.readouterr()
-    assert ("2 of 2 tracks" in said.out, said.err) == (True, "")
-    assert sorted(path.name for path in out.iterdir()) == ["1.json", "car_b.json"]
-    observation = Observation.load(out / "1.json")
-    assert [len(view.points_2d) for view in observation.views] == [24, 24]
-    assert main(["fit", str(out / "1.json"), "--no-picture"]) == 0
-    result = Result.load(out / "1_fit" / "fit.json")
-    for view, pose in zip(result.views, poses, strict=False):
-        np.testing.assert_allclose(view.alignment.scale, pose.scale, rtol=0.03)
-        np.testing.assert_allclose(view.alignment.rotation, pose.rotation, atol=0.02)
-
-
 def test_observations_of_another_time_in_the_folder_are_named(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -428,13 +399,10 @@ def test_observations_of_another_time_in_the_folder_are_named(
         assert found == ([start + said] if said else [])
 
 
-def test_tracks_are_for_all_objects(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refusal_line(capsys, *observing(folder, "--tracks"))
-    assert "--tracks: given without --every; give both" in line
-
-
 def test_files_of_names_that_read_alike_stay_apart() -> None:
-    assert _slugs(["a", "a", "a_0", "A/b", "a_b"]) == ["a_0", "a_1", "a_0_2", "A_b", "a_b_2"]
+    assert _names(["a.png", "a.jpg", "a_0.png", "A b.png", "a_b.png"]) == [
+        *("a_0", "a_1", "a_0_2", "A_b", "a_b_2")
+    ]
 
 
 def test_what_would_have_no_effect_or_be_no_direction_is_refused(

@@ -316,21 +316,11 @@ def test_csv_of_several_images_gives_an_object_each(tmp_path: Path) -> None:
     assert [(found.image, len(found)) for found in objects] == [("a.jpg", 2), ("b.jpg", 1)]
 
 
-def test_csv_of_several_tracks_gives_an_object_each(tmp_path: Path) -> None:
-    text = "image,track,name,u,v\na.jpg,1,nose,1,2\na.jpg,2,nose,3,4\nb.jpg,1,nose,5,6\n"
-    objects = read(tmp_path, text, "keypoints.csv")
-    assert [(found.image, found.track) for found in objects] == [
-        ("a.jpg", "1"),
-        ("a.jpg", "2"),
-        ("b.jpg", "1"),
-    ]
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
         ("", "{path}, line 1: the column 'u' is missing; the first line names the columns, "),
-        ("1,2\n3,4\n", "{path}, line 1: unknown column '1'; known are u, v, image, track, "),
+        ("1,2\n3,4\n", "{path}, line 1: unknown column '1'; known are u, v, image, name, "),
         ("name,u\na,1\n", "{path}, line 1: the column 'v' is missing; "),
         ("u,x,v\n", "{path}, line 1: the column 'u' occurs twice"),
         ("u,v,score,visibility\n", "{path}, line 1: give score or visibility, not both"),

@@ -197,34 +197,6 @@ def test_the_mean_car_in_the_true_box_lies_on_the_sample_keypoints(real_data):
     assert sum(photo.image is not None for photo in dataset) == 3
 
 
-def test_tracks_of_cars_are_read_as_keypoints(tmp_path):
-    frame = {
-        "frame": 5,
-        "uv": [[10, 20], [30, 40]],
-        "score": [0.9, 0.05],
-        "bbox": [0, 0, 50, 50],
-        "location_bottom_centre": [1, 2, 20],
-        "rotation_y": 0.1,
-    }
-    track = {"sequence": 3, "track": 7, "K": [[700, 0, 600], [0, 700, 170], [0, 0, 1]]}
-    table = {
-        "names": ["left wheel", "right wheel"],
-        "model_xyz": [[1, 0, 0], [-1, 0, 0]],
-        "tracks": [{**track, "dims_hwl": [1.5, 1.6, 4.0], "frames": [frame]}],
-    }
-    write_json(tmp_path / "car_tracks.json", table)
-    (found,) = cadalign.datasets.read_image_keypoints(tmp_path)
-    assert (found.image, found.track) == ("0003/000005.png", "7")
-    assert found.names == ("left wheel", "right wheel")
-    assert found.points_2d.tolist() == [[10, 20], [30, 40]]
-    assert found.scores.tolist() == [0.9, 0.05]
-    assert (found.camera.fx, found.camera.cy, found.camera.width) == (700, 170, 1242)
-    frame["uv"] = "none"
-    write_json(tmp_path / "car_tracks.json", table)
-    with pytest.raises(DataError, match=r"car_tracks\.json: tracks\[0\]\.frames\[0\]\.uv"):
-        cadalign.datasets.read_image_keypoints(tmp_path / "car_tracks.json")
-
-
 def test_angles_beyond_all_turns_give_a_box() -> None:
     dims, place = np.array([1.5, 1.7, 4.2]), np.array([1.0, 1.6, 20.0])
     whole = car_box(dims, place, 0.3 + 4 * np.pi)

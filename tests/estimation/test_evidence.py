@@ -185,7 +185,7 @@ class TestDepthImage:
         assert np.allclose(result.alignment.scale, truth.scale, rtol=0.01)
         in_millimetres = seen(points, truth, np.eye(4), depth=str(path))
         assert np.isclose(np.nanmax(in_millimetres.depth_image), 18.0)
-        assert np.nanmax(replace(view, time=1.0).depth_image) == np.nanmax(view.depth_image)
+        assert np.nanmax(replace(view, sigma=2.0).depth_image) == np.nanmax(view.depth_image)
 
     def test_what_hides_keypoints_does_not_harm(self) -> None:
         points, truth, rng = keypoints(12), truth_of(), np.random.default_rng(0)

@@ -17,7 +17,6 @@ from cadalign import (
     Model,
     Result,
     ShapeModel,
-    Tracker,
     View,
     align,
     load_mesh,
@@ -81,10 +80,6 @@ GIVEN: list[tuple[Callable[..., Any], str]] = [
     (
         lambda: Result.from_json(None),  # type: ignore[arg-type]
         "result: not valid JSON: the JSON object must be str, bytes or bytearray, not NoneType",
-    ),
-    (
-        lambda: Tracker(MODEL).update(VIEW.points_2d),  # type: ignore[arg-type]
-        "view: expected a cadalign.View, got ndarray",
     ),
     (
         lambda: ShapeModel.learn("chairs"),  # type: ignore[arg-type]

@@ -21,7 +21,6 @@ from cadalign import (
     RansacOptions,
     Result,
     ShapeModel,
-    Tracker,
     View,
     align,
     fit,
@@ -416,61 +415,8 @@ class TestPictures:
         assert found.alignment.scale == pytest.approx(truth.scale, abs=4 * max(found.std.scale))
 
 
-class TestTracks:
-    """A smooth motion past a fisheye, from one side of it to the other."""
-
-    TIMES = np.arange(20) / 10
-
-    def seen(self, *, moves: bool = False) -> tuple[ShapeModel, list[View], list[Alignment]]:
-        """Views of a box that passes beside the camera, which stands still or rolls."""
-        rng = np.random.default_rng(5)
-        shape = ShapeModel.from_basis(CORNERS, [CORNERS * [0, 1, 0]], [0.1], ids=range(8))
-        views, truths = [], []
-        for time in self.TIMES.tolist():
-            turn = rotation_from_vector([0.3, 0.4 * time, -0.2])
-            truth = Alignment(turn, [6 - 2 * time, 1.0, 2 * time - 1.5], np.ones(3))
-            rig = np.eye(4)
-            if moves:
-                rig[:3, :3] = rotation_from_vector([0.0, 0.0, 0.5 * time])
-            in_camera = truth.apply(CORNERS) @ rig[:3, :3].T
-            pixels = FISHEYE.project(in_camera) + rng.normal(size=(8, 2))
-            own = {"cam_from_rig": rig} if moves else {}
-            views.append(View(FISHEYE, pixels, ids=range(8), time=time, **own))
-            truths.append(
-                Alignment(rig[:3, :3] @ turn, rig[:3, :3] @ truth.translation, np.ones(3))
-            )
-        return shape, views, truths
-
-    @pytest.mark.parametrize("moves", [False, True])
-    def test_beside_the_camera(self, moves: bool) -> None:
-        shape, views, truths = self.seen(moves=moves)
-        smooth = align(shape, views, motion="smooth")
-        alone = align(shape, [replace(view, cam_from_rig=None) for view in views])
-        errors = [
-            [degrees_off(replace(each, views=(view,)), truth) for view, truth in pairs]
-            for each in (smooth, alone)
-            for pairs in [zip(each.views, truths, strict=True)]
-        ]
-        assert np.median(errors[0]) < 0.8 * np.median(errors[1])
-        assert smooth.camera == FISHEYE
-        # The trajectory is in the frame of the views that stand still, or of the rig.
-        path = smooth.trajectory
-        assert path is not None
-        middle = path.at(self.TIMES[10])
-        place = np.linalg.norm([4.0, 1.0, 0.5])
-        assert middle.alignment.translation / place == pytest.approx(
-            np.array([4.0, 1.0, 0.5]) / place, abs=0.15
-        )
-        turn = middle.alignment.rotation @ rotation_from_vector([0.3, 0.4, -0.2]).T
-        off = vector_from_rotation(turn)
-        assert off @ np.linalg.solve(middle.covariance[:3, :3], off) < chi2.ppf(0.999, 3)
-
-
-def test_a_tracker_and_the_annotator_take_no_wide_lens(tmp_path) -> None:
+def test_the_annotator_takes_no_wide_lens(tmp_path) -> None:
     fix = "undistort the photo, or crop it to a pinhole's view"
-    shape, views, _ = TestTracks().seen()
-    with pytest.raises(InputError, match=rf"^camera.lens: a tracker takes no fisheye lens; {fix}$"):
-        Tracker(shape).update(views[0])
     Image.new("RGB", (1000, 1000)).save(tmp_path / "photo.png")
     with pytest.raises(DataError, match=rf"photo.png.*: the annotator takes no fov lens; {fix}$"):
         intrinsics_of(PhotoFile.open(tmp_path / "photo.png"), FOV)

@@ -35,7 +35,6 @@ def test_every_experiment_has_a_specification_with_its_name() -> None:
         "retrieval",
         "unseen",
         "photos",
-        "tracks",
     ]
     for options in known_options():
         spec = spec_named(options.experiment)

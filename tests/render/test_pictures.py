@@ -1,16 +1,14 @@
-"""Plain pictures, sheets, movies and silhouettes: they show what they say."""
+"""Plain pictures, sheets and silhouettes: they show what they say."""
 
 from __future__ import annotations
 
-import av
 import cv2
 import numpy as np
 import pytest
 import trimesh
-from PIL import Image
 
 from cadalign import Alignment, Camera, Mesh
-from cadalign.errors import DataError, InputError, RenderError
+from cadalign.errors import InputError
 from cadalign.render import (
     Angles,
     Scene,
@@ -27,8 +25,6 @@ from cadalign.render import (
     normal_picture,
     pose_in_view,
     silhouette_iou,
-    turntable,
-    write_movie,
 )
 
 CAMERA = Camera.from_fov(160, 120, fov_x=50)
@@ -163,22 +159,6 @@ def test_named_views_look_from_where_they_say(name, axis, sign):
     assert np.sign(eye[axis]) == sign
 
 
-def test_a_turntable_keeps_a_lopsided_model_in_the_picture():
-    box = _box().mesh
-    scene = Scene(Mesh(box.vertices * (0.2, 0.5, 1.5) + (0.7, -2, 3), box.faces))
-    poses = list(turntable(scene, CAMERA, Angles(10, 20), count=12, scale=(1, 2, 0.5)))
-    assert len(poses) == 12
-    turned = poses[3].rotation @ poses[0].rotation.T
-    assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) == pytest.approx(90)
-    for pose in poses:
-        mask = cast_geometry(scene, CAMERA, pose).mask
-        assert mask.sum() > 400
-        assert not mask[[0, -1]].any()
-        assert not mask[:, [0, -1]].any()
-        middle = pose.apply([scene.bounds.mean(axis=0)])
-        np.testing.assert_allclose(CAMERA.project(middle), [[79.5, 59.5]], atol=1e-6)
-
-
 def test_a_contact_sheet_holds_every_picture_and_refuses_odd_ones():
     images = [np.full((30, 40, 3), value, np.uint8) for value in (10, 90, 170)]
     sheet = contact_sheet(images, ["a", "b", "c"])
@@ -188,69 +168,6 @@ def test_a_contact_sheet_holds_every_picture_and_refuses_odd_ones():
         contact_sheet([images[0], images[1][1:]], ["a", "b"])
     with pytest.raises(InputError, match="labels"):
         contact_sheet(images, ["a"])
-
-
-def test_a_movie_can_be_read_again(tmp_path):
-    frames = [np.full((61, 81, 3), (200, 20 * n, 0), np.uint8) for n in range(8)]
-    assert write_movie(tmp_path / "m.mp4", iter(frames), fps=25) == 8
-    video = cv2.VideoCapture(str(tmp_path / "m.mp4"))
-    read = []
-    while True:
-        ok, image = video.read()
-        if not ok:
-            break
-        read.append(image)
-    assert [image.shape for image in read] == [(62, 82, 3)] * 8
-    # OpenCV's order is blue, green, red.
-    assert np.abs(read[5][30, 40].astype(int) - (0, 100, 200)).max() < 25
-
-
-@pytest.mark.parametrize("ending", [".webm", ".gif"])
-def test_other_movies_can_be_read_again(tmp_path, ending):
-    frames = [np.full((61, 81, 3), (200, 20 * n, 0), np.uint8) for n in range(8)]
-    path = tmp_path / f"m{ending}"
-    assert write_movie(path, iter(frames), fps=25) == 8
-    if ending == ".gif":
-        with Image.open(path) as movie:
-            assert movie.n_frames == 8
-            assert movie.info["duration"] == 40
-            movie.seek(5)
-            assert (
-                np.abs(np.asarray(movie.convert("RGB"))[30, 40].astype(int) - (200, 100, 0)).max()
-                < 25
-            )
-    else:
-        with av.open(str(path)) as movie:
-            read = [frame.to_ndarray(format="rgb24") for frame in movie.decode(video=0)]
-        assert len(read) == 8
-        assert np.abs(read[5][30, 40].astype(int) - (200, 100, 0)).max() < 25
-
-
-def test_mp4_is_h264(tmp_path):
-    write_movie(tmp_path / "m.mp4", [np.zeros((60, 80, 3), np.uint8)] * 3, fps=30)
-    with av.open(str(tmp_path / "m.mp4")) as movie:
-        stream = movie.streams.video[0]
-        assert stream.codec_context.name == "h264"
-        assert stream.codec_context.pix_fmt == "yuv420p"
-
-
-def test_other_endings_are_refused(tmp_path):
-    with pytest.raises(InputError, match="is no movie"):
-        write_movie(tmp_path / "m.avi", [], fps=30)
-
-
-def test_a_movie_that_cannot_be_made_leaves_no_file(tmp_path, monkeypatch):
-    frame = np.zeros((20, 30, 3), np.uint8)
-    with pytest.raises(InputError, match="no frames are given"):
-        write_movie(tmp_path / "m.mp4", [], fps=25)
-    with pytest.raises(InputError, match="frame 1 is"):
-        write_movie(tmp_path / "m.mp4", [frame, frame[1:]], fps=25)
-    with pytest.raises(DataError, match="cannot be written"):
-        write_movie(tmp_path / "no" / "m.mp4", [frame], fps=25)
-    monkeypatch.setattr("cadalign.render.drawing.movie._CODECS", ())
-    with pytest.raises(RenderError, match="cannot encode video"):
-        write_movie(tmp_path / "m.mp4", [frame], fps=25)
-    assert not list(tmp_path.iterdir())
 
 
 def test_silhouette_iou_of_known_masks():

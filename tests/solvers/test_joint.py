@@ -96,7 +96,7 @@ def evidence_of(
 
 def gradient_of(evidence: Evidence, state: State, *, integrates: bool = False) -> np.ndarray:
     system = Joint(evidence, integrates)
-    room = joint_room(system.evidence, 6, 0)
+    room = joint_room(system.evidence)
     assert evaluate(system, packed(state), room) < np.inf
     return room.gradient
 
@@ -107,7 +107,7 @@ def cost_of(evidence: Evidence, state: State, *, integrates: bool = False) -> fl
 
 def moved(evidence: Evidence, state: State, step: np.ndarray) -> State:
     system = Joint(evidence, False)
-    row, room = packed(state), joint_room(system.evidence, 6, 0)
+    row, room = packed(state), joint_room(system.evidence)
     evaluate(system, row, room)
     there = row.copy()
     move(system, row, room, 0.0, step, there)
@@ -211,10 +211,10 @@ def test_the_gradient_of_the_integrated_objective_is_that_of_the_cost(
 def shifts_of(evidence: Evidence, state: State) -> np.ndarray:
     """The change of the gradient by the prior means that the log determinant moves."""
     system = Joint(evidence, True)
-    room = joint_room(system.evidence, 6, 0)
+    room = joint_room(system.evidence)
     evaluate(system, packed(state), room)
     shifted = room.rows[-4].copy()
-    plain = joint_room(evidence, 6, 0)
+    plain = joint_room(evidence)
     evaluate(Joint(evidence, False), packed(state), plain)
     return np.asarray(room.rows[:-4] @ (shifted - plain.rows[-4]))
 

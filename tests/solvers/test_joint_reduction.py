@@ -106,7 +106,7 @@ def test_a_minimum_is_one_of_all_modes(evidence: Evidence, rank: int) -> None:
     state, score = best_of(evidence, rank)
     cost, information = information_of(evidence, state)
     system = Joint(evidence, True)
-    room = joint_room(system.evidence, 6, 0)
+    room = joint_room(system.evidence)
     evaluate(system, packed(state), room)
     slope = np.linalg.solve(information, room.gradient)
     assert room.gradient @ slope < 1e-9 * max(cost, 1.0)

@@ -192,7 +192,7 @@ class _Search(NamedTuple):
     def of(cls, minima: Sequence[Minimum], keypoints: int, choice: SurfaceChoice) -> _Search:
         """The search from the likely ones of minima."""
         first = minima[0]
-        is_open = first.track is None and not _is_determined(first)
+        is_open = not _is_determined(first)
         likely = [each for each in minima if is_open or each.score < first.score + _UNLIKELY]
         starts = [(each, each.state) for each in likely]
         most = _MOST_OPEN_STARTS if is_open else _MOST_STARTS
@@ -207,7 +207,7 @@ class _Search(NamedTuple):
             return self._by_outline(contours), contours
         surfaces, convex = self.choice
         best = self._explored(contours, surfaces)
-        if not convex and not self.is_open and self.first.track is None:
+        if not convex and not self.is_open:
             agrees = bool(best) and _misfit(best[0].settled) <= _AGREEING
             if not agrees or best[0].masked.surface.is_exact:
                 others = _displaced(self.first, _POORLY_KNOWN if agrees else _WELL_KNOWN)

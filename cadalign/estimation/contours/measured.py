@@ -52,9 +52,6 @@ class Measured(NamedTuple):
 class Place(NamedTuple):
     """A state of the evidence, and the coefficients (V, 3) of the contours' own modes.
 
-    One row (1, 3) is that of all contours, as the pictures of a video have: rows of their own for
-    each make a fit take time with the square of their number.
-
     Steps change the directions and the logarithms of the distances of objects: where the size is
     hardly known, distance and stretch rise by one factor, which is no straight line otherwise.
     """
@@ -66,10 +63,6 @@ class Place(NamedTuple):
     def of(cls, state: State, contours: int = 0) -> Place:
         """The place of a state, nothing known of the contours' own modes."""
         return cls(state, np.zeros((contours, OWN_MODES)))
-
-    def own_of(self, contours: int) -> FloatArray:
-        """Coefficients (contours, 3) of each contour."""
-        return np.broadcast_to(self.own, (contours, OWN_MODES))
 
     def towards(self, other: Place, share: float) -> Place:
         """The place a share of the way to another one."""
@@ -252,14 +245,8 @@ def solved(information: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def weakest_steps(information: FloatArray, count: int) -> list[FloatArray]:
-    """Steps (U,) of one standard deviation along the directions of which least is known.
-
-    Unknowns of which nothing is known, poses of a track's frames without evidence, stay.
-    """
-    known = np.flatnonzero(information.diagonal() > 0)
-    matrix, sizes = scaled_information(information[np.ix_(known, known)])
+    """Steps (U,) of one standard deviation along the directions of which least is known."""
+    matrix, sizes = scaled_information(information)
     values, vectors = np.linalg.eigh(matrix)
     roots = np.sqrt(np.maximum(values[:count], _LEAST_INFORMATION))
-    steps = np.zeros((len(roots), len(information)))
-    steps[:, known] = (vectors[:, :count] / roots / sizes[:, None]).T
-    return list(steps)
+    return list((vectors[:, :count] / roots / sizes[:, None]).T)

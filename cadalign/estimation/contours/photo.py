@@ -121,10 +121,9 @@ class _Candidate(NamedTuple):
     def supports(self) -> list[OutlineSupport]:
         """OutlineSupport of the outline by each photo."""
         is_exact, outlines = self.pictured.surface.is_exact, self.reached.outlines
-        own_rows = self.reached.place.own_of(len(outlines))
         return [
             _support_of(outline, own, is_exact=is_exact)
-            for outline, own in zip(outlines, own_rows, strict=True)
+            for outline, own in zip(outlines, self.reached.place.own, strict=True)
         ]
 
     @property
@@ -207,8 +206,7 @@ def _explored(
     for start, state in _starts(minima):
         evidence, state = with_displacement_modes(start.evidence, state)
         pictured = Pictured(evidence, keypoints, list(photos), surface)
-        own_rows = len(photos) if start.track is None else 1  # a video's are displaced alike
-        reached = approach(pictured, Approach(Place.of(state, own_rows)))
+        reached = approach(pictured, Approach(Place.of(state, len(photos))))
         if reached is not None:
             near.append(_Candidate(start, pictured, reached))
     finished = []
@@ -233,13 +231,8 @@ def _distinct(candidates: list[_Candidate]) -> list[_Candidate]:
 
 
 def _starts(minima: Sequence[Minimum]) -> list[tuple[Minimum, State]]:
-    """The likely minima, and states beside the best one where its pose is known least.
-
-    A track is known by all of its frames.
-    """
+    """The likely minima, and states beside the best one where its pose is known least."""
     best = minima[0]
-    if best.track is not None:
-        return [(best, best.state)]
     first = minima[:_MOST_MINIMA]
     starts = [(each, each.state) for each in first if each.score <= best.score + _UNLIKELY]
     _, information = information_of(*reduced(best.evidence, best.state))

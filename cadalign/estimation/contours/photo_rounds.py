@@ -105,8 +105,7 @@ def finish(pictured: Pictured, start: Approach) -> Approach | None:
             return None
         if number and here.is_close(_FINE[-1]):
             break
-        own_rows = here.place.own_of(len(here.outlines))
-        noises = [*map(noise_of_lines, here.outlines, own_rows)]
+        noises = [*map(noise_of_lines, here.outlines, here.place.own)]
         here = _round(pictured, here.place, _FINE[-1], noises)
     return None if here is None else _widened(pictured, here, noises)
 
@@ -133,12 +132,11 @@ def _round(
     if not rows:
         return None
     shown = np.array([outline is not None for outline in outlines])
-    used = shown if len(place.own) == len(shown) else slice(None)  # all have one row in common
-    refined = pictured.joined(place._replace(own=place.own[used]), rows).refined(_ITERATIONS)
+    refined = pictured.joined(place._replace(own=place.own[shown]), rows).refined(_ITERATIONS)
     if refined is None:
         return None
     own, (_, joined) = np.zeros_like(place.own), refined
-    own[used] = joined.place.own
+    own[shown] = joined.place.own
     there = Place(joined.place.state, own)
     return Approach(there, tuple(outlines), joined, _step(pictured, outlines, rows, there.state))
 

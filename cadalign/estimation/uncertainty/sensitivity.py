@@ -122,9 +122,6 @@ def sensitivity_of(result: ResultData, *, exact: bool, view: int) -> Sensitivity
     if not exact:
         what = "only keypoints of one view of an exact model have a Gauss-Newton sensitivity"
         raise InputError(what, where="exact", fix="leave it at True")
-    if result.trajectory is not None:
-        what = "an estimate with a motion has no sensitivity"
-        raise InputError(what, where="sensitivity", fix="align its frames without `motion`")
     if not any(len(each.ids) for each in result.views):
         what = "an estimate without keypoints has no derivatives by them"
         raise InputError(what, where="sensitivity", fix="align with keypoints")

@@ -200,31 +200,6 @@ KEYPOINTS_IN_95 = rate("keypoints_within_95", "keypoints within 95 %", "95%", **
 COVERED = rate("covered", "truths within the region", **_COVERED)
 NOMINAL = rate("nominal", "stated probability of a region", **_COVERED)
 
-# Of videos: see `cadalign.evaluation.metrics.errors`.
-FOUND_FRAMES = rate("found", "frames with a pose", "found%")
-ABSOLUTE_ROTATION = _like(
-    ROTATION, "absolute_rotation_deg", "absolute pose error, rotation", "APE, rotation", "APE R"
-)
-ABSOLUTE_TRANSLATION = replace(
-    TRANSLATION_IN_UNITS,
-    key="absolute_translation",
-    label="absolute pose error, translation",
-    head="APE, translation",
-    symbol="APE t",
-)
-RELATIVE_ROTATION = _like(
-    ROTATION, "relative_rotation_deg", "relative pose error, rotation", "RPE, rotation", "RPE R"
-)
-RELATIVE_TRANSLATION = _like(
-    ABSOLUTE_TRANSLATION,
-    "relative_translation",
-    "relative pose error, translation",
-    "RPE, translation",
-    "RPE t",
-)
-JITTER = _like(ROTATION, "jitter_deg", "jitter of the rotation", "jitter", "jitter")
-FLIPS = Metric("flips", "flipped frames", digits=1, symbol="flips", log=False)
-
 # What tasks are grouped by.
 CATEGORY = Metric("category", "category", better=None)
 QUERIES = replace(CATEGORY, label="queries", head="queries")

@@ -85,12 +85,6 @@ class RunFolder:
         if not self.config_file.exists() and any(each.name[0] != "." for each in found):
             raise DataError("holds files that are no run's", where=str(self.path), fix=_FIX_FOREIGN)
 
-    def refuse_run(self) -> None:
-        """Raise a DataError for the folder of a run, whose table would be written over."""
-        if self.config_file.exists():
-            what = f"holds a run, whose {self.results.name} would be written over"
-            raise DataError(what, where=str(self.path), fix="give another --out")
-
     def refuse_others(self, *names: str) -> None:
         """Raise a DataError for a file of these names that no run has written."""
         for name in () if self.config_file.exists() else names:

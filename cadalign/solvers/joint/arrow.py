@@ -1,9 +1,7 @@
-"""Normal equations of successive poses that share a border, factorized in linear time.
+"""Normal equations of poses that share a border, factorized in linear time.
 
-The unknowns are s for each of P poses, and b that all share. A pose has products with the border
-and, where motion links successive poses, with the next one, so that eliminating one after the other
-fills nothing in. The inverse has the blocks of that pattern from the last pose to the first
-(Takahashi, Fagan, Chen, "Formation of a sparse bus impedance matrix", 1973).
+The unknowns are 6 for each of P poses, and b that all share. A pose has products with itself and
+with the border alone, so that eliminating one after the other fills nothing in.
 """
 
 from __future__ import annotations
@@ -29,9 +27,8 @@ _LEAST_SHARE = 1e-12  # of an unknown's information that the others must leave
 class Arrow(NamedTuple):
     """A symmetric matrix and a right side.
 
-    ``blocks`` (P, s, s) are those of each pose, whose first 6 unknowns move it; ``coupling``
-    (P, s, n + b) its products with the next one and with the border, where n is s or, without
-    motion, 0; ``border`` (b, b) is the rest. The ``gradient`` (s P + b,) is the right side.
+    ``blocks`` (P, 6, 6) are those of each pose, ``coupling`` (P, 6, b) its products with the
+    border, and ``border`` (b, b) is the rest. The ``gradient`` (6 P + b,) is the right side.
     """
 
     blocks: FloatArray
@@ -41,20 +38,14 @@ class Arrow(NamedTuple):
 
 
 @kernel
-def empty_arrow(poses: int, size: int, ahead: int, border: int) -> Arrow:
-    """Room for poses of a ``size``, of which ``ahead`` have products with the pose before."""
+def empty_arrow(poses: int, border: int) -> Arrow:
+    """Room for poses and a border."""
     return Arrow(
-        np.zeros((poses, size, size)),
-        np.zeros((poses, size, ahead + border)),
+        np.zeros((poses, 6, 6)),
+        np.zeros((poses, 6, border)),
         np.zeros((border, border)),
-        np.zeros(size * poses + border),
+        np.zeros(6 * poses + border),
     )
-
-
-@inlined
-def ahead_of(arrow: Arrow) -> int:
-    """Place of the border in the coupling: the number n of a next pose's unknowns."""
-    return int(arrow.coupling.shape[2] - arrow.border.shape[0])
 
 
 @inlined
@@ -81,17 +72,14 @@ def copy_matrix(source: Arrow, target: Arrow) -> None:
 
 def dense_matrix(arrow: Arrow) -> FloatArray:
     """All entries (U, U), the border last."""
-    (poses, size, width), border = arrow.coupling.shape, len(arrow.border)
-    last, ahead = size * poses, width - border
+    poses, size, border = arrow.coupling.shape
+    last = size * poses
     whole = np.zeros((last + border, last + border))
     for p in range(poses):
-        own, following = slice(size * p, size * (p + 1)), slice(size * (p + 1), size * (p + 2))
+        own = slice(size * p, size * (p + 1))
         whole[own, own] = arrow.blocks[p]
-        whole[own, last:] = arrow.coupling[p, :, ahead:]
-        whole[last:, own] = arrow.coupling[p, :, ahead:].T
-        if ahead and p < poses - 1:
-            whole[own, following] = arrow.coupling[p, :, :ahead]
-            whole[following, own] = arrow.coupling[p, :, :ahead].T
+        whole[own, last:] = arrow.coupling[p]
+        whole[last:, own] = arrow.coupling[p].T
     whole[last:, last:] = arrow.border
     return whole
 
@@ -99,7 +87,7 @@ def dense_matrix(arrow: Arrow) -> FloatArray:
 @kernel
 def add_row(arrow: Arrow, pose: int, row: FloatArray, value: float) -> None:
     """Add an equation ``row . step = -value`` about one pose and the border, (6 + b,)."""
-    first, own, ahead = border_start(arrow), arrow.blocks.shape[1] * pose, ahead_of(arrow)
+    first, own = border_start(arrow), arrow.blocks.shape[1] * pose
     for k in range(row.shape[0]):
         slope = row[k]
         if slope == 0.0:
@@ -109,7 +97,7 @@ def add_row(arrow: Arrow, pose: int, row: FloatArray, value: float) -> None:
             for m in range(6):
                 arrow.blocks[pose, k, m] += slope * row[m]
             for m in range(arrow.border.shape[0]):
-                arrow.coupling[pose, k, ahead + m] += slope * row[6 + m]
+                arrow.coupling[pose, k, m] += slope * row[6 + m]
         else:
             arrow.gradient[first + k - 6] += slope * value
             for m in range(arrow.border.shape[0]):
@@ -131,7 +119,7 @@ def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: 
     Row 6 + b holds the residuals; ``products`` (6 + b + 1, 6 + b + 1) is scratch space.
     """
     unknowns = 6 + arrow.border.shape[0]
-    first, own, ahead = border_start(arrow), arrow.blocks.shape[1] * pose, ahead_of(arrow)
+    first, own = border_start(arrow), arrow.blocks.shape[1] * pose
     matrix, right = products[:unknowns, :unknowns], products[unknowns, :unknowns]
     products[:] = 0.0
     add_products(rows, columns, matrix, right)
@@ -141,7 +129,7 @@ def add_rows(arrow: Arrow, pose: int, rows: FloatArray, columns: int, products: 
         for m in range(6):
             arrow.blocks[pose, k, m] += matrix[k, m]
         for m in range(unknowns - 6):
-            arrow.coupling[pose, k, ahead + m] += matrix[k, 6 + m]
+            arrow.coupling[pose, k, m] += matrix[k, 6 + m]
     for k in range(unknowns - 6):
         arrow.gradient[first + k] += right[6 + k]
         for m in range(unknowns - 6):
@@ -154,7 +142,7 @@ def hold(arrow: Arrow, k: int) -> None:
     arrow.gradient[border_start(arrow) + k] = 0.0
     for p in range(arrow.blocks.shape[0]):
         for m in range(arrow.blocks.shape[1]):
-            arrow.coupling[p, m, ahead_of(arrow) + k] = 0.0
+            arrow.coupling[p, m, k] = 0.0
     for m in range(arrow.border.shape[0]):
         arrow.border[k, m] = arrow.border[m, k] = 0.0
     arrow.border[k, k] = 1.0
@@ -182,48 +170,38 @@ def factorize_arrow(arrow: Arrow) -> bool:
 
     Returns False where it is not positive definite. The gradient stays.
     """
-    poses, size, width = arrow.coupling.shape
-    border, ahead = arrow.border.shape[0], ahead_of(arrow)
+    poses, size, border = arrow.coupling.shape
     for p in range(poses):
-        block, coupling, linked = arrow.blocks[p], arrow.coupling[p], _next_of(arrow, p)
+        block, coupling = arrow.blocks[p], arrow.coupling[p]
         if not factorize(block):
             return False
         for k in range(size):
             row = coupling[k]
             for j in range(k):
                 share, above = block[k, j], coupling[j]
-                for m in range(ahead - linked, width):
+                for m in range(border):
                     row[m] -= share * above[m]
             inverse = 1.0 / block[k, k]
-            for m in range(ahead - linked, width):
+            for m in range(border):
                 row[m] *= inverse
         for k in range(size):
-            own, shared = coupling[k, :ahead], coupling[k, ahead:]
+            shared = coupling[k]
             for m in range(border):
                 target, share = arrow.border[m], shared[m]
                 for j in range(m + 1):
                     target[j] -= share * shared[j]
-            for m in range(linked):
-                next_row, share = arrow.blocks[p + 1, m], own[m]
-                for j in range(m + 1):
-                    next_row[j] -= share * own[j]
-                next_row = arrow.coupling[p + 1, m, ahead:]
-                for j in range(border):
-                    next_row[j] -= share * shared[j]
     return factorize(arrow.border)
 
 
 @fast_sums
 def solve_arrow(factor: Arrow, gradient: FloatArray, step: FloatArray) -> None:
     """Write the solution of ``matrix @ step = -gradient`` with the factor of the matrix."""
-    poses, size, _ = factor.coupling.shape
-    border, ahead = factor.border.shape[0], ahead_of(factor)
+    poses, size, border = factor.coupling.shape
     for k in range(step.shape[0]):
         step[k] = -gradient[k]
     shared = step[size * poses :]
     for p in range(poses):
-        block, own, linked = factor.blocks[p], step[size * p : size * (p + 1)], _next_of(factor, p)
-        following = step[size * (p + 1) : size * (p + 1) + linked]
+        block, own = factor.blocks[p], step[size * p : size * (p + 1)]
         for k in range(size):
             row = block[k]
             for j in range(k):
@@ -231,32 +209,21 @@ def solve_arrow(factor: Arrow, gradient: FloatArray, step: FloatArray) -> None:
             own[k] /= row[k]
         for k in range(size):
             row, value = factor.coupling[p, k], own[k]
-            for m in range(linked):
-                following[m] -= row[m] * value
             for m in range(border):
-                shared[m] -= row[ahead + m] * value
+                shared[m] -= row[m] * value
     solve_factor(factor.border, shared)
     for p in range(poses - 1, -1, -1):
-        block, own, linked = factor.blocks[p], step[size * p : size * (p + 1)], _next_of(factor, p)
-        following = step[size * (p + 1) : size * (p + 1) + linked]
+        block, own = factor.blocks[p], step[size * p : size * (p + 1)]
         for k in range(size):
             row, total = factor.coupling[p, k], 0.0
-            for m in range(linked):
-                total += row[m] * following[m]
             for m in range(border):
-                total += row[ahead + m] * shared[m]
+                total += row[m] * shared[m]
             own[k] -= total
         for k in range(size - 1, -1, -1):
             own[k] /= block[k, k]
             row, value = block[k], own[k]
             for j in range(k):
                 own[j] -= row[j] * value
-
-
-@inlined
-def _next_of(arrow: Arrow, pose: int) -> int:
-    """Number of the next pose's unknowns that a pose has products with."""
-    return ahead_of(arrow) if pose < arrow.blocks.shape[0] - 1 else 0
 
 
 @kernel
@@ -274,21 +241,14 @@ def log_determinant(factor: Arrow) -> float:
 @kernel
 def invert_arrow(factor: Arrow) -> Arrow:
     """Blocks of the inverse matrix in the same pattern, from its factor; an empty gradient."""
-    poses, size, width = factor.coupling.shape
-    ahead = ahead_of(factor)
-    inverse = empty_arrow(poses, size, ahead, factor.border.shape[0])
+    poses, border = factor.blocks.shape[0], factor.border.shape[0]
+    inverse = empty_arrow(poses, border)
     triangle = invert_factor(factor.border)
     inverse.border[:] = triangle.T @ triangle
-    rest = np.zeros((width, width))  # of the next pose and the border
-    rest[ahead:, ahead:] = inverse.border
-    for p in range(poses - 1, -1, -1):
+    for p in range(poses):
         lower = invert_factor(factor.blocks[p].copy())
-        gain = lower.T @ factor.coupling[p].copy()  # - d(pose) / d(next pose, border)
-        across = gain @ rest
+        gain = lower.T @ factor.coupling[p].copy()  # - d(pose) / d(border)
+        across = gain @ inverse.border
         inverse.coupling[p] = -across
         inverse.blocks[p] = lower.T @ lower + across @ gain.T
-        if ahead > 0:
-            rest[:ahead, :ahead] = inverse.blocks[p]
-            rest[:ahead, ahead:] = inverse.coupling[p, :, ahead:]
-            rest[ahead:, :ahead] = inverse.coupling[p, :, ahead:].T
     return inverse

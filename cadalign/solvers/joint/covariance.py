@@ -52,12 +52,12 @@ def joint_covariance(evidence: Evidence, state: State) -> JointCovariance:
     reduction, row = reduced_row(evidence, state)
     basis = np.ascontiguousarray(reduction.basis[: len(evidence.shape.modes)])
     reduced, sighted = reduction.evidence, sighted_points(evidence)
-    equations = joint_room(reduced, 6, 0)
+    equations = joint_room(reduced)
     evaluate_joint(Joint(reduced, False), row, equations)
     is_determined, inverse = _inverse_of(equations.arrow)
     if not is_determined:
-        return unbounded(evidence, len(inverse.blocks))
-    return covariances_from(evidence, reduced, basis, row, equations, inverse, sighted)
+        return _unbounded(evidence, len(inverse.blocks))
+    return _covariances_from(evidence, reduced, basis, row, equations, inverse, sighted)
 
 
 @kernel
@@ -69,7 +69,7 @@ def _inverse_of(arrow: Arrow) -> tuple[bool, Arrow]:
     return True, invert_arrow(arrow)
 
 
-def unbounded(evidence: Evidence, poses: int) -> JointCovariance:
+def _unbounded(evidence: Evidence, poses: int) -> JointCovariance:
     """Infinite covariances, of what is not determined."""
     size = len(evidence.focals.low) + 3 + len(evidence.shape.modes)
     points = len(evidence.shape.mean)
@@ -83,7 +83,7 @@ def unbounded(evidence: Evidence, poses: int) -> JointCovariance:
 
 
 @kernel
-def covariances_from(
+def _covariances_from(
     evidence: Evidence,
     reduced: Evidence,
     basis: FloatArray,
@@ -258,7 +258,7 @@ def _turn_and_move(evidence: Evidence, state: State, rows: FloatArray) -> FloatA
 
 def information_of(evidence: Evidence, state: State) -> tuple[float, FloatArray]:
     """The cost at a state, and the information (U, U) about all unknowns, border last."""
-    equations = joint_room(evidence, 6, 0)
+    equations = joint_room(evidence)
     cost = evaluate_joint(Joint(evidence, False), packed(state), equations)
     return float(cost), dense_matrix(equations.arrow)
 

@@ -64,8 +64,8 @@ class JointEquations(NamedTuple):
 
 
 @kernel
-def joint_room(evidence: Evidence, size: int, ahead: int) -> JointEquations:
-    """Room for the normal equations; size and number ahead are those of `Arrow`."""
+def joint_room(evidence: Evidence) -> JointEquations:
+    """Room for the normal equations."""
     sightings, rig = evidence.sightings, evidence.rig
     poses, points = rig.pose.max() + 1, evidence.shape.mean.shape[0]
     border = evidence.focals.low.shape[0] + 3 + evidence.shape.modes.shape[0]
@@ -83,11 +83,11 @@ def joint_room(evidence: Evidence, size: int, ahead: int) -> JointEquations:
             columns[i, 1] = counts[0]
     for p in range(poses):
         first[p + 1] += first[p]
-    arrow = empty_arrow(poses, size, ahead, border)
+    arrow = empty_arrow(poses, border)
     return JointEquations(
         arrow,
         arrow.gradient,
-        empty_arrow(poses, size, ahead, border),
+        empty_arrow(poses, border),
         order,
         first,
         columns,

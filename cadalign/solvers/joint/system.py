@@ -77,7 +77,7 @@ def _integrating(system: Joint, integrates: bool) -> Joint:
 @room_of.of(Joint)
 @kernel
 def _room_of(system: Joint) -> tuple[JointEquations, JointEquations]:
-    return joint_room(system.evidence, 6, 0), joint_room(system.evidence, 6, 0)
+    return joint_room(system.evidence), joint_room(system.evidence)
 
 
 @evaluate.of(Joint)
@@ -127,17 +127,17 @@ def evaluate_joint(system: Joint, row: FloatArray, equations: JointEquations) ->
 @cost_at.of(Joint)
 @kernel
 def _cost_at(system: Joint, row: FloatArray) -> float:
-    return evaluate_joint(system, row, joint_room(system.evidence, 6, 0))
+    return evaluate_joint(system, row, joint_room(system.evidence))
 
 
 def joint_cost(system: Joint, row: FloatArray) -> float:
     """The cost at a state; not one kernel, since `evaluate_joint` takes long to compile."""
-    return evaluate_joint(system, row, joint_room(system.evidence, 6, 0))
+    return evaluate_joint(system, row, joint_room(system.evidence))
 
 
 @solve.of(Joint)
 @kernel
-def solve_joint(system: Any, equations: JointEquations, damping: float, step: FloatArray) -> float:
+def _solve(system: Any, equations: JointEquations, damping: float, step: FloatArray) -> float:
     """Write the damped step; see `cadalign.solvers.search.solve`."""
     factor = equations.factor
     copy_matrix(equations.arrow, factor)
@@ -150,7 +150,7 @@ def solve_joint(system: Any, equations: JointEquations, damping: float, step: Fl
 
 @move.of(Joint)
 @kernel
-def move_joint(
+def _move(
     system: Joint,
     row: FloatArray,
     equations: JointEquations,
@@ -189,14 +189,14 @@ def _bounded(log_step: float) -> float:
 @score_of.of(Joint)
 @kernel
 def _score_of(system: Joint, row: FloatArray, cost: float) -> float:
-    equations = joint_room(system.evidence, 6, 0)
+    equations = joint_room(system.evidence)
     cost = evaluate_joint(Joint(system.evidence, False), row, equations)
     return _score_from(system.evidence, row, cost, equations)
 
 
 def joint_score(evidence: Evidence, row: FloatArray) -> float:
     """-2 log of the evidence by Laplace's approximation; infinite where it is not determined."""
-    equations = joint_room(evidence, 6, 0)
+    equations = joint_room(evidence)
     cost = evaluate_joint(Joint(evidence, False), row, equations)
     return _score_from(evidence, row, cost, equations)
 

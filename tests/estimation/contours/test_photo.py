@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import pytest
-from support.timing import Measure, ratio, timed
 
-from cadalign import Alignment, Camera, Mesh, Model, Tracker, View, align
+from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.contours.contour import Sight
 from cadalign.estimation.contours.line_changes import (
@@ -93,18 +92,6 @@ def drawn(
     clicks = CAMERA.project(truth.apply(mesh.vertices))
     noisy = clicks + rng.normal(0, CLICK_PX, clicks.shape)
     return PhotoScene(mesh, truth, pixels, noisy, mask)
-
-
-@cache
-def frames(count: int) -> list[tuple[PhotoScene, np.ndarray]]:
-    """Frames of a clip, and the corners that are clicked in each."""
-    rng = np.random.default_rng(5)
-    axis, found = np.array([0.6, 0.64, 0.48]), []
-    for number in range(count):
-        turn = rotation_from_vector(np.radians(3 * number) * axis)
-        shown = drawn(rng, turn, [0.1 - 0.01 * number, -0.05, 3.0], (1.0, 1.2, 0.9))
-        found.append((shown, np.flatnonzero(rng.random(8) < 0.6)))
-    return found
 
 
 class TestPhoto:
@@ -246,79 +233,6 @@ class TestRefusals:
         shown = scene(0)
         with pytest.raises(InputError, match="no mesh, which a photo needs"):
             shown.aligned(Model(points_3d=shown.mesh.vertices), image=shown.pixels)
-
-
-class TestTrack:
-    """Frames of a smooth motion: three degrees further each, half of the clicks."""
-
-    @staticmethod
-    def views(count: int, *, spoilt: tuple[int, ...] = (), **shown: bool) -> list[View]:
-        views = []
-        for number, (frame, ids) in enumerate(frames(count)):
-            pixels = np.full_like(frame.pixels, 90) if number in spoilt else frame.pixels
-            images = {"image": pixels, "mask": frame.mask}
-            kept = {name: images[name] for name, is_shown in shown.items() if is_shown}
-            clicks, time = frame.clicks[ids], number / 25
-            views.append(View(CAMERA, clicks, ids=ids.tolist(), sigma=CLICK_PX, time=time, **kept))
-        return views
-
-    def test_photos_sharpen_every_frame(self) -> None:
-        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
-        errors = {}
-        for shown in (False, True):
-            result = align(model, self.views(8, image=shown), motion="smooth")
-            poses = [view.alignment for view in result.views]
-            pairs = zip(frames(8), poses, strict=True)
-            errors[shown] = [frame.turned(pose) for (frame, _), pose in pairs]
-        assert np.sqrt(np.mean(np.square(errors[True]))) < 0.4
-        assert np.mean(errors[True]) < 0.25 * np.mean(errors[False])
-        assert result.trajectory is not None
-        assert result.alignment.scale == pytest.approx([1.0, 1.2, 0.9], rel=0.02)
-        assert [each.view for each in result.evidence if each.kind == "photo"] == list(range(8))
-
-    @pytest.mark.timing
-    def test_time_grows_with_the_number_of_pictures(self) -> None:
-        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
-
-        def aligning(count: int) -> Measure:
-            views = self.views(count, image=True)
-            return timed(lambda: align(model, views, motion="smooth"))
-
-        # Four times as many: 16 times where each picture has unknowns in common with all frames.
-        assert ratio(aligning(40), aligning(10), below=8.0, rounds=1) < 8.0
-
-    def test_masks_do_as_well(self) -> None:
-        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
-        result = align(model, self.views(3, mask=True), motion="smooth")
-        for (frame, _), view in zip(frames(3), result.views, strict=True):
-            assert frame.turned(view.alignment) < 0.5
-
-    def test_frames_without_any_evidence_follow(self) -> None:
-        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
-        first, second, third = self.views(3, mask=True)
-        views = [first, View(CAMERA, time=second.time), third]
-        result = align(model, views, motion="smooth")
-        assert all(
-            frame.turned(view.alignment) < 1.0
-            for (frame, _), view in zip(frames(3), result.views, strict=True)
-        )
-
-    def test_frames_without_the_outline_are_left_out(self) -> None:
-        model = Model(points_3d=wedge().vertices, mesh=wedge(), stretch_sigma=0.3)
-        result = align(model, self.views(6, image=True, spoilt=(2, 4)), motion="smooth")
-        shares = {each.view: each.share for each in result.evidence if each.kind == "photo"}
-        assert [view for view, share in shares.items() if share == 0] == [2, 4]
-        for (frame, _), view in zip(frames(6), result.views, strict=True):
-            assert view.std is not None
-            assert frame.turned(view.alignment) < 3 * view.std.rotation_deg
-            assert frame.turned(view.alignment) < 3.0
-        named = [text for text in result.warnings if "is left out" in text]
-        assert [text[:14] for text in named] == ["views[2].image", "views[4].image"]
-
-    def test_a_tracker_follows_keypoints_alone(self) -> None:
-        tracker = Tracker(Model(points_3d=wedge().vertices, mesh=wedge()))
-        with pytest.raises(InputError, match=r"view\.image.*not outlines.*init="):
-            tracker.update(self.views(1, image=True)[0])
 
 
 class TestSilhouette:

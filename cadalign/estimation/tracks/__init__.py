@@ -1,1 +1,0 @@
-"""An object through a video: one shape, smooth motion, poses at all times."""

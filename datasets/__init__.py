@@ -23,13 +23,11 @@ if TYPE_CHECKING:
     from cadalign.datasets.models.keypoints import Circle, Keypoints, RotationalSymmetry, Symmetries
     from cadalign.datasets.models.model_keypoints import ModelKeypoint, ModelKeypoints
     from cadalign.datasets.models.shapenet import SYNSETS, ShapeNet, ShapeNetModel
-    from cadalign.datasets.photos.bop import Bop
     from cadalign.datasets.photos.dataset import PhotoDataset, PhotoFormat, PhotoSummary
     from cadalign.datasets.photos.kitti import KittiCars
     from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
     from cadalign.datasets.photos.photo import CadModel, Photo, PhotoKeypoints, PhotoObject, Truth
     from cadalign.datasets.photos.pix3d import Pix3D
-    from cadalign.datasets.photos.posed_photos import PosedPhotos
     from cadalign.datasets.photos.scan2cad import Scan2CAD
     from cadalign.datasets.sample.writer import sample_models, write_sample_dataset
     from cadalign.datasets.sfm.blind_pnp import BlindPnP
@@ -42,7 +40,6 @@ __all__ = [
     "SYNSETS",
     "AnnotatedModel",
     "BlindPnP",
-    "Bop",
     "CadModel",
     "Circle",
     "Colmap",
@@ -63,7 +60,6 @@ __all__ = [
     "PhotoObject",
     "PhotoSummary",
     "Pix3D",
-    "PosedPhotos",
     "RotationalSymmetry",
     "Scan2CAD",
     "ShapeNet",

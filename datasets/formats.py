@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cadalign.datasets.photos import bop, kitti, pascal3d, pix3d, posed_photos, scan2cad
+from cadalign.datasets.photos import kitti, pascal3d, pix3d, scan2cad
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.datasets.sfm import blind_pnp, colmap
 from cadalign.datasets.sfm.correspondences import CorrespondenceSet
@@ -17,11 +17,9 @@ from cadalign.io.files import as_path
 PHOTO_FORMATS = (
     scan2cad.FORMAT,
     pix3d.FORMAT,
-    bop.FORMAT,
     kitti.FORMAT,
     pascal3d.FORMAT,
     pascal3d.DETECTIONS,
-    posed_photos.FORMAT,
 )
 """The known formats, in the order in which they are looked for."""
 
@@ -32,8 +30,8 @@ def open_photos(path: str | os.PathLike[str]) -> PhotoDataset:
     Parameters
     ----------
     path : str or path-like
-        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `Bop`, `KittiCars`,
-        `Pascal3D`, `Pascal3DDetections`, `PosedPhotos`.
+        The folder; see the classes for what may lie in it: `Scan2CAD`, `Pix3D`, `KittiCars`,
+        `Pascal3D`, `Pascal3DDetections`.
 
     Returns
     -------

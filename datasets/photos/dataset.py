@@ -18,7 +18,6 @@ from msgspec import Raw
 
 from cadalign.datasets.photos.photo import Photo, PhotoObject
 from cadalign.errors import CadalignError, DataError, brief
-from cadalign.geometry.alignment import Alignment
 from cadalign.io.documents import convert, in_file
 from cadalign.io.files import damaged, read_bytes
 
@@ -80,7 +79,7 @@ class PhotoDataset(ABC):
 
     Examples
     --------
-    >>> for photo in cadalign.datasets.open("lmo"):  # doctest: +SKIP
+    >>> for photo in cadalign.datasets.open("pix3d"):  # doctest: +SKIP
     ...     for found in photo.objects:
     ...         print(photo.name, found.category, found.truth.cam_from_model)
     """
@@ -291,15 +290,3 @@ def _decode(data: bytes | Raw, kind: Any, name: str, where: Path | str) -> Any:
     except RecursionError:
         what = "not valid JSON: nested too deeply" if name else "nested too deeply"
         raise DataError(what, where=str(where)) from None
-
-
-@dataclass(frozen=True, eq=False)
-class PoseEstimate:
-    """A model's estimated pose in a photo."""
-
-    scene: str  # the scene's id; empty where the file has none
-    image: str  # the photo's id in its scene
-    model_id: str  # the model's id
-    cam_from_model: Alignment  # the pose, in the unit of the data set
-    score: float = 1.0  # confidence; higher is better
-    seconds: float | None = None  # time that the estimate took, of all objects in the photo

@@ -78,8 +78,6 @@ class CadModel:
     bounds: FloatArray | None = None
     """(2, 3), the bounding box's lowest and highest corner, where the annotation gives it [model
     units]."""
-    diameter: float | None = None
-    """The largest distance of two of the model's points, where the data set gives it."""
 
     def find_mesh(self) -> Mesh | None:
         """Read the mesh; None where there is none. Raises DataError if it cannot be read."""
@@ -144,8 +142,6 @@ class PhotoObject:
     """An image of the object's pixels; see `read_mask`."""
     bbox: FloatArray | None = None
     """(4,), left, top, right and bottom of its rectangle in the photo [px]."""
-    visible_fraction: float | None = None
-    """Share of its silhouette that is seen, 0 to 1."""
     flags: frozenset[str] = frozenset()
     """Some of "truncated", "occluded", "difficult"."""
 
@@ -155,30 +151,6 @@ class PhotoObject:
             raise DataError("this object has no mask", where=f"object {self.object_id}")
         with open_photo(self.mask_path) as image:
             return np.asarray(image.convert("L")) > 0
-
-
-@dataclass(frozen=True)
-class DepthImage:
-    """A depth image file."""
-
-    path: Path  # a 16-bit PNG
-    scale: float  # units of the camera frame that one step of its values is worth
-
-    def read(self) -> FloatArray:
-        """Read the camera's z at each pixel, (h, w) float; 0 where it was not measured.
-
-        Raises DataError if the file cannot be read, or depths are not finite.
-        """
-        with open_photo(self.path) as image:
-            values = np.asarray(image)
-        if values.ndim != 2:
-            raise DataError(f"{values.ndim} dimensions are not a depth image", where=str(self.path))
-        with np.errstate(over="ignore"):
-            depth = np.asarray(values, dtype=np.float64) * self.scale
-        if not np.isfinite(depth).all():
-            what = f"some depths are not finite, at a scale of {self.scale:g}"
-            raise DataError(what, where=str(self.path))
-        return depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,8 +166,6 @@ class Photo:
     image's size is."""
     objects: tuple[PhotoObject, ...]
     """The objects whose annotation could be read."""
-    depth: DepthImage | None = None
-    """The photo's depth image."""
     up: FloatArray | None = None
     """(3,), the direction against gravity in the camera's frame, as a sensor or the rig
     has it."""

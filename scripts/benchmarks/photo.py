@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,11 +19,11 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Camera, Mesh, Model, Result, Symmetry, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel
-from cadalign.datasets import open as open_data
 from cadalign.estimation.contours.line_changes import bins_of, regions_of
 from cadalign.evaluation.metrics.cramer_rao import probability_level
-from cadalign.geometry.rotations import rotation_from_vector
+from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
 from cadalign.io.images import read_photo
+from cadalign.io.meshes.files import load_mesh
 from cadalign.metrics import nearest_truth, rotation_error
 from cadalign.render import RaycastRenderer, Scene, Studio, cast_geometry, sample_view
 
@@ -226,11 +228,34 @@ def _spread_places(mask: np.ndarray, rng: np.random.Generator, count: int) -> np
 
 def real_cases(given: BenchmarkData, folder: str) -> Iterator[PhotoCase]:
     """The objects of real photos: bop_samples (HANDAL, LINEMOD), lmo_multiview (occluded ones)."""
-    for photo in open_data(given.real(folder)):
-        group, pixels = photo.name.rpartition("/")[0] or "lmo", photo.read_image()
-        for each in photo.objects:
-            mesh, truth = each.model.load_mesh(), each.truth.cam_from_model
-            yield PhotoCase(group, photo.known_camera, pixels, mesh, truth)
+    is_sample = folder == "bop_samples"
+    entries = (_posed if is_sample else _lmo)(given.real(folder))
+    for photo, fields, model, rotation, shift in entries:
+        group = photo.parent.name if is_sample else "lmo"
+        camera = Camera(*(fields[name] for name in ("width", "height", "fx", "fy", "cx", "cy")))
+        truth = Alignment(nearest_rotation(rotation), shift, np.ones(3))
+        yield PhotoCase(group, camera, read_photo(photo), load_mesh(model), truth)
+
+
+_Posed = tuple[Path, dict[str, Any], Path, np.ndarray, np.ndarray]
+"""Photo, camera's fields, model, and its rotation and translation [mm]."""
+
+
+def _posed(root: Path) -> Iterator[_Posed]:
+    """The objects of `poses.json`: {photo: {"model", "cam_from_model", "camera"}}."""
+    for name, entry in json.loads((root / "poses.json").read_text()).items():
+        pose = np.array(entry["cam_from_model"])
+        yield root / name, entry["camera"], root / entry["model"], pose[:3, :3], pose[:3, 3]
+
+
+def _lmo(root: Path) -> Iterator[_Posed]:
+    """The objects of `scene_gt.json`: {photo: [{"cam_R_m2c", "cam_t_m2c", "obj_id"}]}."""
+    camera = json.loads((root / "camera.json").read_text())
+    for number, objects in json.loads((root / "scene_gt.json").read_text()).items():
+        for each in objects:
+            model = root / "models" / f"obj_{each['obj_id']:06d}.ply"
+            rotation, shift = np.reshape(each["cam_R_m2c"], (3, 3)), np.array(each["cam_t_m2c"])
+            yield root / "rgb" / f"{int(number):06d}.png", camera, model, rotation, shift
 
 
 # Composites ---------------------------------------------------------------------------------------

@@ -7,20 +7,20 @@ import pickle
 
 import numpy as np
 import pytest
-from support.photo_data import write_bop, write_photo, write_scan2cad, write_text
-from support.photo_sets import WRITERS
+from support.files import write_json
+from support.photo_data import write_scan2cad, write_text
+from support.photo_sets import WRITERS, write_pix3d
 
 import cadalign
 import cadalign.datasets
 from cadalign.cli import main
-from cadalign.datasets import Bop, CadModel, PhotoKeypoints, PhotoObject
+from cadalign.datasets import CadModel, PhotoKeypoints, PhotoObject, Pix3D
 from cadalign.datasets.formats import PHOTO_FORMATS
-from cadalign.datasets.photos.photo import DepthImage
 from cadalign.errors import DataError
 
 
 def test_photos_are_asked_for_by_number_and_name(tmp_path):
-    write_bop(tmp_path)
+    write_pix3d(tmp_path, photos=2)
     dataset = cadalign.datasets.open(tmp_path)
     assert [photo.name for photo in dataset] == list(dataset.names)
     assert dataset[1].name == dataset[-1].name == dataset[dataset.names[1]].name
@@ -28,22 +28,20 @@ def test_photos_are_asked_for_by_number_and_name(tmp_path):
         dataset["x"]
     with pytest.raises(IndexError):
         dataset[2]
-    assert repr(dataset) == f"Bop({str(tmp_path)!r}): 2 photos"
+    assert repr(dataset) == f"Pix3D({str(tmp_path)!r}): 2 photos"
 
 
 def test_data_sets_can_be_sent_to_other_processes(tmp_path):
-    write_bop(tmp_path)
-    dataset = Bop(tmp_path)
+    write_pix3d(tmp_path, photos=2)
+    dataset = Pix3D(tmp_path)
     first = dataset[0]
     copy = pickle.loads(pickle.dumps(dataset))
     assert copy[0].objects[0].truth.cam_from_model == first.objects[0].truth.cam_from_model
 
 
 def test_problems_are_counted_once_and_few_are_logged(tmp_path, caplog):
-    write_bop(tmp_path, photos=50, images=False)
-    path = tmp_path / "test" / "000001" / "scene_gt.json"
-    path.write_text(json.dumps(dict.fromkeys(json.loads(path.read_text()), 3)))
-    dataset = Bop(tmp_path)
+    write_json(tmp_path / "pix3d.json", [3] * 50)
+    dataset = Pix3D(tmp_path)
     for _ in range(2):
         assert list(dataset) == []
     assert len(dataset.problems) == 50
@@ -52,7 +50,7 @@ def test_problems_are_counted_once_and_few_are_logged(tmp_path, caplog):
 
 
 def test_files_may_begin_with_a_byte_order_mark(tmp_path):
-    write_bop(tmp_path)
+    write_pix3d(tmp_path, photos=2)
     for path in tmp_path.rglob("*.json"):
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert len(list(cadalign.datasets.open(tmp_path))) == 2
@@ -80,9 +78,6 @@ def test_what_is_missing_is_told(tmp_path):
         CadModel("x", tmp_path / "gone.obj").load_mesh()
     with pytest.raises(DataError, match="2 keypoints, 1 names"):
         PhotoKeypoints(np.zeros((2, 2)), ("a",), np.ones(2, dtype=bool))
-    color = write_photo(tmp_path / "color.png")
-    with pytest.raises(DataError, match="not a depth image"):
-        DepthImage(color, 1.0).read()
 
 
 def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):
@@ -101,15 +96,6 @@ def test_folders_are_recognised_or_what_is_known_is_told(tmp_path):
 def test_hostile_entries_are_told(tmp_path, name, bad):
     write_text(tmp_path / name, f"[{bad}]")
     with pytest.raises(DataError, match=name) as caught:
-        cadalign.datasets.open(tmp_path)[0]
-    assert len(str(caught.value)) < 2000
-
-
-@pytest.mark.parametrize("bad", ["[" * 9999 + "]" * 9999, '"\\ud800"', "1e999", "9" * 5000, "nul"])
-@pytest.mark.parametrize("name", ["scene_gt.json", "poses.json"])
-def test_hostile_tables_are_told(tmp_path, name, bad):
-    write_text(tmp_path / name, f'{{"1": {bad}}}')
-    with pytest.raises(DataError, match=str(tmp_path)) as caught:
         cadalign.datasets.open(tmp_path)[0]
     assert len(str(caught.value)) < 2000
 

@@ -20,7 +20,6 @@ from support.photo_sets import WRITERS
 from cadalign import Alignment, Camera, Model, Result, ShapeModel, Size, View, align
 from cadalign.datasets import load_mesh
 from cadalign.datasets.detections.coco import decode_segmentation
-from cadalign.datasets.photos.bop_files import RESULT_COLUMNS, read_bop_results, read_scene_gt
 from cadalign.datasets.photos.kitti_keypoints import car_shape
 from cadalign.io.camera_file import read_camera
 from cadalign.io.documents import read_json
@@ -35,14 +34,6 @@ _PIXELS = _CAMERA.project(_POSE.apply(_POINTS))
 # Of each data set of photos the files that a mutation may stand in.
 _CHANGED = {
     "Pix3D": ("pix3d.json", "model/m.obj", "model/k.txt", "mask/0.png"),
-    "BOP": (
-        "models/models_info.json",
-        "models/obj_000001.ply",
-        "test/000001/depth/000000.png",
-        "test/000001/mask_visib/000000_000000.png",
-        "test/000001/scene_camera.json",
-        "test/000001/scene_gt.json",
-    ),
     "Scan2CAD": (
         "full_annotations.json",
         "scans/scene0000_00/intrinsic/intrinsic_color.txt",
@@ -134,16 +125,6 @@ def _write_result(folder: Path) -> Path:
     ]
     result = align(Model(points_3d=_POINTS), views, size=Size(width=1.0, sigma=0.1))
     return write_text(folder / "fit.json", result.to_json())
-
-
-def _write_bop_results(folder: Path) -> Path:
-    row = "1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 1000,0.1\n"
-    return write_text(folder / "results.csv", ",".join(RESULT_COLUMNS) + "\n" + row + row)
-
-
-def _write_scene_gt(folder: Path) -> Path:
-    pose = {"cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 900], "obj_id": 1}
-    return write_text(folder / "scene_gt.json", json.dumps({"0": [pose], "1": [pose, pose]}))
 
 
 _POLYGONS = [[1.0, 0.0, 30.0, 0.0, 30.0, 20.0, 1.0, 20.0], [40, 30, 50.5, 30, 45, 45]]
@@ -252,8 +233,6 @@ FORMATS = (
         _write_result,
         lambda path: Result.from_json(path.read_text("utf-8", "replace")),
     ),
-    Format("BOP results", _write_bop_results, read_bop_results),
-    Format("BOP scene_gt", _write_scene_gt, read_scene_gt),
     _mask("polygons", _POLYGONS, 64, 48),
     _mask("runs", _RUNS, 64, 48),
     _mask("compressed runs", _TEXT, 4, 2),

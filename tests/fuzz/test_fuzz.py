@@ -81,7 +81,6 @@ def test_a_prior_beside_keypoints_that_determine_nothing_leaves_a_covariance() -
     ("name", "seed"),
     [
         ("fit", 1001377),  # a word where words or a record may stand
-        ("BOP test/000001/scene_gt.json", 1012924),  # a number of an image of 5,000 digits
         ("PASCAL3D+ CAD/chair.mat", 1000002),  # a triangle's corner that is not finite
         ("PASCAL3D+ Annotations/chair_pascal/1.mat", 1008358),  # an angle of 1e300 degrees
         ("photo", 33876),  # EXIF with numbers that Pillow cannot write

@@ -17,7 +17,6 @@ from support.refusals import refusal_line
 from cadalign import Camera, FocalPrior, Library, Result, Results, ShapeModel
 from cadalign.datasets import (
     BlindPnP,
-    Bop,
     Colmap,
     KeypointNet,
     KittiCars,
@@ -25,7 +24,6 @@ from cadalign.datasets import (
     Pascal3D,
     Pascal3DDetections,
     Pix3D,
-    PosedPhotos,
     Scan2CAD,
     ShapeNet,
     load_mesh,
@@ -33,7 +31,6 @@ from cadalign.datasets import (
     open_photos,
     read_image_keypoints,
 )
-from cadalign.datasets.photos.bop_files import read_bop_results
 from cadalign.datasets.photos.dataset import read_list, read_table
 from cadalign.datasets.photos.kitti import read_labels
 from cadalign.datasets.photos.mat_files import read_structs
@@ -77,7 +74,6 @@ READERS = [
     *same(".json", read=read_table),
     *same(".txt", read=lambda path: read_matrix(path, (3, 3))),
     *same(".txt", read=lambda path: read_labels(path, tracking=False)),
-    *same(".csv", read=read_bop_results),
 ]
 
 
@@ -155,7 +151,7 @@ class Opened:
     [
         *dict.fromkeys(each.read for each in READERS),
         *(KeypointNet, ShapeNet, Scan2CAD, Pix3D, Pascal3D, Pascal3DDetections),
-        *(KittiCars, Bop, PosedPhotos, Colmap, BlindPnP, open_correspondences),
+        *(KittiCars, Colmap, BlindPnP, open_correspondences),
         *(open_photos, ModelKeypoints.load, Result.load, Results.open),
         *(FocalPrior.from_exif, photo_size),
     ],

@@ -16,7 +16,7 @@ from PIL import Image
 from cadalign import FocalPrior
 from cadalign.annotate.photos import PhotoFile
 from cadalign.datasets import load_mesh
-from cadalign.datasets.photos.photo import DepthImage, PhotoObject
+from cadalign.datasets.photos.photo import PhotoObject
 from cadalign.errors import DataError
 from cadalign.io.images import photo_size, read_grey, read_mask, read_photo
 
@@ -108,7 +108,6 @@ READERS = [
     read_grey,
     FocalPrior.from_exif,
     lambda path: PhotoObject(object_id="a", category="a", mask_path=path).read_mask(),
-    lambda path: DepthImage(path, 1.0).read(),
     lambda path: PhotoFile(path, 4, 4).thumbnail(),
     lambda path: PhotoFile(path, 4, 4).encoded(),
 ]

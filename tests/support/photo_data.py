@@ -14,25 +14,6 @@ import cadalign.datasets
 from cadalign.errors import DataError
 from support.files import TETRAHEDRON, write_json
 
-TETRAHEDRON_PLY = """ply
-format ascii 1.0
-element vertex 4
-property float x
-property float y
-property float z
-element face 4
-property list uchar int vertex_indices
-end_header
-0 0 0
-10 0 0
-0 10 0
-0 0 10
-3 0 1 2
-3 0 1 3
-3 0 2 3
-3 1 2 3
-"""
-
 
 def write_photo(path: Path, width: int = 64, height: int = 48, *, grey: bool = False) -> Path:
     """Write a photo of one colour; a grey one may be a mask."""
@@ -124,51 +105,6 @@ def write_scan2cad(root: Path, *, scenes: int = 1, frames: int = 2, **changes: A
     return cam_from_model
 
 
-# --- BOP -------------------------------------------------------------------------------------
-
-
-def bop_pose(cam_from_model: np.ndarray, obj_id: int = 1) -> dict[str, Any]:
-    """One pose of ``scene_gt.json``."""
-    return {
-        "cam_R_m2c": cam_from_model[:3, :3].ravel().tolist(),
-        "cam_t_m2c": cam_from_model[:3, 3].tolist(),
-        "obj_id": obj_id,
-    }
-
-
-def write_bop(root: Path, *, photos: int = 2, images: bool = True) -> np.ndarray:
-    """Write a data set of one scene, ``test/000001``; returns cam_from_model [mm]."""
-    pose = rigid(4, (5.0, -7.0, 400.0))
-    scene = root / "test" / "000001"
-    keys = [str(number) for number in range(photos)]
-    write_json(scene / "scene_gt.json", {key: [bop_pose(pose)] for key in keys})
-    camera = {"cam_K": [500.0, 0, 31.5, 0, 510.0, 23.5, 0, 0, 1], "depth_scale": 0.1}
-    write_json(scene / "scene_camera.json", dict.fromkeys(keys, camera))
-    info = {"bbox_obj": [10, 12, 20, 16], "bbox_visib": [10, 12, 9, 9], "visib_fract": 0.75}
-    write_json(scene / "scene_gt_info.json", {key: [info] for key in keys})
-    for key in keys if images else ():
-        write_photo(scene / "rgb" / f"{int(key):06d}.png")
-        write_photo(scene / "mask_visib" / f"{int(key):06d}_000000.png", grey=True)
-        (scene / "depth").mkdir(exist_ok=True)
-        Image.fromarray(np.full((48, 64), 4000, np.uint16)).save(
-            scene / "depth" / f"{int(key):06d}.png"
-        )
-    entry = {
-        "diameter": 14.142,
-        "min_x": 0.0,
-        "min_y": 0.0,
-        "min_z": 0.0,
-        "size_x": 10.0,
-        "size_y": 10.0,
-        "size_z": 10.0,
-        "symmetries_discrete": [[-1, 0, 0, 10, 0, -1, 0, 10, 0, 0, 1, 0, 0, 0, 0, 1]],
-        "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [5, 5, 0]}],
-    }
-    write_json(root / "models" / "models_info.json", {"1": entry})
-    write_text(root / "models" / "obj_000001.ply", TETRAHEDRON_PLY)
-    return pose
-
-
 # --- damage ----------------------------------------------------------------------------------
 
 
@@ -179,7 +115,6 @@ def read_whole(root: Path) -> int:
     for photo in dataset:
         count += 1
         readers: list[Any] = [photo.read_image]
-        readers += [photo.depth.read] if photo.depth is not None else []
         for found in photo.objects:
             readers += [found.read_mask]
             if found.model is not None:

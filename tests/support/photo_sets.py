@@ -79,45 +79,6 @@ def write_pix3d(root: Path, *, photos: int = 3, noise: float = 0.5) -> Path:
     return root
 
 
-def write_bop(root: Path, *, photos: int = 2, depth: bool = True) -> Path:
-    """One scene of the box in millimetres, with masks and depth images."""
-    scene = root / "test" / "000001"
-    truth = {}
-    for number in range(photos):
-        alignment = pose(number)
-        mask, z = drawn(alignment)
-        truth[str(number)] = [
-            {
-                "cam_R_m2c": alignment.rotation.ravel().tolist(),
-                "cam_t_m2c": (1000 * alignment.translation).tolist(),
-                "obj_id": 1,
-            }
-        ]
-        write_photo(scene / "rgb" / f"{number:06d}.png", 320, 240)
-        for kind, name, image in (
-            ("mask_visib", f"{number:06d}_000000", (255 * mask).astype(np.uint8)),
-            ("depth", f"{number:06d}", np.round(10_000 * z).astype(np.uint16)),
-        ):
-            if kind != "depth" or depth:
-                (scene / kind).mkdir(exist_ok=True)
-                Image.fromarray(image).save(scene / kind / f"{name}.png")
-    write_json(scene / "scene_gt.json", truth)
-    k = [300.0, 0, 159.5, 0, 300.0, 119.5, 0, 0, 1]
-    camera = {"cam_K": k, "depth_scale": 0.1}
-    write_json(scene / "scene_camera.json", dict.fromkeys(truth, camera))
-    head = "ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\n"
-    head += "property float z\nelement face 12\nproperty list uchar int vertex_indices\n"
-    rows = [f"{x} {y} {z}" for x, y, z in 1000 * CORNERS] + [f"3 {a} {b} {c}" for a, b, c in FACES]
-    text = "\n".join([head + "end_header", *rows, ""])
-    write_text(root / "models" / "obj_000001.ply", text)
-    low, size = 1000 * CORNERS.min(axis=0), 1000 * SIDES
-    info = {f"{name}_{axis}": float(values[k]) for k, axis in enumerate("xyz")
-            for name, values in (("min", low), ("size", size))}  # fmt: skip
-    diameter = float(np.linalg.norm(size))
-    write_json(root / "models" / "models_info.json", {"1": {**info, "diameter": diameter}})
-    return root
-
-
 def write_scan2cad(root: Path, *, frames: int = 2) -> Path:
     """A scan with the box stretched as no model is, seen from several places."""
     folder = root / "scans" / "scene0000_00"
@@ -216,7 +177,6 @@ def _write_record(path: Path, found: dict[str, Any]) -> None:
 
 WRITERS = {
     "Pix3D": write_pix3d,
-    "BOP": write_bop,
     "Scan2CAD": write_scan2cad,
     "KITTI": write_kitti,
     "PASCAL3D+": write_pascal3d,

@@ -18,7 +18,6 @@ from cadalign.errors import DataError, InputError, quote
 from cadalign.evaluation.benchmark import VIEW_NAMES
 from cadalign.evaluation.methods.pnp import PNP_METHODS
 from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.bop import BOP
 from cadalign.evaluation.metrics.photos import DEPTH as DEPTH_ERROR
 from cadalign.evaluation.metrics.photos import (
     IOU_3D,
@@ -66,10 +65,10 @@ COLUMNS: Columns = (
 class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
     """Evaluate methods on photos of real objects, by the metrics of their data set.
 
-    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D, BOP or KITTI. Keypoints
+    The folder may hold Scan2CAD, PASCAL3D+, ObjectNet3D, Pix3D or KITTI. Keypoints
     are the annotated or detected ones; where there are none, visible points of the model's mesh are
     projected with the true pose, with noise, and called simulated. The model's width (x) is given,
-    as one image leaves size open; with depth, or a shape model in metres, it is estimated. The
+    as one image leaves size open; with a shape model in metres it is estimated. The
     run's folder gets results.parquet with a row per object and method, summary.csv, figures and
     report.html. A killed run continues when the same command is started again.
     """
@@ -84,10 +83,10 @@ class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
     methods: tuple[str, ...] = ()
     """epnp, rigid; stretched, prior (stretched, with a prior on the scales), similar (prior, and
     keypoints that differ from the model's), shape (a shape model); each also with evidence, as in
-    rigid+mask, rigid+image (the photo itself) or similar+depth+gravity; and truth. By default the
+    rigid+mask, rigid+image (the photo itself) or similar+mask+gravity; and truth. By default the
     first five, shape where there is one, and the evidence that the data have but the image."""
     evidence: tuple[str, ...] = ()
-    """mask, depth, gravity, image: what the methods by default get beside keypoints; what the data
+    """mask, gravity, image: what the methods by default get beside keypoints; what the data
     have but the image, where none is named."""
     shape: tuple[Path, ...] = ()
     """Files of `cadalign shape learn`, each for its category."""
@@ -112,11 +111,10 @@ class PhotosOptions(FunctionOptions, PhotoOptions, protocols.KeypointOptions):
 GALLERY = (
     *(metric for each in protocols.SETS for metric in each.medians),
     metrics.RMS,
-    *BOP.shares,
 )
 """Errors of single objects."""
 # The data sets' own first.
-_OWN_FIRST = (SCAN2CAD, KITTI, BOP, VIEWPOINT, NINE_DOF)
+_OWN_FIRST = (SCAN2CAD, KITTI, VIEWPOINT, NINE_DOF)
 HEADLINE = (
     *(metrics.INSTANCES, metrics.FAILED, metrics.LEFT_OUT, metrics.KEYPOINTS),
     *(metric for each in _OWN_FIRST for metric in each.headline),
@@ -254,7 +252,6 @@ def _evidence(dataset: PhotoDataset) -> set[str]:
             continue
         has = {
             protocols.MASK: any(each.mask_path is not None for each in photo.objects),
-            protocols.DEPTH: photo.depth is not None,
             protocols.GRAVITY: photo.up is not None,
         }
         found |= {name for name, is_there in has.items() if is_there}
@@ -302,8 +299,8 @@ SPEC = Spec(
     note=(
         "Medians over the objects that did not fail, and shares of all, of which failures count as "
         "misses; objects without camera, model or enough keypoints are left out. The model's width "
-        "is the object's, as one image leaves size open, where neither depth nor a shape model "
-        "in metres determines it. Simulated: the data set has no keypoints, so that visible points "
+        "is the object's, as one image leaves size open, where no shape model in metres "
+        "determines it. Simulated: the data set has no keypoints, so that visible points "
         "of the model were projected with the true pose, with noise; all methods get the same."
     ),
 )

@@ -62,7 +62,6 @@ class MetricSet:
     rates: tuple[Rate, ...] = ()
     shares: tuple[Metric, ...] = ()
     """Columns between 0 and 1 whose means over all objects are shown."""
-    means: tuple[tuple[Metric, tuple[Metric, ...]], ...] = ()  # means of such shares
     headline: tuple[Metric, ...] = ()  # first columns of the headline table
     details: tuple[Metric, ...] = ()  # its last columns
     console: tuple[Metric, ...] = ()  # columns of the console's table
@@ -129,9 +128,6 @@ def shares_of(
     for metric in (metric for each in sets for metric in each.shares):
         values = known(solved[metric.key])
         found[metric.key] = share(float(values.sum()), len(values), metric)
-    for metric, parts in (pair for each in sets for pair in each.means):
-        shares = [found[part.key] for part in parts]
-        found[metric.key] = float(np.nanmean(shares)) if np.isfinite(shares).any() else np.nan
     return found
 
 

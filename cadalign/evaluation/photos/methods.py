@@ -226,7 +226,6 @@ def with_all_evidence(sighting: Sighting) -> tuple[Model, list[View]]:
     has_mesh = target.cad is not None and target.cad.has_mesh
     kinds = {
         protocols.MASK: has_mesh and target.found.mask_path is not None,
-        protocols.DEPTH: target.photo.depth is not None,
         protocols.GRAVITY: target.photo.up is not None,
     }
     evidence = [kind for kind, is_there in kinds.items() if is_there]
@@ -266,10 +265,6 @@ def _view(sighting: Sighting, evidence: Collection[str], *, rows: Any = slice(No
         if found.mask_path is None:
             raise LeftOutError("the object has no mask")
         given["mask"] = found.read_mask()
-    if protocols.DEPTH in evidence:
-        if photo.depth is None:
-            raise LeftOutError("the photo has no depth")
-        given["depth"] = photo.depth.read()
     if protocols.GRAVITY in evidence:
         if photo.up is None:
             raise LeftOutError("the direction of gravity is not known")

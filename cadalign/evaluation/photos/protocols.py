@@ -9,15 +9,12 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from cadalign.datasets.photos.bop import Bop
 from cadalign.datasets.photos.kitti import KittiCars
 from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
-from cadalign.datasets.photos.posed_photos import PosedPhotos
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
 from cadalign.evaluation.methods.method import SHAPE
-from cadalign.evaluation.metrics.bop import BOP
 from cadalign.evaluation.metrics.photos import KITTI, NINE_DOF, VIEWPOINT, MetricSet
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.options import ExperimentOptions
@@ -27,8 +24,8 @@ SIMULATED = "simulated"
 EPNP, RIGID, STRETCHED, PRIOR, SIMILAR = "epnp", "rigid", "stretched", "prior", "similar"
 TRUTH = "truth"
 BASES = (EPNP, RIGID, STRETCHED, PRIOR, SIMILAR, SHAPE)
-MASK, DEPTH, GRAVITY, IMAGE = "mask", "depth", "gravity", "image"
-EVIDENCE = (MASK, DEPTH, GRAVITY, IMAGE)
+MASK, GRAVITY, IMAGE = "mask", "gravity", "image"
+EVIDENCE = (MASK, GRAVITY, IMAGE)
 
 
 def parts_of(method: str) -> tuple[str, frozenset[str]]:
@@ -36,9 +33,9 @@ def parts_of(method: str) -> tuple[str, frozenset[str]]:
 
     Examples
     --------
-    >>> base, evidence = parts_of("rigid+mask+depth")
+    >>> base, evidence = parts_of("rigid+mask+gravity")
     >>> base, sorted(evidence)
-    ('rigid', ['depth', 'mask'])
+    ('rigid', ['gravity', 'mask'])
     """
     base, *evidence = method.split("+")
     return base, frozenset(evidence)
@@ -90,8 +87,8 @@ def default_methods(
 
     Examples
     --------
-    >>> default_methods(with_evidence=("rigid",), evidence={"mask", "depth"}, has_shape=False)[5:]
-    ('rigid+mask', 'rigid+depth', 'rigid+mask+depth')
+    >>> default_methods(with_evidence=("rigid",), evidence={"mask", "gravity"}, has_shape=False)[5:]
+    ('rigid+mask', 'rigid+gravity', 'rigid+mask+gravity')
     """
     bases = [base for base in BASES if has_shape or base != SHAPE]
     more = []
@@ -129,7 +126,7 @@ class KeypointOptions(ExperimentOptions):
             raise InputError(f"{self.min_score} is not a score", where="min_score")
 
 
-SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI, BOP)
+SETS = (VIEWPOINT, NINE_DOF, SCAN2CAD, KITTI)
 """All sets of metrics, in the order of the result table's columns."""
 
 
@@ -147,13 +144,10 @@ class Protocol:
     sigma_of_width: float | None = None  # the same as a share of the image's width
 
 
-_EXACT = Protocol((VIEWPOINT, BOP, NINE_DOF), RIGID, up_axis="z")
 _PROTOCOLS = {
     # Annotators' points on scan and model are about 5 cm apart, 8 px in an image of 480.
     Scan2CAD.kind: Protocol((VIEWPOINT, SCAN2CAD, NINE_DOF), SIMILAR, sigma_of_width=1 / 60),
     Pix3D.kind: Protocol((VIEWPOINT, NINE_DOF), RIGID),
-    Bop.kind: _EXACT,
-    PosedPhotos.kind: _EXACT,
     KittiCars.kind: Protocol((VIEWPOINT, KITTI), SHAPE, up_axis="z"),
     Pascal3D.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),
     Pascal3DDetections.kind: Protocol((VIEWPOINT,), SIMILAR, up_axis="z"),

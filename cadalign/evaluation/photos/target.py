@@ -7,8 +7,6 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import pdist
 
 from cadalign.arrays import FloatArray
 from cadalign.datasets.formats import open_photos
@@ -32,7 +30,6 @@ from cadalign.render.scene import Scene
 
 _KEPT = 16
 _ON_SURFACE = 2000  # points among which farthest ones are sought, beside the vertices
-_MOST_OF_HULL = 1000  # points whose distances are compared
 
 
 @dataclass(frozen=True)
@@ -119,18 +116,6 @@ class Cad:
             None if points is None else np.array([points.xyz.min(axis=0), points.xyz.max(axis=0)])
         )
 
-    @property
-    def diameter(self) -> float:
-        """The largest distance of two points: the data set's, or that of the mesh's vertices."""
-        if self.model.diameter is not None:
-            return self.model.diameter
-        return _diameter(self)
-
-    @property
-    def hull_vertices(self) -> FloatArray:
-        """The vertices (n, 3) of the mesh's convex hull; of a flat mesh all of them."""
-        return _hull(self)
-
     def spread_points(self, count: int) -> NamedPoints:
         """Farthest-point samples of the mesh's surface, named by their numbers."""
         return _spread(self, count)
@@ -147,21 +132,6 @@ def _spread(cad: Cad, count: int) -> NamedPoints:
     points = np.vstack([cad.scene.used_vertices, on_surface])
     xyz = farthest_points(points, count)
     return NamedPoints(tuple(str(row) for row in range(len(xyz))), xyz)
-
-
-@lru_cache(maxsize=_KEPT)
-def _hull(cad: Cad) -> FloatArray:
-    vertices = cad.scene.used_vertices
-    try:
-        return np.asarray(vertices[ConvexHull(vertices).vertices])
-    except QhullError:
-        return vertices
-
-
-@lru_cache(maxsize=_KEPT)
-def _diameter(cad: Cad) -> float:
-    points = farthest_points(cad.hull_vertices, _MOST_OF_HULL)
-    return float(pdist(points).max())
 
 
 def farthest_points(points: FloatArray, count: int) -> FloatArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from support.photo_sets import (
     POINTS,
     WRITERS,
     pose,
-    write_bop,
     write_kitti,
     write_pix3d,
     write_scan2cad,
@@ -50,12 +48,10 @@ PERFECT = {
     "rotation_error_deg": 0.0, "translation_cm": 0.0, "box_iou": 1.0, "box_iou_up_to_scale": 1.0,
     "scan2cad_translation_m": 0.0, "scan2cad_scale": 0.0, "scan2cad_aligned": 1.0,
     "scan2cad_aligned_axes": 1.0, "yaw_error_deg": 0.0, "depth_error": 0.0,
-    "depth_error_relative": 0.0, "iou_3d": 1.0, "iou_bev": 1.0, "mssd": 0.0, "mspd_px": 0.0,
-    "mssd_recall": 1.0, "mspd_recall": 1.0, "vsd_recall": 1.0,
+    "depth_error_relative": 0.0, "iou_3d": 1.0, "iou_bev": 1.0,
 }  # fmt: skip
 OWN = {
     "Pix3D": {"rotation_error_deg", "box_iou"},
-    "BOP": {"rotation_error_deg", "translation_cm", "mssd_recall", "mspd_recall", "vsd_recall"},
     "Scan2CAD": {"rotation_error_deg", "box_iou", "scan2cad_aligned", "scan2cad_aligned_axes"},
     "KITTI": {"yaw_error_deg", "depth_error_relative", "iou_3d", "iou_bev"},
     "PASCAL3D+": {"rotation_error_deg"},
@@ -105,9 +101,7 @@ class TestTruth:
             assert row["status"] == "ok", row["reason"]
             assert row["rotation_error_deg"] < 1.0
             assert row["rms_px"] < 0.6
-            assert row["source"] == {"KITTI": "detected"}.get(
-                kind, "simulated" if kind == "BOP" else "annotated"
-            )
+            assert row["source"] == ("detected" if kind == "KITTI" else "annotated")
 
 
 def score_poses(dataset: PhotoDataset, poses: dict[tuple[str, str], Alignment]) -> list[Any]:
@@ -134,10 +128,8 @@ def summarize_rows(rows: list[Any]) -> list[Summary]:
 
 class TestMadeUpErrors:
     def test_have_the_scores_of_their_definitions(self, tmp_path: Path) -> None:
-        """A box moved by 30 mm in depth, of a diameter of 877 mm: MSSD = .0342 diameters < .05.
-
-        All ten thresholds hold for MSSD; a turn by 90 degrees about an axis fails them all."""
-        dataset = cadalign.datasets.open(write_bop(tmp_path / "data"))
+        """A box moved by 30 mm in depth, and one turned by 90 degrees about an axis."""
+        dataset = cadalign.datasets.open(write_scan2cad(tmp_path / "data"))
         truth = {
             (photo.name, found.object_id): found.truth.cam_from_model
             for photo in dataset
@@ -145,37 +137,33 @@ class TestMadeUpErrors:
         }
         first, second = truth
         moved = Alignment(
-            truth[first].rotation, truth[first].translation + [0, 0, 30], truth[first].scale
+            truth[first].rotation, truth[first].translation + [0, 0, 0.03], truth[first].scale
         )
         turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
         turned = replace(truth[second], rotation=truth[second].rotation @ turn)
         a, b = score_poses(dataset, {first: moved, second: turned})
-        assert a["mssd"] == pytest.approx(30 / np.sqrt(500**2 + 600**2 + 400**2))
-        assert a["mssd_recall"] == 1.0
         assert a["translation_cm"] == pytest.approx(3.0)
         assert b["rotation_error_deg"] == pytest.approx(90.0)
-        assert b["mssd_recall"] < 0.2
         (line,) = summarize_rows([a, b])
         assert line.values["accuracy_pi_6"] == 0.5
         assert line.values["deg_5_cm_5"] == 0.5
-        assert line.values["mssd_recall"] == pytest.approx((1 + b["mssd_recall"]) / 2)
 
     def test_missing_estimates_count(self, tmp_path: Path) -> None:
-        dataset = cadalign.datasets.open(write_bop(tmp_path / "data"))
+        dataset = cadalign.datasets.open(write_scan2cad(tmp_path / "data"))
         found = dataset[0].objects[0].truth.cam_from_model
-        rows = score_poses(dataset, {("test/000001/0", "0"): found})
+        rows = score_poses(dataset, {("scene0000_00/0", "0"): found})
         assert [row["status"] for row in rows] == ["ok", "failed"]
         (line,) = summarize_rows(rows)
         assert (line.values["instances"], line.values["failed"]) == (2, 1)
-        assert line.values["mssd_recall"] == 0.5
+        assert line.values["accuracy_pi_6"] == line.values["scan2cad_aligned"] == 0.5
 
     def test_a_category_where_everything_failed_counts(self, tmp_path: Path) -> None:
-        dataset = cadalign.datasets.open(write_bop(tmp_path / "data"))
+        dataset = cadalign.datasets.open(write_pix3d(tmp_path / "data", photos=2))
         found = dataset[0].objects[0].truth.cam_from_model
-        solved, failed = score_poses(dataset, {("test/000001/0", "0"): found})
-        lines = summarize_rows([solved, failed, {**failed, "category": "other"}])
-        shares = {line.group: line.values["mssd_recall"] for line in lines}
+        solved, failed = score_poses(dataset, {("0", "0"): found})
         own = solved["category"]
+        lines = summarize_rows([solved, *({**failed, "category": name} for name in (own, "other"))])
+        shares = {line.group: line.values["accuracy_pi_6"] for line in lines}
         assert shares == {own: 0.5, "other": 0, "all": 1 / 3, "mean of categories": 0.25}
         others = {line.group: line.values["scan2cad_aligned"] for line in lines}
         assert np.isnan(list(others.values())).all()  # of another data set's protocol
@@ -196,47 +184,47 @@ class TestMadeUpErrors:
 
 class TestMethods:
     def test_evidence_that_the_data_have_is_used_and_helps(self, tmp_path: Path) -> None:
-        found = done(write_bop(tmp_path / "data"), tmp_path / "run")
-        assert found.methods[5:] == ["rigid+mask", "rigid+depth", "rigid+mask+depth"]
+        found = done(write_pix3d(tmp_path / "data", noise=2.0), tmp_path / "run")
+        assert found.methods[5:] == ["rigid+mask"]
         error = {
-            name: np.median([row["translation_cm"] for row in rows_of(found, name)])
+            name: np.median([row["rotation_error_deg"] for row in rows_of(found, name)])
             for name in found.methods
         }
         assert error["rigid+mask"] < error["rigid"]
         assert all(row["status"] == "ok" for row in found.results.to_pylist())
 
     def test_a_photo_is_evidence(self, tmp_path: Path) -> None:
-        root = write_bop(tmp_path / "data")
+        root = write_pix3d(tmp_path / "data", photos=2)
         found = done(root, tmp_path / "run", methods=("rigid", "rigid+image"), max_photos=1)
         assert {row["status"] for row in found.results.to_pylist()} == {"ok"}
 
     def test_evidence_of_the_methods_by_default_may_be_named(self, tmp_path: Path) -> None:
-        root = write_bop(tmp_path / "data")
+        root = write_pix3d(tmp_path / "data", photos=2)
         found = done(root, tmp_path / "run", evidence=("image",), max_photos=1)
         assert found.methods[5:] == ["rigid+image"]
 
     def test_what_an_object_lacks_is_left_out(self, tmp_path: Path) -> None:
-        root = write_bop(tmp_path / "data", depth=False)
-        (root / "test/000001/mask_visib/000001_000000.png").unlink()
-        methods = ("rigid", "rigid+mask", "rigid+depth", "rigid+gravity", "shape")
+        root = write_pix3d(tmp_path / "data", photos=2)
+        (root / "mask" / "1.png").unlink()
+        methods = ("rigid", "rigid+mask", "rigid+gravity", "shape")
         found = done(root, tmp_path / "run", methods=methods)
         rows = found.results.to_pylist()
         assert [row["status"] for row in rows] == [
-            *("ok", "ok", "left out", "left out", "left out"),
-            *("ok", "left out", "left out", "left out", "left out"),
+            *("ok", "ok", "left out", "left out"),
+            *("ok", "left out", "left out", "left out"),
         ]
-        assert [row["reason"] for row in rows[5:]] == [
+        assert [row["reason"] for row in rows[4:]] == [
             "",
             "the object has no mask",
-            "the photo has no depth",
             "the direction of gravity is not known",
-            "there is no shape model of obj_000001",
+            "there is no shape model of table",
         ]
         assert SPEC.conclude(found, []).failed == 0
-        assert SPEC.conclude(found, []).counts == {"left_out": 7}
+        assert SPEC.conclude(found, []).counts == {"left_out": 5}
 
     def test_noise_is_the_same_for_all_methods_and_runs(self, tmp_path: Path) -> None:
-        root = write_bop(tmp_path / "data")
+        root = write_pix3d(tmp_path / "data", photos=2)
+        (root / "model" / "k.txt").unlink()  # without keypoints they are simulated
         one = done(root, tmp_path / "one", methods=("rigid", "stretched"))
         other = done(root, tmp_path / "other", methods=("rigid",), max_photos=1)
         assert rows_of(one, "rigid")[:1] == rows_of(other, "rigid")
@@ -285,31 +273,25 @@ class TestBadRecords:
             "chair", "chair, simulated", "table", "unreadable", "all", "mean of categories",
         ]  # fmt: skip
 
-    def test_objects_and_scenes_are_counted(self, tmp_path: Path) -> None:
-        root = write_bop(tmp_path / "data", photos=3)
-        scene = root / "test" / "000001"
-        truth = json.loads((scene / "scene_gt.json").read_text())
-        truth["1"][0]["cam_R_m2c"] = [0.0] * 9
-        write_json(scene / "scene_gt.json", truth)
-        (root / "test" / "000002").mkdir()
-        (root / "test" / "000002" / "scene_gt.json").write_text('{"0": [')
-        (scene / "depth" / "000002.png").write_bytes(b"\x89PNG")
-        found = done(root, tmp_path / "run", methods=("rigid", "rigid+depth"))
+    def test_objects_and_scans_are_counted(self, tmp_path: Path) -> None:
+        root = write_scan2cad(tmp_path / "data", frames=3)
+        (scan,) = json.loads((root / "full_annotations.json").read_text())
+        scan["aligned_models"].append(7)
+        write_json(root / "full_annotations.json", [scan, 7])
+        (root / "scans/scene0000_00/pose/1.txt").write_text("x")
+        found = done(root, tmp_path / "run", methods=("rigid",))
         rows = rows_of(found, "rigid")
-        assert [row["status"] for row in rows] == ["ok", "failed", "failed", "failed"]
-        assert [row["status"] for row in rows_of(found, "rigid+depth")] == ["ok"] + ["failed"] * 3
-        assert rows[1]["model_id"] == "test/000001/1, problem 1"
-        assert "000002.png" in rows[2]["reason"]
-        assert "000002" in rows[3]["model_id"]
-        assert "scene_gt.json" in rows[3]["reason"]
+        assert [row["status"] for row in rows] == [
+            *("failed", "ok"), "failed", *("failed", "ok"), "failed",
+        ]  # fmt: skip
+        assert rows[0]["model_id"] == "scene0000_00/0, problem 1"
+        assert "pose/1.txt" in rows[2]["reason"]
+        assert "full_annotations.json" in rows[5]["reason"]
 
     @pytest.mark.long
-    @pytest.mark.parametrize("write", [write_pix3d, write_bop])
-    def test_any_damaged_file_is_refused_or_counted(
-        self, tmp_path: Path, write: Callable[..., Path]
-    ) -> None:
+    def test_any_damaged_file_is_refused_or_counted(self, tmp_path: Path) -> None:
         """Each file is cut short, then renamed: rows say so, or the whole data set is refused."""
-        root = write(tmp_path / "data", photos=1)
+        root = write_pix3d(tmp_path / "data", photos=1)
         methods = ("rigid+mask",)
         files = sorted(path for path in root.rglob("*") if path.is_file())
         good = done(root, tmp_path / "good", methods=methods, pictures=0)
@@ -444,7 +426,7 @@ class TestPage:
         shown = SPEC.shown_columns(SPEC.summarize(found), [found])
         keys = {column.key for column in shown}
         assert "accuracy_pi_6" in keys
-        assert not keys & {"scan2cad_aligned", "yaw_error_deg", "average_recall"}
+        assert not keys & {"scan2cad_aligned", "yaw_error_deg"}
 
     def test_categories_may_have_the_names_of_summaries(self, tmp_path: Path) -> None:
         root = write_pix3d(tmp_path / "data", photos=3)
@@ -470,13 +452,15 @@ class TestPage:
         assert "no object is of the categories sofas" in capsys.readouterr().err
 
     def test_simulated_keypoints_are_named_so(self, tmp_path: Path) -> None:
-        found = done(write_bop(tmp_path / "data"), tmp_path / "run", methods=("rigid",))
-        assert SPEC.summarize(found)[0].group == "obj_000001, simulated"
+        root = write_pix3d(tmp_path / "data", photos=2)
+        (root / "model" / "k.txt").unlink()
+        found = done(root, tmp_path / "run", methods=("rigid",))
+        assert SPEC.summarize(found)[0].group == "chair, simulated"
         table = SPEC.console_table(found, SPEC.summarize(found))
         assert table.note.endswith("projected with the true pose, with noise")
         text = SPEC.describe(found)
         assert text == (
-            "on 2 objects in photos of data (BOP), whose keypoints are simulated: projected with "
+            "on 2 objects in photos of data (Pix3D), whose keypoints are simulated: projected with "
             "the true pose, 1 px"
         )
 
@@ -485,7 +469,7 @@ class TestPage:
     ("options", "text"),
     [
         (("--methods", "best"), "--methods: unknown method 'best'"),
-        (("--evidence", "sound"), "--evidence: unknown evidence 'sound'; known are mask, depth"),
+        (("--evidence", "sound"), "--evidence: unknown evidence 'sound'; known are mask, gravity"),
         (
             ("--evidence", "image", "--methods", "rigid"),
             "--evidence: is for the methods by default alone; name it there, as in rigid+image",

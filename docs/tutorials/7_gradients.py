@@ -71,5 +71,4 @@ for place, share in zip(photo, shares, strict=True):
 axes.set_title("Shares of the rotation's variance")
 
 # %%
-# In a training loop, `cadalign.torch.fit` has the same derivatives as gradients of tensors: see
-# "Train through the alignment" among the how-tos.
+# In a training loop, `cadalign.torch.fit` has the same derivatives as gradients of tensors.

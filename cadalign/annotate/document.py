@@ -151,7 +151,6 @@ class History:
     document: AnnotationDocument
     before: list[AnnotationDocument] = field(default_factory=list)  # for undo, the next one last
     after: list[AnnotationDocument] = field(default_factory=list)  # for redo, the next one last
-    revision: int = 0  # grows with every change, those by undo and redo included
     _step: object = None
 
     def record(self, document: AnnotationDocument, *, step: object = None) -> None:
@@ -165,7 +164,6 @@ class History:
             del self.before[:-_LONGEST]
         self.after.clear()
         self.document = document
-        self.revision += 1
         self._step = step
 
     def undo(self) -> bool:
@@ -179,7 +177,7 @@ class History:
     def changed(self, change: Callable[[AnnotationDocument], AnnotationDocument]) -> History:
         """The history with a change made to each of its documents."""
         before, after = ([change(each) for each in side] for side in (self.before, self.after))
-        return History(change(self.document), before, after, self.revision + 1)
+        return History(change(self.document), before, after)
 
     def _go(self, source: list[AnnotationDocument], target: list[AnnotationDocument]) -> bool:
         self._step = None
@@ -187,5 +185,4 @@ class History:
             return False
         target.append(self.document)
         self.document = source.pop()
-        self.revision += 1
         return True

@@ -34,7 +34,6 @@ def page_state(
         document, registry, cad = state.document, state.model.registry, state.model.cad
         history, used = state.history, document.keypoints
         return {
-            "revision": history.revision,
             "image": {
                 "number": state.number,
                 "count": len(session.photos),

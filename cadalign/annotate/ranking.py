@@ -21,8 +21,7 @@ def ranking_state(session: Session, number: int) -> dict[str, Any]:
     """
     with session.lock:
         state, choice = session.annotation(number), session.choice
-        revision = state.history.revision
-        answer: dict[str, Any] = {"revision": revision, "note": "", "none": None, "models": []}
+        answer: dict[str, Any] = {"note": "", "none": None, "models": []}
         if choice is None:
             return answer | {"note": "The session has no library: start it with --library."}
         known, complete = choice.ids_on(state.model.path), state.document.complete_pairs

@@ -98,7 +98,9 @@ def rendered(root: Path, folder: Path) -> Iterator[Scripted]:
 def photographed(cars: Path, folder: Path) -> Iterator[Scripted]:
     """Cars of three street photos, whose model is the average car."""
     for truth in json.loads((cars / "truth.json").read_text()):
-        observed = Observation.load(cars / "observations" / f"{truth['name']}.json")
+        path = cars / "observations" / f"{truth['name']}.json"
+        text = path.read_text().replace('"confidence"', '"score"')
+        observed = Observation.from_dict(json.loads(text), folder=path.parent)
         assert observed.scores is not None
         assert observed.image is not None
         seen = observed.scores > 0.1

@@ -81,6 +81,11 @@ class ManyOptions(ExperimentOptions):
         self.check_least(pictures=0)
 
     @property
+    def threads(self) -> int:
+        """Number of threads of a run without workers."""
+        return 1
+
+    @property
     def learned(self) -> Path | None:
         """The learned shape that keypoints of detectors may be named after."""
         raise NotImplementedError

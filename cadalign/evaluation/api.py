@@ -166,7 +166,7 @@ def prepared(
     if dask is not None:
         options, folder = absolute_paths(options), absolute_paths(folder)
     count = options.default_workers if workers is None else workers
-    pool = workers_of(count, dask, threads=options.threads)
+    pool = workers_of(count, dask)
     spec = spec_named(options.experiment)
     check_metric_names(getattr(options, "metrics", ()), [column.key for column in spec.columns])
     return spec.plan(options, folder), pool

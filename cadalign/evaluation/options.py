@@ -52,11 +52,6 @@ class ExperimentOptions:
         """Number of worker processes, unless another is given; see `RunOptions`."""
         return -1
 
-    @property
-    def threads(self) -> int:
-        """Number of threads of a run without workers."""
-        return 1
-
     def as_config(self) -> dict[str, Any]:
         """The options and the experiment's name in a run's configuration, paths made absolute.
 

@@ -33,8 +33,6 @@ from cadalign.geometry.symmetry_group import SymmetryGroup
 if TYPE_CHECKING:
     from cadalign.evaluation.instances.instance import Instance
 
-_FLIPPED_DEG = 90.0
-
 
 def alignment_errors(*, est: Alignment, gt: Alignment, length: float = 1.0) -> dict[str, float]:
     """Errors of pose and stretch by column, the translation's over a length [model units]."""

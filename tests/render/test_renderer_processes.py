@@ -55,7 +55,7 @@ def test_a_spawned_pool_draws_with_pyrender_after_the_parent_has(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*fork.*")
 def test_a_forked_process_is_refused_not_hung():
     renderer = renderer_or_skip("pyrender")
     shape = trimesh.creation.icosphere(subdivisions=2)

@@ -58,7 +58,7 @@ def views_without_pose(
         for number, view in enumerate(views)
         if inits[number] is None
         and tells_something(view)
-        and lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
+        and _lie_on_a_line(mean[prior.rows_of(view.keypoint_ids, f"views[{number}].ids")])
     ]
 
 
@@ -155,7 +155,7 @@ def _renumbered(text: str, used: Sequence[int]) -> str:
     return re.sub(r"views\[(\d+)\]", lambda found: f"views[{used[int(found[1])]}]", text)
 
 
-def lie_on_a_line(points: FloatArray) -> bool:
+def _lie_on_a_line(points: FloatArray) -> bool:
     """True for points (n, 3) that determine no rotation: fewer than three, or on one line."""
     return len(points) < LEAST_POINTS or are_on_a_line(points, _ON_A_LINE)
 

@@ -21,7 +21,7 @@ from cadalign.datasets.photos.kitti_keypoints import (
     yaw_of_car,
 )
 
-_LEAST_SCORE, _LEAST_KEYPOINTS, _BLOCK = 0.1, 6, 6
+_LEAST_KEYPOINTS = 6
 _SIGMA = 3.0  # [px] of the network's keypoints
 
 

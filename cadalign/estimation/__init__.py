@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
     from cadalign.estimation.uncertainty.next_best import Advice, rank_evidence
-    from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import (
         Contribution,
         EvidenceSummary,
@@ -45,7 +44,6 @@ __all__ = [
     "RansacOptions",
     "Result",
     "Results",
-    "Sensitivity",
     "Size",
     "Uncertainty",
     "View",

@@ -121,7 +121,7 @@ def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evide
     if is_kept or not len(shape.modes) or not len(seen):
         return evidence, state
     points = points_of(shape, state) / np.exp(state.log_scales)
-    bounds, own = placed_box(points, keypoints, seen, prior)
+    bounds, own = _placed_box(points, keypoints, seen, prior)
     axes = np.arange(3)
     mean, modes = shape.mean.copy(), shape.modes.copy()
     displacements = state.displacements.copy()
@@ -132,7 +132,7 @@ def with_box(evidence: Evidence, state: State, prior: ShapePrior) -> tuple[Evide
     return placed, state._replace(displacements=displacements)
 
 
-def placed_box(
+def _placed_box(
     points: FloatArray, keypoints: int, seen: IntArray, model: ShapePrior | ShapeModel
 ) -> tuple[FloatArray, IntArray]:
     """Corners (2, 3) of the box of points (m, 3), and the points (2, 3) that its faces vary with.
@@ -169,7 +169,7 @@ def with_boxes(
     means, covariances = mixture.means[component], mixture.covariances[component]
     for k in range(count):
         points = shape_at(mixture, component[k], seen, force_of(minima.states[k]))
-        bounds, rows = placed_box(points, len(model.ids), seen.points, model)
+        bounds, rows = _placed_box(points, len(model.ids), seen.points, model)
         means[k, -2:] = means[k, rows, axes] + (bounds - points[rows, axes])
         own = (3 * rows + axes).ravel()
         covariances[k, -6:] = covariances[k, own]

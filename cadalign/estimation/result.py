@@ -18,7 +18,6 @@ from cadalign.estimation.result_data import ResultData
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from cadalign.estimation.uncertainty.sensitivity import Sensitivity
     from cadalign.estimation.uncertainty.summary import Contribution
     from cadalign.export.aligned_object import Frame
     from cadalign.geometry.mesh import Mesh
@@ -63,49 +62,6 @@ class Result(ResultData):
         from cadalign.estimation.uncertainty.evidence import contributions_of
 
         return contributions_of(self.statistics.basis)
-
-    def sensitivity(self, *, view: int = 0, exact: bool = True) -> Sensitivity:
-        """Derivatives of pose, stretch, shape and focal length by the data, at the optimum.
-
-        By every keypoint, its standard deviation and the model's points, by the implicit function
-        theorem. Held are the estimated noise level, and the points of the model that a mask, photo
-        or depth image was matched with.
-
-        Parameters
-        ----------
-        view : int
-            Number of the view whose pose is derived, by the keypoints of all views.
-        exact : bool
-            Take the Hessian of the cost. Otherwise its Gauss-Newton matrix, which leaves out what
-            vanishes with the residuals: of keypoints of one view of an exact model only.
-
-        Returns
-        -------
-        Sensitivity
-            Outliers that the estimate does not rest on have no influence, nor has any keypoint on
-            what the keypoints do not determine.
-
-        Raises
-        ------
-        InputError
-            If the result was read from a file, or minimises no cost.
-        DegenerateError
-            If the evidence beside keypoints of one view leaves unknowns undetermined.
-
-        Examples
-        --------
-        >>> from cadalign import Camera, fit
-        >>> camera = Camera(640, 480, 900, 900, 319.5, 239.5)
-        >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
-        >>> result = fit(corners, camera.project(corners + [0.1, 0.2, 5.0]), camera)
-        >>> result.sensitivity().by_points_2d.shape
-        (9, 8, 2)
-        >>> result.sensitivity().strongest
-        0
-        """
-        from cadalign.estimation.uncertainty.sensitivity import sensitivity_of  # rarely asked
-
-        return sensitivity_of(self, exact=exact, view=view)
 
     def __str__(self) -> str:
         return _text_of(self)

@@ -45,45 +45,19 @@ def stretched_axes(held: tuple[bool, bool, bool]) -> str:
     return "".join(axis for axis, is_held in zip("xyz", held, strict=True) if not is_held)
 
 
-def step_to(best: Equal, given: Alignment) -> FloatArray:
-    """Derivatives (9, 9) of an equal alignment by the given one.
-
-    Both by the rotation vector in the camera frame, the translation and the log scales.
-    """
-    turn, shift = best.motion[:3, :3], best.motion[:3, 3]
-    step = np.eye(9)
-    step[3:6, :3] = by_rotation(given.linear @ shift)
-    step[3:6, 6:] = given.linear * shift
-    step[6:, 6:] = (turn**2).T
-    return step
-
-
 def without_free_turns(covariance: FloatArray, best: Equal) -> FloatArray:
     """A covariance whose unknowns begin with rotation vector and translation, without free turns.
 
     These are rotations about the symmetry's axes through its center.
     """
-    left = _free_turns_removed(len(covariance), best)
-    return np.asarray(left @ covariance @ left.T)
-
-
-def _free_turns_removed(size: int, best: Equal) -> FloatArray:
-    """Projection (size, size) of steps of the unknowns that takes free turns off."""
+    size = len(covariance)
     arm, left = best.alignment.linear @ best.center, np.eye(size)
     for axis in best.free:
         direction = best.alignment.rotation @ axis
         turn, share = np.zeros(size), np.zeros(size)
         turn[:3], turn[3:6], share[:3] = direction, -np.cross(direction, arm), direction
         left = (np.eye(size) - np.outer(turn, share)) @ left
-    return left
-
-
-def equal_slopes(
-    given: Alignment, symmetry: Symmetry, *, held: tuple[bool, bool, bool]
-) -> FloatArray:
-    """Derivatives (9, 9) of an alignment's canonical form by itself, without free turns."""
-    best = group_of(symmetry).canonical(given, held=held)
-    return np.asarray(_free_turns_removed(9, best) @ step_to(best, given))
+    return np.asarray(left @ covariance @ left.T)
 
 
 def is_same(
@@ -122,7 +96,10 @@ def carried(
     held: tuple[bool, bool, bool] = (False, False, False),
 ) -> FloatArray:
     """The covariance (9, 9) or (10, 10) of an equal alignment; zero for scales that are held."""
+    turn, shift = best.motion[:3, :3], best.motion[:3, 3]
     step = np.eye(len(covariance))
-    step[:9, :9] = step_to(best, given)
+    step[3:6, :3] = by_rotation(given.linear @ shift)
+    step[3:6, 6:9] = given.linear * shift
+    step[6:9, 6:9] = (turn**2).T
     step[6 + np.flatnonzero(held)] = 0.0
     return np.asarray(step @ covariance @ step.T)

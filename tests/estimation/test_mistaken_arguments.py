@@ -74,10 +74,6 @@ GIVEN: list[tuple[Callable[..., Any], str]] = [
         "dimension: 'a' is not a positive number",
     ),
     (
-        lambda: align(MODEL, VIEW).sensitivity(view="a"),  # type: ignore[arg-type]
-        "view: 'a' is none of the result's 1 views; give 0 to 0",
-    ),
-    (
         lambda: Result.from_json(None),  # type: ignore[arg-type]
         "result: not valid JSON: the JSON object must be str, bytes or bytearray, not NoneType",
     ),

@@ -53,7 +53,6 @@ class Optima:
     loss: int = LINEAR  # one of `cadalign.solvers.constants`
     loss_scale: float = 1.0
     exact: bool = True
-    slopes: FloatArray | None = None  # (B, n, 2) of undistorted rays by the log focal; None for 0
     focal_offset: FloatArray | float = 0.0  # (B,) of the log focal length from its prior's mean
     focal_weight: FloatArray | float = 0.0  # (B,) of that prior
 
@@ -80,7 +79,7 @@ class Optima:
         slope = np.zeros((*inverse.shape, 2, 4))
         slope[..., 0, 0] = slope[..., 1, 1] = inverse
         slope[..., 2] = -projected * inverse[..., None]
-        slope[..., 3] = projected if self.slopes is None else projected - self.slopes
+        slope[..., 3] = projected
         return projected, inverse, slope
 
     @cached_property
@@ -208,8 +207,7 @@ class Optima:
     def pull_back(self, slopes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Derivatives by the data of numbers whose derivatives by the unknowns are (B, 10).
 
-        By rays (B, n, 2), log sigmas (B, n) and points (B, n, 3). For one problem, the numbers may
-        be many.
+        By rays (B, n, 2), log sigmas (B, n) and points (B, n, 3).
         """
         adjoint = np.zeros((len(slopes), UNKNOWNS))
         adjoint[:, self.free] = -(self.solved[0] @ slopes[:, self.free, None])[..., 0]

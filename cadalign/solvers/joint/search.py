@@ -46,7 +46,7 @@ def search_joint(
     unmoved = np.zeros((count, len(fewer.shape.modes) + fewer.shape.mean.size))
     starts = np.concatenate([poses.reshape(count, -1), log_focals, log_scales, unmoved], axis=1)
     minima = room_for_minima(max(count, 1), starts.shape[1])
-    if has_latent(fewer):
+    if _has_latent(fewer):
         effort = Effort(count, _FEW_ITERATIONS, 0, _UNLIKELY)
         likely = room_for_minima(max(count, 1), starts.shape[1])
         search(system, starts, effort, 0, 0.0, likely)
@@ -64,7 +64,7 @@ def search_joint(
     return JointMinima(states, costs, scores), int(minima.counts[1])
 
 
-def has_latent(evidence: Evidence) -> bool:
+def _has_latent(evidence: Evidence) -> bool:
     """True if the evidence rests on a shape that may vary."""
     sighted = evidence.shape.spread[evidence.sightings.point]
     return bool(len(evidence.shape.modes) or sighted.any())
@@ -78,7 +78,7 @@ def refine_joint(
     The cost is infinite if a point lies behind a camera at the start.
     """
     reduction, row = reduced_row(evidence, state)
-    system = Joint(reduction.evidence, has_latent(reduction.evidence))
+    system = Joint(reduction.evidence, _has_latent(reduction.evidence))
     cost, iterations, converged = refine(system, max_iterations, row)
     if system.integrates and cost < np.inf:
         cost = joint_cost(Joint(reduction.evidence, False), row)
@@ -89,7 +89,7 @@ def refine_joint(
 def objective_of(evidence: Evidence, state: State) -> float:
     """Objective of `refine_joint`: the cost, with the log determinant of what is integrated out."""
     reduction, row = reduced_row(evidence, state)
-    return float(joint_cost(Joint(reduction.evidence, has_latent(reduction.evidence)), row))
+    return float(joint_cost(Joint(reduction.evidence, _has_latent(reduction.evidence)), row))
 
 
 def score_state(evidence: Evidence, state: State) -> float:

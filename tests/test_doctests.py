@@ -49,7 +49,7 @@ def test_examples_run(
         if error.name not in OPTIONAL:
             raise
         pytest.skip(f"the optional package {error.name} is not installed")
-    if name.startswith("cadalign.torch."):
+    if name == "cadalign.torch":
         pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
     monkeypatch.chdir(tmp_path)  # what an example writes does not stay
     with capsys.disabled():

@@ -16,7 +16,6 @@ import cadalign
 pytestmark = pytest.mark.long
 
 DOCS = ROOT / "docs"
-EXTRAS = ("torch",)
 TUTORIALS = sorted((DOCS / "tutorials").glob("*.py"))
 PAGES = [
     page
@@ -116,24 +115,13 @@ def test_ipython_completes_names(user: Environment, use_jedi: bool) -> None:
     assert {"fit", "fit_batch", "datasets"} <= set(found)
 
 
-def needs(page: Path, extra: str) -> bool:
-    text = page.read_text(encoding="utf-8")
-    return f"cadalign.{extra}" in "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("extra", ["", *EXTRAS])
-def test_snippets_of_readme_and_site_run(user: Environment, extra: str) -> None:
+def test_snippets_of_readme_and_site_run(user: Environment) -> None:
     readme.write_files(user.home)
-    if extra:
-        pytest.importorskip(extra, reason=f'needs pip install -e ".[{extra}]"')
-        pages = [page for page in PAGES if needs(page, extra)]
-    else:
-        pages = [page for page in PAGES if not any(needs(page, each) for each in EXTRAS)]
-        assert len(pages) > 5
-    ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, pages)])
+    assert len(PAGES) > 5
+    ran = user.run("python", ["-c", RUN_SNIPPETS, *map(str, PAGES)])
     assert [line for line in ran.splitlines() if line.startswith("ran ")] == [
-        f"ran {page}" for page in pages
+        f"ran {page}" for page in PAGES
     ]
 
 

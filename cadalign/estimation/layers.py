@@ -6,13 +6,13 @@ leaves. The backward pass solves one linear system for each problem, vectorised 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import InputError
 from cadalign.estimation.focal import log_focal_range
 from cadalign.estimation.options import LOSSES, FitOptions
@@ -52,7 +52,7 @@ class KeypointBatch:
         present: BoolArray,
         cameras: tuple[Camera, ...],
     ) -> KeypointBatch:
-        """The batch of checked arrays, seen by cameras that `check_cameras` takes."""
+        """The batch of checked arrays, seen by cameras that `FitTask` takes."""
         present = present & np.isfinite(pixels).all(axis=2) & np.isfinite(sigmas) & (sigmas > 0)
         pixels = np.where(present[..., None], pixels, 0.0)
         sigmas = np.where(present, sigmas, 1.0)
@@ -68,11 +68,6 @@ class KeypointBatch:
         return cls(pixels, sigmas, present, rays, by_pixels, cameras)
 
     @property
-    def counts(self) -> IntArray:
-        """Numbers of present keypoints (B,)."""
-        return np.asarray(self.present.sum(axis=1))
-
-    @property
     def information(self) -> FloatArray:
         """Information (B, n, 2, 2) of the rays; 0 for those that are absent."""
         (a, b), (c, d) = self.by_pixels.transpose(2, 3, 0, 1)
@@ -80,23 +75,6 @@ class KeypointBatch:
         mixed = -weights * (a * c + b * d)  # of the inverse's columns; NumPy's takes thrice as long
         rows = [weights * (c * c + d * d), mixed], [mixed, weights * (a * a + b * b)]
         return np.ascontiguousarray(np.array(rows).transpose(2, 3, 0, 1))
-
-
-def check_cameras(cameras: Sequence[Camera], *, focal: str = "known") -> None:
-    """Refuse cameras that the derivatives don't know."""
-    if any(each.is_wide for each in cameras):
-        what = "wide lenses have no gradients"
-        raise InputError(what, where="camera", fix="undistort keypoints and camera first")
-    if focal == "known":
-        for each in cameras:
-            each.require_focal()
-        return
-    if len({(each.width, each.height) for each in cameras}) > 1:
-        what = "with an unknown focal length all images must have one size"
-        raise InputError(what, where="camera", fix="call fit for each size")
-    if any(each.distortion for each in cameras):
-        what = "an unknown focal length and lens distortion have no gradients together"
-        raise InputError(what, where="focal", fix="undistort keypoints and camera first")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,15 +90,19 @@ class FitTask:
     workers: int
 
     def __post_init__(self) -> None:
-        check_cameras(self.cameras, focal=self.options.focal)
-
-
-class BatchMinima(NamedTuple):
-    """Poses (B, 15) and focal lengths (B,) of what a search found, and for which problems (B,)."""
-
-    poses: FloatArray
-    focals: FloatArray
-    found: BoolArray
+        if any(each.is_wide for each in self.cameras):
+            what = "wide lenses have no gradients"
+            raise InputError(what, where="camera", fix="undistort keypoints and camera first")
+        if self.options.focal == "known":
+            for each in self.cameras:
+                each.require_focal()
+            return
+        if len({(each.width, each.height) for each in self.cameras}) > 1:
+            what = "with an unknown focal length all images must have one size"
+            raise InputError(what, where="camera", fix="call fit for each size")
+        if any(each.distortion for each in self.cameras):
+            what = "an unknown focal length and lens distortion have no gradients together"
+            raise InputError(what, where="focal", fix="undistort keypoints and camera first")
 
 
 class FitValues(NamedTuple):
@@ -138,7 +120,7 @@ class FitValues(NamedTuple):
 class BatchFits:
     """Fits of a batch in the parts that threads have shared."""
 
-    parts: Sequence[_Part]
+    parts: list[_Part]
 
     @property
     def values(self) -> FitValues:
@@ -147,7 +129,7 @@ class BatchFits:
 
     def pulled_back(self, *slopes: FloatArray) -> tuple[FloatArray, ...]:
         """Slopes by points, pixels and sigmas from those by rotation, translation, scale, focal."""
-        ends = np.cumsum([len(part.minima.found) for part in self.parts])[:-1]
+        ends = np.cumsum([len(part.sigmas) for part in self.parts])[:-1]
         given = zip(self.parts, *(np.split(each, ends) for each in slopes), strict=True)
         return _joined(part.pulled_back(*own) for part, *own in given)
 
@@ -158,12 +140,11 @@ def _joined(parts: Iterable[tuple[Any, ...]]) -> tuple[Any, ...]:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Fits of some problems, and their optima before the polish.
+    """Fits of some problems, and their optima before a Newton step.
 
     ``by_pixels`` (B, n, 2, 2) are the derivatives of the optima's rays by the pixels.
     """
 
-    minima: BatchMinima
     optima: Optima
     by_pixels: FloatArray
     sigmas: FloatArray
@@ -209,25 +190,17 @@ def fits_of(
         present = mask[some] & np.isfinite(points[some]).all(axis=2)
         batch = KeypointBatch.of(pixels[some], sigmas[some], present, cameras)
         known = np.where(batch.present[..., None], points[some], 0.0)
-        found = _searched(known, batch, options)
-        return _polished(known, batch, options, found, exact=task.exact)
+        return _fitted(known, batch, options, exact=task.exact)
 
     return BatchFits(in_threads(run, len(points), task.workers))
 
 
-def _polished(
-    points: FloatArray,
-    batch: KeypointBatch,
-    options: FitOptions,
-    minima: BatchMinima,
-    *,
-    exact: bool,
-) -> _Part:
+def _fitted(points: FloatArray, batch: KeypointBatch, options: FitOptions, *, exact: bool) -> _Part:
     """The fits of some problems, polished by a Newton step.
 
     The derivatives are those before it: it is far below the noise.
     """
-    poses, focals, valid = minima
+    poses, focals, valid = _searched(points, batch, options)
     pose = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:12], poses[:, 12:]
     given = np.array([camera.fx for camera in batch.cameras])
     ratio = (focals / given)[:, None, None]
@@ -269,12 +242,15 @@ def _polished(
         covariance,
         valid,
     )
-    return _Part(minima, optima, by_pixels, batch.sigmas, values)
+    return _Part(optima, by_pixels, batch.sigmas, values)
 
 
-def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> BatchMinima:
+def _searched(
+    points: FloatArray, batch: KeypointBatch, options: FitOptions
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Poses (B, 15) and focal lengths (B,) of the best minima, and for which problems (B,)."""
     present, cameras = batch.present, batch.cameras
-    offsets = np.concatenate([[0], np.cumsum(batch.counts)]).astype(np.int64)
+    offsets = np.concatenate([[0], np.cumsum(present.sum(axis=1))]).astype(np.int64)
     problems = Problems(points[present], batch.pixels[present], offsets, cameras)
     sigmas, each = batch.sigmas[present], None
     if len(cameras) > 1 or options.focal == "estimate":
@@ -288,4 +264,4 @@ def _searched(points: FloatArray, batch: KeypointBatch, options: FitOptions) -> 
     focals = np.array([camera.fx for camera in cameras]) * np.ones(len(points))
     if found.focals is not None:
         focals = np.where(valid, found.focals[:, 0], focals)
-    return BatchMinima(poses, focals, valid)
+    return poses, focals, valid

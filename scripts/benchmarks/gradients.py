@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from benchmarks import section
 from benchmarks.section import BenchmarkData, Row, Tables
-from cadalign import Camera, ShapeModel
+from cadalign import Camera
 from cadalign.evaluation.simulation import Problem, simulate_problem
 
 _WELL_KNOWN_DEG = 10.0
@@ -141,7 +140,7 @@ def gradient_errors(
 
     The gradient of a random combination of pose, stretch and focal length, along random steps of
     all pixels, relative to the root mean square of such products. Well-determined are problems
-    whose rotation is known to 10 degrees; of learned shapes, all with a solution.
+    whose rotation is known to 10 degrees.
 
     Parameters
     ----------
@@ -152,8 +151,7 @@ def gradient_errors(
     step : float
         Step of the differences [px].
     """
-    torch = _torch()
-    from cadalign.torch import align, fit
+    from cadalign.torch import fit
 
     rng = np.random.default_rng(given.seed)
     drawn, places, pixels = _drawn(rng, problems, points)
@@ -170,17 +168,6 @@ def gradient_errors(
         _row(name, partial(fit, places, camera=camera, **options), pixels, rng, step)
         for name, options in kinds.items()
     ]
-    mean = rng.uniform(-1, 1, (points, 3))
-    modes = 0.1 * rng.standard_normal((3, points, 3))
-    shape = ShapeModel.from_basis(mean, modes, np.ones(3), residual_sigma=0.01)
-    weights = rng.standard_normal((problems, 3, 1, 1))
-    objects = mean + (weights * modes).sum(axis=1)
-    poses = [replace(each.alignment, scale=np.ones(3)) for each in drawn]
-    pairs = zip(poses, objects, strict=True)
-    noisy = [section.seen_in(camera, pose, own, 1.0, rng).points_2d for pose, own in pairs]
-    seen = torch.tensor(np.array(noisy))
-    for name, loss in (("learned shape", "linear"), ("learned shape, cauchy", "cauchy")):
-        rows.append(_row(name, partial(align, shape, camera=camera, loss=loss), seen, rng, step))
     yield "Gradients beside finite differences, relative errors", rows
 
 
@@ -203,10 +190,8 @@ def _row(
     after, before = (parts(pixels + sign * step * steps) for sign in (1.0, -1.0))
     expected = ((after[0] - before[0]) * weights).sum(dim=1) / (2.0 * step)
     slopes = (seen.grad * steps).sum(dim=(1, 2))
-    known = found.valid & after[1].valid & before[1].valid
-    if found.covariance is not None:
-        turn = found.covariance.diagonal(dim1=1, dim2=2)[:, :3].sum(dim=1).sqrt()
-        known &= turn < np.radians(_WELL_KNOWN_DEG)
+    turn = found.covariance.diagonal(dim1=1, dim2=2)[:, :3].sum(dim=1).sqrt()
+    known = found.valid & after[1].valid & before[1].valid & (turn < np.radians(_WELL_KNOWN_DEG))
     size = seen.grad.flatten(1).norm(dim=1)
     errors = ((slopes - expected).abs() / size)[known].detach().numpy()
     return {

@@ -1,26 +1,23 @@
-"""`cadalign.torch.fit` and `align`: results of the estimates, gradients, masks, failures."""
+"""`cadalign.torch.fit`: results of the estimates, gradients, masks, failures."""
 
 from __future__ import annotations
 
-from functools import cache
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from support.problems import LENS, problem_of
 
 import cadalign
-from cadalign import Camera, ShapeModel
+from cadalign import Camera
 from cadalign.errors import InputError
-from cadalign.shapes.examples import Example
 
 torch = pytest.importorskip("torch", reason='needs pip install -e ".[torch]"')
-from cadalign.torch import PoseBatch, align, fit  # noqa: E402
+from cadalign.torch import PoseBatch, fit  # noqa: E402
 
 pytestmark = pytest.mark.slow
 COUNT, POINTS = 40, 10
-UNKNOWN = Camera.without_focal(640, 480)
 
 
 def tensors(count: int = COUNT, **options: Any) -> tuple[Any, Any, Camera]:
@@ -152,64 +149,24 @@ def test_gauss_newton_gradients_are_near_those_of_the_hessian() -> None:
     np.testing.assert_allclose(both[0], both[1], rtol=0.05, atol=1e-2)
 
 
-@cache
-def shapes(n: int = 9) -> tuple[ShapeModel, Any, Camera]:
-    """A learned shape, images (B, n, 2) of objects, and the camera."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.5, 0.5, (n, 3))
-    examples = [
-        Example(f"m{k}", range(n), points * rng.uniform(0.75, 1.3, 3) + rng.normal(0, 0.02, (n, 3)))
-        for k in range(60)
-    ]
-    camera = Camera(640, 480, 900, 900, 319.5, 239.5)
-    seen = []
-    for seed in range(6):
-        turn = Rotation.random(random_state=seed).as_matrix()
-        own = points * rng.uniform(0.8, 1.25, 3)
-        image = camera.project(own @ turn.T + [0.1, 0.1, 3])
-        seen.append(image + rng.normal(0, 0.5, (n, 2)))
-    return ShapeModel.learn(examples), torch.tensor(np.array(seen)), camera
+def test_unknown_focal_lengths_are_refused_where_poses_have_none() -> None:
+    unknown = Camera.without_focal(640, 480)
+    pose = torch.eye(3)[None], torch.tensor([[0.0, 0.0, 4.0]]), torch.ones(1, 3)
+    point = torch.tensor([[1.0, 0.0, 0.0]])
+    found = PoseBatch(*pose, focal=torch.tensor([400.0])).project(point, unknown)
+    assert found[0].tolist() == [[419.5, 239.5]]
+    with pytest.raises(InputError, match="camera: the focal length is unknown"):
+        PoseBatch(*pose).project(point, unknown)
 
 
-def test_align_gives_the_estimates_of_a_learned_shape_with_gradients() -> None:
-    model, pixels, camera = shapes()
-    found = align(model, pixels, camera, sigma=0.7)
-    assert found.valid.all()
-    for b in range(len(pixels)):
-        one = cadalign.align(model, cadalign.View(camera, pixels[b].numpy(), sigma=0.7))
-        np.testing.assert_allclose(found.rotation[b], one.alignment.rotation, atol=1e-6)
-        np.testing.assert_allclose(found.points_3d[b], one.points_3d, atol=1e-6)
-
-    def layer(given: Any, sigma: Any) -> tuple[Any, ...]:
-        poses = align(model, given, camera, sigma=sigma)
-        return poses.rotation, poses.translation, poses.points_3d
-
-    given = pixels[:2].clone().requires_grad_()
-    sigma = torch.full((2, 9), 0.7, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(
-        layer, (given, sigma), eps=1e-2, atol=1e-7, rtol=1e-3, fast_mode=True
+def test_every_pose_is_projected_by_its_own_camera() -> None:
+    plain = Camera(640, 480, 300.0, 310.0, 315.0, 245.0)
+    other = Camera(64, 48, 30.0, 31.0, 31.5, 24.5)
+    turns, center = torch.eye(3).expand(2, 3, 3), torch.tensor([[0.0, 0.0, 4.0]]).expand(2, 3)
+    found = PoseBatch(turns, center, torch.ones(2, 3)).project(
+        torch.tensor([[1.0, 1.0, 0.0]]), [plain, other]
     )
-
-
-def test_three_keypoints_align_as_in_cadalign() -> None:
-    model, pixels, camera = shapes()
-    ids = (1, 4, 7)
-    found = align(model, pixels[:, ids], camera, ids=ids, sigma=0.7)
-    for b, points_2d in enumerate(pixels[:, ids].numpy()):
-        one = cadalign.align(model, cadalign.View(camera, points_2d, ids=ids, sigma=0.7))
-        np.testing.assert_allclose(found.rotation[b], one.alignment.rotation, atol=1e-6)
-
-
-def test_align_marks_what_has_too_few_keypoints() -> None:
-    model, pixels, camera = shapes()
-    mask = torch.ones(6, 9, dtype=torch.bool)
-    mask[1, 2:] = False
-    given = pixels.clone().requires_grad_()
-    found = align(model, given, camera, mask=mask)
-    assert found.valid.tolist() == [True, False, True, True, True, True]
-    found.points_3d.sum().backward()
-    assert torch.isfinite(given.grad).all()
-    assert not given.grad[1].any()
+    assert found[:, 0].tolist() == [[390.0, 322.5], [39.0, 32.25]]
 
 
 @pytest.mark.parametrize(
@@ -257,25 +214,17 @@ def test_align_marks_what_has_too_few_keypoints() -> None:
             "camera: wide lenses have no gradients; undistort keypoints and camera first",
         ),
         (
-            lambda p, x, c: align(cadalign.Model(points_3d=p[0]), x, c),
-            "model: expected a cadalign.ShapeModel, got Model; points of a Model go to "
-            "cadalign.torch.fit",
-        ),
-        (
-            lambda p, x, c: align(shapes()[0], shapes()[1].long(), c),
-            "points_2d: expected floating point numbers, got torch.int64; give points_2d.double()",
-        ),
-        (
-            lambda p, x, c: align(*shapes()[:2], c, ids=[0, *range(shapes()[1].shape[1] - 1)]),
-            "ids: 0 occurs twice; give each once",
-        ),
-        (
-            lambda p, x, c: align(*shapes()[:2], UNKNOWN),
+            lambda p, x, c: fit(p, x, Camera.without_focal(640, 480)),
             'camera: the focal length is unknown; estimate it with focal="estimate", or give it: '
             "camera.with_focal(...)",
         ),
         (
-            lambda p, x, c: PoseBatch(*fit(p, x, c).__dict__.values()).project(p, LENS),
+            lambda p, x, c: fit(p, x, c).project(p, LENS),
+            "camera: projections in PyTorch know no lens distortion; undistort keypoints and "
+            "camera first",
+        ),
+        (  # of a wide lens, too, whose distortion is not stated
+            lambda p, x, c: fit(p, x, c).project(p, [c, c, replace(c, lens="fisheye")]),
             "camera: projections in PyTorch know no lens distortion; undistort keypoints and "
             "camera first",
         ),

@@ -1,4 +1,4 @@
-"""Posterior of pose and shape at a minimum, and derivatives of the minimum by its data."""
+"""Posterior of pose and shape at a minimum."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from cadalign.solvers.marginal.equations import (
     evaluate_posed,
     force_of,
     posed_room,
-    state_at,
 )
 from cadalign.solvers.marginal.problem import (
     GaussianTarget,
@@ -27,8 +26,7 @@ from cadalign.solvers.marginal.problem import (
     target_of,
     whiten,
 )
-from cadalign.solvers.search import Minima, step_at
-from cadalign.solvers.unknowns import move_rigid
+from cadalign.solvers.search import Minima
 
 
 class Posterior(NamedTuple):
@@ -220,66 +218,3 @@ def _block(whole: FloatArray, told: FloatArray, square: float, i: int, j: int) -
                 total -= told[3 * i + a, c] * told[3 * j + b, c]
             found[a, b] = total
     return found
-
-
-_DIFFERENCE = 1e-5  # in standard deviations, radians, and shares of lengths
-
-
-@kernel
-def slopes_of(
-    mixture: Mixture, component: int, seen: Seen, pose: FloatArray, force: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of a step of pose and forces (6 + 3 n), by these and by the data.
-
-    At the optimum, whose ``pose`` (12,) and ``force`` (n, 3) are given, the step that the equations
-    predict is zero. Its derivatives by the state and by the data, from central differences of the
-    equations themselves, give those of the state by the implicit function theorem:
-    ``ds = -(dG/ds)^-1 dG/dd dd``. All that the objective holds counts, the determinant that the
-    shape leaves and the weights of a robust loss included.
-
-    By the state (6 + 3 n, 6 + 3 n); by the rays (2 n) and the log sigmas (n), (6 + 3 n, 3 n).
-    """
-    target = target_of(mixture, component, seen)
-    n = target.mean.shape[0]
-    covariance = target.covariance
-    state = state_at(pose, n)
-    for k in range(3 * n):
-        state[POSE + 3 * n + k] = force[k // 3, k % 3]
-        for m in range(3 * n):
-            state[POSE + k] += covariance[k, m] * force[m // 3, m % 3]
-    size = POSE_UNKNOWNS + 3 * n
-    slopes = np.zeros((size, size + 3 * n))
-    for k in range(size + 3 * n):
-        step, unit, m = np.zeros(POSE_UNKNOWNS), _DIFFERENCE, k - POSE_UNKNOWNS
-        if 3 <= k < POSE_UNKNOWNS:
-            unit = _DIFFERENCE * abs(state[11])
-        elif POSE_UNKNOWNS <= k < size:
-            unit = _DIFFERENCE / np.sqrt(covariance[m, m]) if covariance[m, m] > 0.0 else 1.0
-        elif size <= k < size + 2 * n:
-            unit = _DIFFERENCE / seen.whitening[(k - size) // 2, 0]
-        for sign in (1.0, -1.0):
-            change, moved, changed = sign * unit, state.copy(), seen
-            if k < POSE_UNKNOWNS:
-                step[k] = change
-                move_rigid(state, step, moved)
-            elif k < size:
-                moved[POSE + 3 * n + m] += change
-                for j in range(3 * n):
-                    moved[POSE + j] += change * covariance[j, m]
-            else:
-                changed = _changed(seen, k - size, change)
-            slopes[:, k] += sign * step_at(Posed(target, changed, True), moved, 3 * n)
-        slopes[:, k] /= 2.0 * unit
-    return slopes[:, :size].copy(), slopes[:, size:].copy()
-
-
-@kernel
-def _changed(seen: Seen, datum: int, change: float) -> Seen:
-    """The keypoints with one coordinate of a ray, or one log sigma, changed."""
-    rays, whitening, others = seen.rays.copy(), seen.whitening.copy(), 2 * seen.points.shape[0]
-    if datum < others:
-        rays[datum // 2, datum % 2] += change
-    else:
-        for c in range(3):
-            whitening[datum - others, c] *= np.exp(-change)
-    return Seen(seen.points, rays, whitening, seen.loss, seen.loss_scale)

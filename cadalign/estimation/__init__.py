@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from cadalign.estimation.result import Result
     from cadalign.estimation.result_parts import Alternative, FitStats, ViewResult
     from cadalign.estimation.results import Results, to_dataframe
-    from cadalign.estimation.uncertainty.next_best import Advice, rank_evidence
     from cadalign.estimation.uncertainty.summary import (
         Contribution,
         EvidenceSummary,
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from cadalign.io.evidence import Size
 
 __all__ = [
-    "Advice",
     "Alternative",
     "Contribution",
     "EvidenceSummary",
@@ -52,7 +50,6 @@ __all__ = [
     "fit_batch",
     "model_of",
     "object_of",
-    "rank_evidence",
     "to_dataframe",
     "views_from",
     "views_of",

@@ -28,7 +28,6 @@ from cadalign import (
 )
 from cadalign.annotate.photos import PhotoFile, intrinsics_of
 from cadalign.errors import DataError, InputError
-from cadalign.estimation.uncertainty.next_best import rank_evidence
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound
 from cadalign.geometry.rotations import rotation_from_vector, vector_from_rotation
 from cadalign.render import Scene, cast_geometry
@@ -268,17 +267,6 @@ def test_a_start_is_given_in_the_lenses_frame() -> None:
     model = Model(points_3d=points, shape_sigma=0.02)
     view = view_of(FISHEYE, truth.apply(points), 0)
     assert degrees_off(align(model, view, init=truth), truth) < 3
-
-
-def test_next_best_evidence_of_a_wide_view() -> None:
-    truth, points = placed(95), points_of(4, 10)
-    ids = tuple(range(8))
-    view = view_of(FISHEYE, truth.apply(points[:8]), 0, ids=ids)
-    model = Model(points_3d=points)
-    result = align(model, view)
-    best = rank_evidence(model, [view], result, candidates=[8, 9])
-    assert {8, 9} <= {advice.detail for advice in best}
-    assert result.covariance is not None
 
 
 def test_misfit_and_warnings_are_those_of_pixels() -> None:

@@ -7,7 +7,6 @@ click no better. Both are unknown, and integrated out with the rest of the shape
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
@@ -347,48 +346,29 @@ def contour_bound(model: Model, view: View, gt: Alignment) -> FloatArray:
 
     It is in the form of `cadalign.Result.covariance`. The contour has the standard deviation and
     the correlation that its residuals show at the true alignment, which has the scale 1 along the
-    model's known axis. Raises InputError if the view has no mask, or the model is not exact.
+    model's known axis. Raises InputError if the view has no mask, its mask no contour, or the model
+    no mesh or is not exact.
     """
     if view.mask_image is None or model.shape_sigma is not None:
         raise InputError("expected a view with a mask, and an exact model", where="view")
     evidence = evidence_of(prior_of(model), [view])
     state = mean_state(evidence, gt.packed[None, :12], np.log(gt.scale))
-    full, stacked = with_contours(model, [view], evidence, state)
-    unknowns = pose_and_border(joint_covariance(full, stacked), 0)
-    return pose_and_lengths(full, stacked, unknowns)
-
-
-def with_contours(
-    model: Model, views: Sequence[View], evidence: Evidence, state: State
-) -> tuple[Evidence, State]:
-    """The evidence of an exact model's views with the contours of their masks.
-
-    Their standard deviation and correlation are those that their residuals show at the state.
-
-    Raises InputError if a mask has no contour, or the model has no mesh.
-    """
-    masked = [number for number, view in enumerate(views) if view.mask_image is not None]
-    if not masked:
-        return evidence, state
     keypoints = len(evidence.shape.mean) - 2
-    where = f"views[{masked[0]}].mask"
-    (surface,), _ = surfaces_of(model, evidence.shape.mean[:keypoints], where)
-    sought = Sought(evidence, keypoints, masked, surface)
-    (posed, poses), measured = sought.at(state), []
-    for number in masked:
-        view = views[number]
-        seen = contour_view(number, view, f"views[{number}].mask", view.camera)
-        sight = Sight(posed.caster, seen.camera, poses[number])
-        rims = find_rims(sight, seen.contour, _BOUND_REACH)
-        bias = extraction_bias(sight, seen.mask, seen.contour, rims)
-        rims = without_steep(seen.contour, rims, bias)
-        offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
-        centred = np.where(rims.found, rims.offset - offset, np.nan)
-        known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
-        noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
-        agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
-        rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)
-        sightings = rows.sightings._replace(loss=np.full_like(rows.sightings.loss, LINEAR))
-        measured.append(rows._replace(sightings=sightings))
-    joined = sought.joined(Place.of(state, len(measured)), measured)
-    return joined.evidence, joined.state
+    (surface,), _ = surfaces_of(model, evidence.shape.mean[:keypoints], "view.mask")
+    sought = Sought(evidence, keypoints, [0], surface)
+    posed, (pose,) = sought.at(state)
+    seen = contour_view(0, view, "view.mask", view.camera)
+    sight = Sight(posed.caster, seen.camera, pose)
+    rims = find_rims(sight, seen.contour, _BOUND_REACH)
+    bias = extraction_bias(sight, seen.mask, seen.contour, rims)
+    rims = without_steep(seen.contour, rims, bias)
+    offset = float(np.median(rims.offset[rims.found])) if rims.found.any() else 0.0
+    centred = np.where(rims.found, rims.offset - offset, np.nan)
+    known = Noise(1.0, 1.0, max(abs(offset), _LEAST_COMMON_OFFSET))
+    noise = noise_of(seen.contour, seen.sigma, rims, centred - bias, known, correlated=True)
+    agreeing = rims.found & (np.abs(np.nan_to_num(centred - bias)) < _INLIER * noise.sigma)
+    rows = seen.evidence_of(rims._replace(found=agreeing), noise, posed, sight, bias)
+    sightings = rows.sightings._replace(loss=np.full_like(rows.sightings.loss, LINEAR))
+    joined = sought.joined(Place.of(state, 1), [rows._replace(sightings=sightings)])
+    unknowns = pose_and_border(joint_covariance(joined.evidence, joined.state), 0)
+    return pose_and_lengths(joined.evidence, joined.state, unknowns)

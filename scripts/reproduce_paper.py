@@ -16,6 +16,7 @@ import tyro
 
 from cadalign import CadalignError
 from cadalign.datasets import write_sample_dataset
+from cadalign.evaluation import metrics
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.keypointnet import (
     PAPER_TABLE,
@@ -27,8 +28,7 @@ from cadalign.evaluation.experiments.keypointnet import (
 from cadalign.evaluation.experiments.keypointnet import SPEC as KEYPOINTNET
 from cadalign.evaluation.experiments.simulation import SPEC as SIMULATION
 from cadalign.evaluation.experiments.simulation import SWEEPS, SweepOptions
-from cadalign.evaluation.methods.method import LIMIT
-from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.methods import LIMIT
 from cadalign.evaluation.options import ExperimentOptions, RunOptions
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress

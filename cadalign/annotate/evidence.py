@@ -14,7 +14,7 @@ import numpy.typing as npt
 from cadalign.arrays import BoolArray, FloatArray
 from cadalign.errors import DataError, InputError
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.gravity import vertical_direction
+from cadalign.geometry.conventions import vertical_direction
 from cadalign.io.evidence import LENGTHS, ImageEvidence, Size
 from cadalign.io.images import read_mask
 from cadalign.io.observation import Observation

@@ -44,7 +44,7 @@ from cadalign.batch.spec import summarize_by
 from cadalign.datasets import AnnotatedModel, KeypointNet
 from cadalign.errors import DataError
 from cadalign.estimation.result import Result
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.options import absolute_paths
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import OnProgress, execute

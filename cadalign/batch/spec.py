@@ -14,8 +14,8 @@ import pyarrow as pa
 from cadalign.batch.experiment import FitRunOptions, plan_run
 from cadalign.batch.outputs import COLUMNS as TABLE_COLUMNS
 from cadalign.batch.outputs import NAMING, RECORD_COLUMNS, page_names, without_lists
-from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation import metrics
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.plots import Plot, cumulative_curves
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.tables import Cells, Run

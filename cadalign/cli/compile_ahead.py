@@ -75,7 +75,7 @@ def _align_shape(views: int) -> None:
 
 def _align_with_mask() -> None:
     from cadalign.estimation.align import align
-    from cadalign.estimation.contours.sampling import colors_at
+    from cadalign.estimation.contours.silhouettes import colors_at
     from cadalign.estimation.model import Model
     from cadalign.geometry.mesh import Mesh
     from cadalign.render import Scene, cast_geometry

@@ -185,7 +185,9 @@ def _align_all(
         raise no_pose_error(problem, model, ransac)
     has_mesh = isinstance(model, Model) and model.mesh is not None
     if has_mesh and any(len(each.evidence.image_depths.point) for each in minima):
-        from cadalign.estimation.contours.covered import without_covered  # with OpenCV and embree
+        from cadalign.estimation.contours.silhouette_starts import (
+            without_covered,  # with OpenCV and embree
+        )
 
         minima = without_covered(cast(Model, model), problem, minima)
     minima, refined = refine_with_images(model, prior, views, minima)

@@ -20,7 +20,7 @@ from cadalign.evaluation.functions import (
     choose_methods,
     choose_metrics,
 )
-from cadalign.evaluation.methods.method import LIMIT, Method, MethodInput
+from cadalign.evaluation.methods import LIMIT, Method, MethodInput
 from cadalign.evaluation.options import ExperimentOptions, text_of
 from cadalign.evaluation.runs.work import (
     FAILED,

@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 from cadalign.arrays import is_number, is_real
 from cadalign.errors import CadalignError, InputError, quote, unknown
-from cadalign.evaluation.methods.method import Method, MethodInput, fit_methods
-from cadalign.evaluation.methods.pnp import PNP_METHODS
-from cadalign.evaluation.metrics.table import Metric, metric_named
+from cadalign.evaluation.methods import PNP_METHODS, Method, MethodInput, fit_methods
+from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import Function, is_function, name_of
 from cadalign.evaluation.runs.work import Columns
 from cadalign.geometry.alignment import Alignment

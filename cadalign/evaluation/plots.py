@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.methods.method import LIMIT, fit_methods
-from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.table import HIGH, Metric
+from cadalign.evaluation import metrics
+from cadalign.evaluation.methods import LIMIT, fit_methods
+from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.runs.work import FAILED, OK
 from cadalign.evaluation.summary import Quartiles, known
 from cadalign.io.files import write_whole

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import DataError, InputError, quote, unknown
-from cadalign.evaluation.metrics.table import CATEGORY, Metric, told
+from cadalign.evaluation.metrics import CATEGORY, Metric, told
 from cadalign.evaluation.options import ExperimentOptions
 from cadalign.evaluation.plots import Plot, draw_plots
 from cadalign.evaluation.runs.work import COLUMNS, FAILED, SKIPPED, Columns, Plan

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics.table import CATEGORY, INSTANCES, Metric
+from cadalign.evaluation.metrics import CATEGORY, INSTANCES, Metric
 from cadalign.evaluation.runs.work import OK, SKIPPED, Row
 
 if TYPE_CHECKING:

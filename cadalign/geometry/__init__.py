@@ -12,9 +12,6 @@ if TYPE_CHECKING:
         alignment_from_opengl,
         opengl_from_model,
         opengl_projection,
-        resized_camera,
-    )
-    from cadalign.geometry.gravity import (
         up_from_gravity,
         up_from_pitch_roll,
         up_from_pose,
@@ -50,7 +47,6 @@ __all__ = [
     "opengl_from_model",
     "opengl_projection",
     "reprojection_error",
-    "resized_camera",
     "rotation_error",
     "scale_error",
     "symmetric_rotation_error",

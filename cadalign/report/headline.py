@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from cadalign.errors import InputError
-from cadalign.evaluation.methods.method import LIMIT
-from cadalign.evaluation.metrics.table import HIGH, Metric
+from cadalign.evaluation.methods import LIMIT
+from cadalign.evaluation.metrics import HIGH, Metric
 from cadalign.evaluation.photos.protocols import TRUTH
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.registry import spec_of

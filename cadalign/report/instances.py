@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 
 from cadalign.errors import DataError, quote
 from cadalign.evaluation.instances.record import RECORD_COLUMNS, record_stem
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.plots import compact
 from cadalign.evaluation.registry import spec_of
 from cadalign.evaluation.runs.tables import Run

@@ -56,8 +56,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cadalign.evaluation.methods.method import LIMIT
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.methods import LIMIT
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.plots import Plot, look_of
 from cadalign.evaluation.runs.tables import Run
 from cadalign.io.files import (

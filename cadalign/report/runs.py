@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from cadalign.errors import InputError
-from cadalign.evaluation.methods.method import LIMIT
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.methods import LIMIT
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.registry import BATCHES, Spec, spec_of, spec_of_config
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run

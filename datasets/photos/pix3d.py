@@ -28,7 +28,7 @@ from cadalign.datasets.photos.scannet import read_matrix
 from cadalign.errors import InputError
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import PIXEL_CENTRE
+from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import nearest_rotation
 from cadalign.io.documents import Finite, ForeignDocument, PathText, Point2, Point3, Positive, Text
 from cadalign.io.files import as_path

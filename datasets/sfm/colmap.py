@@ -26,7 +26,7 @@ from cadalign.datasets.sfm.correspondences import (
 from cadalign.errors import DataError, brief, quote
 from cadalign.geometry.calibration import COLMAP_PARAMS
 from cadalign.geometry.camera import Camera
-from cadalign.geometry.conventions import PIXEL_CENTRE
+from cadalign.geometry.pixels import PIXEL_CENTRE
 from cadalign.geometry.rotations import rotation_from_quat_wxyz
 from cadalign.io.documents import in_file
 from cadalign.io.files import as_path, damaged, read_bytes, read_text

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from cadalign.arrays import FloatArray
 from cadalign.errors import InputError
-from cadalign.geometry.conventions import rescaled_pixels
+from cadalign.geometry.pixels import rescaled_pixels
 
 Color = tuple[int, int, int]
 

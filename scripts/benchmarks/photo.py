@@ -19,7 +19,7 @@ from benchmarks.section import BenchmarkData, Row, Tables
 from cadalign import Alignment, Camera, Mesh, Model, Result, Symmetry, View, align
 from cadalign.arrays import FloatArray
 from cadalign.datasets import AnnotatedModel
-from cadalign.estimation.contours.line_changes import bins_of, regions_of
+from cadalign.estimation.contours.photo_lines import bins_of, regions_of
 from cadalign.evaluation.metrics.cramer_rao import probability_level
 from cadalign.geometry.rotations import nearest_rotation, rotation_from_vector
 from cadalign.io.images import read_photo

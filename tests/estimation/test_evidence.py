@@ -30,7 +30,7 @@ from cadalign.estimation.prior import Lenses, prior_of
 from cadalign.estimation.result import Result
 from cadalign.estimation.search import JointProblem
 from cadalign.estimation.uncertainty.evidence import redundancy_of
-from cadalign.geometry.gravity import up_from_vertical_edges
+from cadalign.geometry.conventions import up_from_vertical_edges
 from cadalign.shapes.parts import BoxMargins
 from cadalign.solvers.joint.evidence import State
 

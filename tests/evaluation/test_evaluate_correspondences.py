@@ -30,7 +30,7 @@ from cadalign.evaluation.instances.correspondences import (
     errors_of,
     spoil,
 )
-from cadalign.evaluation.methods.method import fit_options
+from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.tables import Run, read_table
 from cadalign.evaluation.simulation import Problem, simulate_problem

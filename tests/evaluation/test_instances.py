@@ -16,7 +16,7 @@ from cadalign.evaluation.instances.instance import (
     KeypointTask,
     make_hull_instances,
 )
-from cadalign.evaluation.methods.method import LIMIT, fit_methods, fit_options
+from cadalign.evaluation.methods import LIMIT, fit_methods, fit_options
 from cadalign.evaluation.metrics.cramer_rao import cramer_rao_bound, limit_estimate
 from cadalign.evaluation.simulation import simulate_problem
 from cadalign.geometry.box import Box

@@ -23,8 +23,7 @@ from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation.experiments.photos import PhotosOptions
 from cadalign.evaluation.functions import choose_methods
-from cadalign.evaluation.methods.method import MethodInput
-from cadalign.evaluation.methods.pnp import PNP_METHODS
+from cadalign.evaluation.methods import PNP_METHODS, MethodInput
 from cadalign.evaluation.plots import look_of
 from cadalign.evaluation.simulation import simulate_problem
 

@@ -19,8 +19,8 @@ from cadalign.cli import main
 from cadalign.errors import DataError, InputError
 from cadalign.evaluation import metrics as room
 from cadalign.evaluation.functions import FunctionMetric
+from cadalign.evaluation.metrics import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.metrics.photos import score_columns
-from cadalign.evaluation.metrics.table import BOX_IOU, ROTATION, Metric
 from cadalign.evaluation.photos.protocols import SETS
 from cadalign.evaluation.plots import cumulative
 from cadalign.report import headline_text

@@ -21,10 +21,10 @@ from cadalign.evaluation import registry
 from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments import photos
 from cadalign.evaluation.experiments.photos import PhotosOptions
-from cadalign.evaluation.methods.method import MethodInput
+from cadalign.evaluation.methods import MethodInput
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics import photos as metrics
 from cadalign.evaluation.metrics.photos import medians_of, score_alignment, score_columns
-from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.photos.methods import Sighting
 from cadalign.evaluation.photos.objects import PhotoObjects
 from cadalign.evaluation.photos.target import PhotoTask, PhotoTasks, opened

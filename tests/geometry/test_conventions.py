@@ -16,9 +16,8 @@ from cadalign.geometry.conventions import (
     alignment_from_opengl,
     opengl_from_model,
     opengl_projection,
-    rescaled_pixels,
-    resized_camera,
 )
+from cadalign.geometry.pixels import rescaled_pixels
 from cadalign.render import RaycastRenderer, Scene, look_at
 
 CAMERA = Camera(160, 120, 170.0, 140.0, 60.25, 71.75, (-0.25, 0.06, 0.004, -0.003))
@@ -43,7 +42,7 @@ def image_centroid(weight: np.ndarray) -> np.ndarray:
 def test_a_resized_camera_renders_where_the_resized_pixels_are(factor: float) -> None:
     pixel = np.array([80.0, 60.0])
     center = 3.0 * np.append(CAMERA.normalize([pixel])[0], 1.0)
-    resized = resized_camera(CAMERA, round(160 * factor), round(120 * factor))
+    resized = CAMERA.resized(round(160 * factor), round(120 * factor))
     expected = rescaled_pixels(pixel, factor)
     np.testing.assert_allclose(resized.project(center[None])[0], expected, atol=1e-9)
     if factor > 1:  # a marker of few pixels covers them unevenly

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from cadalign import Camera
 from cadalign.errors import InputError
-from cadalign.geometry.gravity import (
+from cadalign.geometry.conventions import (
     up_from_gravity,
     up_from_pitch_roll,
     up_from_pose,

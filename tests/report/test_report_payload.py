@@ -29,7 +29,7 @@ from cadalign.evaluation.experiments.retrieval import RetrievalRunOptions
 from cadalign.evaluation.experiments.simulation import SweepOptions
 from cadalign.evaluation.instances.record import record_stem
 from cadalign.evaluation.instances.views import KeypointTasks, keypointnet_benchmark
-from cadalign.evaluation.methods.method import fit_options
+from cadalign.evaluation.methods import fit_options
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.run import Progress
 from cadalign.evaluation.runs.tables import read_table

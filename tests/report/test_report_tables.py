@@ -14,7 +14,7 @@ from cadalign.cli import main
 from cadalign.errors import InputError
 from cadalign.evaluation.api import run as do_run
 from cadalign.evaluation.experiments.simulation import SweepOptions
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.report import FORMATS, headline_text
 from cadalign.report.headline import Headline, HeadlineRow, table_text

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from cadalign import Alignment, Mesh
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA
 from cadalign.evaluation.instances.pictures import preview_of
-from cadalign.evaluation.metrics.table import INSTANCE_METRICS as METRICS
+from cadalign.evaluation.metrics import INSTANCE_METRICS as METRICS
 from cadalign.render import look_at
 from cadalign.report.page import method_dict, render_page
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
 from cadalign.errors import InputError
-from cadalign.estimation.contours.sampling import Image, sampled
+from cadalign.estimation.contours.silhouettes import Image, sampled
 from cadalign.geometry.alignment import Alignment, model_rays
 from cadalign.geometry.camera import Camera
 from cadalign.geometry.raycaster import RayCaster

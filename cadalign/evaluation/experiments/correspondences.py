@@ -13,9 +13,9 @@ import tyro
 from cadalign.datasets import open_correspondences
 from cadalign.errors import InputError
 from cadalign.estimation.options import RansacOptions
-from cadalign.evaluation.methods.method import LIMIT
-from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.table import Metric
+from cadalign.evaluation import metrics
+from cadalign.evaluation.methods import LIMIT
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.options import FunctionOptions
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec

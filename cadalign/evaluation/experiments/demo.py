@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cadalign.errors import DataError
+from cadalign.evaluation import metrics
 from cadalign.evaluation.experiments.keypointnet import ON_INSTANCES, TABLE, KeypointNetOptions
-from cadalign.evaluation.metrics import table as metrics
 from cadalign.evaluation.options import NoiseOption
 from cadalign.evaluation.registry import Spec
 from cadalign.evaluation.runs.work import Plan

@@ -11,10 +11,10 @@ import numpy as np
 
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
+from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.methods.method import LIMIT
-from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.table import INSTANCE_METRICS, UP_TO_SCALE, Metric
+from cadalign.evaluation.methods import LIMIT
+from cadalign.evaluation.metrics import INSTANCE_METRICS, UP_TO_SCALE, Metric
 from cadalign.evaluation.options import ViewOptions
 from cadalign.evaluation.plots import in_math, label_log_axis, look_of, new_figure, save_figure
 from cadalign.evaluation.registry import Reference, Spec

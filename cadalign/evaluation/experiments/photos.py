@@ -15,9 +15,10 @@ import tyro
 
 from cadalign.datasets.photos.dataset import PhotoDataset
 from cadalign.errors import DataError, InputError, quote
+from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.methods.pnp import PNP_METHODS
-from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.methods import PNP_METHODS
+from cadalign.evaluation.metrics import BOX_IOU
 from cadalign.evaluation.metrics.photos import DEPTH as DEPTH_ERROR
 from cadalign.evaluation.metrics.photos import (
     IOU_3D,
@@ -31,7 +32,6 @@ from cadalign.evaluation.metrics.photos import (
     shares_of,
 )
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
-from cadalign.evaluation.metrics.table import BOX_IOU
 from cadalign.evaluation.options import FunctionOptions, PhotoOptions, is_function
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.plots import cumulative_curves

@@ -13,8 +13,8 @@ import tyro
 
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
-from cadalign.evaluation.metrics import table as metrics
-from cadalign.evaluation.metrics.table import QUERIES, Metric
+from cadalign.evaluation import metrics
+from cadalign.evaluation.metrics import QUERIES, Metric
 from cadalign.evaluation.options import ModelOptions
 from cadalign.evaluation.plots import Plot, Trace
 from cadalign.evaluation.registry import Spec

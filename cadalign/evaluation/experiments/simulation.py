@@ -17,11 +17,11 @@ import tyro
 
 from cadalign.arrays import instance_rng
 from cadalign.errors import DataError, InputError, refuse_unused, unknown
+from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting
-from cadalign.evaluation.methods.method import Method, MethodInput
-from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.methods import Method, MethodInput
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import alignment_errors
-from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.options import FunctionOptions, name_of, plain_value
 from cadalign.evaluation.plots import QUARTILES_NOTE, Plot, Trace
 from cadalign.evaluation.registry import Spec

@@ -10,9 +10,9 @@ import numpy as np
 
 from cadalign.datasets import KeypointNet
 from cadalign.errors import InputError
+from cadalign.evaluation import metrics
 from cadalign.evaluation.benchmark import VIEW_NAMES
-from cadalign.evaluation.methods.method import LIMIT, SHAPE
-from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation.methods import LIMIT, SHAPE
 from cadalign.evaluation.options import (
     FunctionOptions,
     ModelOptions,

@@ -21,7 +21,7 @@ from cadalign.estimation.options import RansacOptions
 from cadalign.estimation.result import Result
 from cadalign.evaluation.benchmark import Benchmark, Case, Setting, Tasks
 from cadalign.evaluation.experiments.correspondences import COLUMNS, NAMES, CorrespondenceOptions
-from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.metrics.errors import alignment_errors
 from cadalign.evaluation.runs.work import Row, fingerprint
 from cadalign.evaluation.simulation import Problem, simulate_problem

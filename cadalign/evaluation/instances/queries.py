@@ -30,7 +30,7 @@ from cadalign.evaluation.experiments.retrieval import (
 )
 from cadalign.evaluation.instances.hull import KeypointHull, sample_hull_view
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, STRETCH_RANGE, example_view
-from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.methods import Method
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment

@@ -29,7 +29,7 @@ from cadalign.evaluation.instances.record import (
     record_of,
 )
 from cadalign.evaluation.instances.views import KeypointTasks
-from cadalign.evaluation.methods.method import LIMIT, SHAPE, Method, MethodInput
+from cadalign.evaluation.methods import LIMIT, SHAPE, Method, MethodInput
 from cadalign.evaluation.metrics.cramer_rao import limit_estimate, probability_level
 from cadalign.evaluation.metrics.errors import overlap, overlap_up_to_scale
 from cadalign.evaluation.runs.folder import RunFolder

@@ -40,9 +40,9 @@ from cadalign.evaluation.instances.record import (
     pose_of,
     record_of,
 )
-from cadalign.evaluation.methods.method import SHAPE, Method, MethodInput
+from cadalign.evaluation.methods import SHAPE, Method, MethodInput
+from cadalign.evaluation.metrics import BOX_IOU_UP_TO_SCALE
 from cadalign.evaluation.metrics.errors import estimate_errors, overlap_up_to_scale
-from cadalign.evaluation.metrics.table import BOX_IOU_UP_TO_SCALE
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import FAILED, Columns, Outcome, Row, fingerprint, reason_of
 from cadalign.evaluation.shape_files import NO_SHAPES, ShapeFiles

@@ -22,9 +22,9 @@ import numpy as np
 
 from cadalign.arrays import BoolArray
 from cadalign.datasets.photos.kitti_keypoints import car_box, yaw_of_car
-from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation import metrics
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.errors import overlap_up_to_scale
-from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.work import FAILED, Columns, Row
 from cadalign.evaluation.summary import known, median_of
 from cadalign.geometry.alignment import Alignment

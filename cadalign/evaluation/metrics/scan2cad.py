@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cadalign.arrays import FloatArray
-from cadalign.evaluation.metrics import table as metrics
+from cadalign.evaluation import metrics
+from cadalign.evaluation.metrics import Metric
 from cadalign.evaluation.metrics.photos import MetricSet
-from cadalign.evaluation.metrics.table import Metric
 from cadalign.evaluation.runs.work import Row
 from cadalign.geometry.alignment import Alignment
 from cadalign.geometry.box import Box

@@ -18,7 +18,7 @@ from cadalign.estimation.options import SIMILAR_SCALE_SIGMA
 from cadalign.estimation.result import Result
 from cadalign.estimation.view import View
 from cadalign.evaluation.instances.record import box_alignment
-from cadalign.evaluation.methods.method import SHAPE
+from cadalign.evaluation.methods import SHAPE
 from cadalign.evaluation.photos import protocols
 from cadalign.evaluation.photos.protocols import KeypointOptions, Protocol
 from cadalign.evaluation.photos.target import Cad, PhotoTarget, rectangle_of

@@ -38,7 +38,7 @@ from cadalign.evaluation.instances.record import (
     record_of,
     record_stem,
 )
-from cadalign.evaluation.methods.method import Method, MethodInput
+from cadalign.evaluation.methods import Method, MethodInput
 from cadalign.evaluation.metrics.photos import score_alignment
 from cadalign.evaluation.options import is_function
 from cadalign.evaluation.photos.methods import (

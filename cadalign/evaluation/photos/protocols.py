@@ -14,7 +14,7 @@ from cadalign.datasets.photos.pascal3d import Pascal3D, Pascal3DDetections
 from cadalign.datasets.photos.pix3d import Pix3D
 from cadalign.datasets.photos.scan2cad import Scan2CAD
 from cadalign.errors import InputError, quote
-from cadalign.evaluation.methods.method import SHAPE
+from cadalign.evaluation.methods import SHAPE
 from cadalign.evaluation.metrics.photos import KITTI, NINE_DOF, VIEWPOINT, MetricSet
 from cadalign.evaluation.metrics.scan2cad import SCAN2CAD
 from cadalign.evaluation.options import ExperimentOptions

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from cadalign.arrays import is_number
 from cadalign.errors import DataError, quote
-from cadalign.evaluation.metrics.table import Metric, metric_named
+from cadalign.evaluation.metrics import Metric, metric_named
 from cadalign.evaluation.options import name_of
 from cadalign.evaluation.runs.folder import RunFolder
 from cadalign.evaluation.runs.work import COLUMNS, Columns, Row

@@ -20,7 +20,7 @@ from cadalign.estimation.contours.contour import (
     find_rims,
     mask_contour,
 )
-from cadalign.estimation.contours.sampling import colors_at, sampled
+from cadalign.estimation.contours.silhouettes import colors_at, sampled
 from cadalign.estimation.contours.view_contour import (
     Noise,
     correlation_length,

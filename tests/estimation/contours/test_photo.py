@@ -14,15 +14,15 @@ import pytest
 from cadalign import Alignment, Camera, Mesh, Model, View, align
 from cadalign.errors import DataError, InputError
 from cadalign.estimation.contours.contour import Sight
-from cadalign.estimation.contours.line_changes import (
+from cadalign.estimation.contours.photo_lines import (
     bins_of,
     changes_of,
     crossings_of,
     edges_of,
     regions_of,
+    silhouette_of,
     with_neighbours,
 )
-from cadalign.estimation.contours.photo_lines import silhouette_of
 from cadalign.estimation.contours.surface import RigidSurface
 from cadalign.estimation.result import Result
 from cadalign.geometry.rotations import rotation_from_vector

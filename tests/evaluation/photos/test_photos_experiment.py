@@ -32,7 +32,7 @@ from cadalign.evaluation.api import evaluate, run
 from cadalign.evaluation.benchmark import Benchmark
 from cadalign.evaluation.experiments.photos import COLUMNS, SPEC, PhotosOptions, summarize
 from cadalign.evaluation.instances.pictures import cut_out
-from cadalign.evaluation.methods.method import Method
+from cadalign.evaluation.methods import Method
 from cadalign.evaluation.photos.methods import PhotoEstimate, Sighting
 from cadalign.evaluation.photos.objects import PhotoObjects
 from cadalign.evaluation.photos.target import PhotoTasks, farthest_points, opened

@@ -1,1 +1,0 @@
-"""Methods that benchmarks run on instances."""

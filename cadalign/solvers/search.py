@@ -163,27 +163,6 @@ def _descend(
         move(system, state, current, damping, step, trial)
 
 
-@kernel
-def step_at(system: Any, state: FloatArray, followers: int) -> FloatArray:
-    """The step that the equations at a state predict, whose root is the optimum.
-
-    The changes of the last numbers of the state, so many ``followers``, follow that of the
-    unknowns. NaN where the equations do not determine these.
-    """
-    equations, _ = room_of(system)
-    size, first = equations.gradient.shape[0], state.shape[0] - followers
-    found, step, moved = np.full(size + followers, np.nan), np.zeros(size), state.copy()
-    if not evaluate(system, state, equations) < np.inf:
-        return found
-    if np.isnan(solve(system, equations, 0.0, step)):
-        return found
-    move(system, state, equations, 0.0, step, moved)
-    copy_into(found[:size], step)
-    for k in range(followers):
-        found[size + k] = moved[first + k] - state[first + k]
-    return found
-
-
 class Effort(NamedTuple):
     """Effort of a search.
 

@@ -50,11 +50,11 @@ class Optima:
     scale: FloatArray  # (B, 3)
     scale_prior: ScalePrior
     free: IntArray  # (u,) rows of the unknowns that were estimated
-    loss: int = LINEAR  # one of `cadalign.solvers.constants`
-    loss_scale: float = 1.0
-    exact: bool = True
-    focal_offset: FloatArray | float = 0.0  # (B,) of the log focal length from its prior's mean
-    focal_weight: FloatArray | float = 0.0  # (B,) of that prior
+    loss: int  # one of `cadalign.solvers.constants`
+    loss_scale: float
+    exact: bool
+    focal_offset: FloatArray  # (B,) of the log focal length from its prior's mean
+    focal_weight: FloatArray  # (B,) of that prior
 
     @cached_property
     def _axes(self) -> FloatArray:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray
+from cadalign.solvers.linalg import factorize, invert_factor, product, solve_factor_rows
 
 _UNSEEN = 1e-6  # weight of the previous mean: a component without vectors stays where it is
 
@@ -161,11 +162,11 @@ def _conditionals(vectors: Vectors, model: Gaussians) -> list[Conditional]:
     for mean, covariance in zip(model.means, model.covariances, strict=True):
         root, offsets, gaps = _root(covariance), vectors.offsets(mean), []
         if vectors.gaps:
-            precision = _symmetric(_inverse(root))
-            pulled = offsets @ precision
+            precision = _inverse(root)
+            pulled = product(offsets, precision)
             for rows, missing in vectors.gaps:
                 of_gap = _root(precision[missing[:, None], missing])
-                gaps.append((of_gap, _solve(of_gap, pulled[rows, missing].T, twice=True)))
+                gaps.append((of_gap, _solve(of_gap, pulled[rows, missing].T)))
         found.append(Conditional(root, offsets, tuple(gaps)))
     return found
 
@@ -175,7 +176,7 @@ def _log_densities(vectors: Vectors, model: Gaussians, given: Sequence[Condition
     found = np.empty((len(vectors.values), len(model.weights)))
     constants = vectors.has.sum(axis=1) / 2 * math.log(2 * math.pi)
     for number, (root, offsets, gaps) in enumerate(given):
-        whitened = _solve(root, offsets.T)
+        whitened = product(invert_factor(root), np.ascontiguousarray(offsets.T))
         squares = np.einsum("nr,nr->r", whitened, whitened)
         volumes = constants + np.log(root.diagonal()).sum()
         # The density of all entries, integrated over those that are missing.
@@ -196,7 +197,7 @@ def _expect(
     for (rows, missing), (of_gap, below) in zip(vectors.gaps, given.gaps, strict=True):
         completed[rows, missing] = mean[missing] - below.T
         spread[missing[:, None], missing] += shares[rows].sum() * _inverse(of_gap)
-    return completed, _symmetric(spread)
+    return completed, spread
 
 
 def _maximise(
@@ -214,7 +215,7 @@ def _maximise(
         mean = share @ completed + _UNSEEN * model.means[number]
         mean /= share.sum() + _UNSEEN
         offsets = completed - mean
-        scatter = offsets.T @ (share[:, None] * offsets) + spread
+        scatter = product(offsets.T, share[:, None] * offsets) + spread
         scatter += (strength + _UNSEEN) * towards
         covariance = scatter / (share.sum() + strength + _UNSEEN)
         covariance[np.diag_indices_from(covariance)] += floor**2
@@ -224,32 +225,24 @@ def _maximise(
     return Gaussians(totals / totals.sum(), np.array(means), np.array(covariances))
 
 
-# SciPy's own checks would take longer than the factorisation of such small matrices.
+# Compiled here, and so are products: BLAS shares such small matrices out among threads, which takes
+# 30 times as long on a busy machine.
 def _root(covariance: FloatArray) -> FloatArray:
-    from scipy.linalg.lapack import dpotrf
-
-    root, info = dpotrf(covariance, lower=1, clean=1)
-    if info:
+    """The lower Cholesky factor."""
+    root = np.tril(covariance)
+    if not factorize(root):
         raise np.linalg.LinAlgError("a covariance is not positive definite")
-    return np.asarray(root)
+    return root
 
 
-def _solve(root: FloatArray, right: FloatArray, *, twice: bool = False) -> FloatArray:
-    """The quotient by the root, or, ``twice``, by the matrix that has it."""
-    from scipy.linalg.lapack import dpotrs, dtrtrs
-
-    solution, _ = (dpotrs if twice else dtrtrs)(root, right, lower=1)
-    return np.asarray(solution)
+def _solve(root: FloatArray, right: FloatArray) -> FloatArray:
+    """The quotient by the matrix that has the root."""
+    solution = np.array(right, order="C")
+    solve_factor_rows(root, solution)
+    return solution
 
 
 def _inverse(root: FloatArray) -> FloatArray:
-    """The lower half of the inverse of the matrix that has the root, zeros above."""
-    from scipy.linalg.lapack import dpotri
-
-    lower, _ = dpotri(root, lower=1)
-    return np.asarray(lower)
-
-
-def _symmetric(lower: FloatArray) -> FloatArray:
-    """The matrix with that lower half."""
-    return lower + np.tril(lower, -1).T
+    """The inverse of the matrix that has the root."""
+    half = invert_factor(root)
+    return product(half.T, half)

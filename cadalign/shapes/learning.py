@@ -11,11 +11,9 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from cadalign.arrays import BoolArray, FloatArray, IntArray, require_counts
 from cadalign.errors import InputError
@@ -247,13 +245,9 @@ def learn_parts(
         raise InputError(what, where="components")
     extents = np.nanmax(rows, axis=1) - np.nanmin(rows, axis=1)
     models = _Models(ids, rows, float(np.median(np.linalg.norm(extents, axis=1))))
-    # Threads of the linear algebra libraries make products of such small matrices 30 times slower.
-    # The limit reaches those that are loaded: SciPy brings one of its own.
-    import_module("scipy.linalg.lapack")
-    with threadpool_limits(1):
-        tried = _CrossValidation(models, on_progress)
-        choice = tried.choose(components, modes, reflection)
-        mixture = models.mixture(choice.recipe)
+    tried = _CrossValidation(models, on_progress)
+    choice = tried.choose(components, modes, reflection)
+    mixture = models.mixture(choice.recipe)
     on_progress(_STEPS, _STEPS)
     weights = mixture.weights / mixture.weights.sum()
     parts = sorted(

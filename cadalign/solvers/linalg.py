@@ -198,6 +198,19 @@ def invert_factor(factor: FloatArray) -> FloatArray:
     return inverse
 
 
+@fast_sums
+def product(first: FloatArray, second: FloatArray) -> FloatArray:
+    """The matrix product (n, k) of (n, m) and (m, k), in one thread."""
+    found = np.zeros((first.shape[0], second.shape[1]))
+    for i in range(first.shape[0]):
+        own = found[i]
+        for j in range(second.shape[0]):
+            share, other = first[i, j], second[j]
+            for c in range(own.shape[0]):
+                own[c] += share * other[c]
+    return found
+
+
 @inlined
 def copy_into(target: FloatArray, source: FloatArray) -> None:
     """Copy a vector; ``target[:] = source`` makes Numba compile text for its error message."""

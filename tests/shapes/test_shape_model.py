@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -148,27 +146,6 @@ def test_progress_ends_at_all_steps() -> None:
     done = [each[0] for each in steps]
     assert done == sorted(done)
     assert steps[-1][0] == steps[-1][1]
-
-
-@pytest.mark.long
-def test_linear_algebra_runs_in_one_thread() -> None:
-    """In a fresh process, where SciPy's library would be loaded while models are learned."""
-    program = """
-import numpy as np
-from threadpoolctl import threadpool_info
-from cadalign.shapes.examples import Example
-from cadalign.shapes.model import ShapeModel
-rng, threads = np.random.default_rng(0), set()
-models = [Example(str(k), list(range(5)), rng.normal(size=(5, 3))) for k in range(12)]
-models = [Example(e.model_id, e.ids[1:], e.points_3d[1:]) for e in models[:6]] + models[6:]
-def note(done, total):
-    if done < total:
-        threads.update(each["num_threads"] for each in threadpool_info())
-ShapeModel.learn(models, on_progress=note)
-print(sorted(threads))
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert done.stdout == "[1]\n", done.stdout + done.stderr
 
 
 @pytest.mark.parametrize("count", [4, 5, 11])

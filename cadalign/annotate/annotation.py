@@ -1,4 +1,4 @@
-"""An annotation: one object in one photo, its model and its files."""
+"""An annotation: one object in one photo, and its files."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False)
 class Annotation:
-    """An object in a photo, its model and files, and the outcome of the last save."""
+    """An object in a photo, its files, and the outcome of the last save."""
 
     session: Session = field(repr=False)
     photo: PhotoFile
     intrinsics: Intrinsics
-    model: OpenedModel
     files: AnnotationFiles
     stored: Observation
     """Content of the file when it was opened, of which marks take the place."""
@@ -54,6 +53,11 @@ class Annotation:
     """The last alignment and suggestion, with their document."""
     by_mask: tuple[object, dict[Camera, Result]] | None = field(default=None, repr=False)
     """Estimates by the mask alone, with what they depend on."""
+
+    @property
+    def model(self) -> OpenedModel:
+        """The model of the session."""
+        return self.session.model
 
     @property
     def document(self) -> AnnotationDocument:
@@ -107,7 +111,7 @@ class Annotation:
     def estimates_by_mask(self) -> dict[Camera, Result]:
         """Estimates by the mask alone, kept until more than pairs changes."""
         document = self.document
-        key = replace(document.evidence, start=None), document.priors, self.model
+        key = replace(document.evidence, start=None), document.priors
         if self.by_mask is None or self.by_mask[0] != key:
             self.by_mask = key, {}
         return self.by_mask[1]

@@ -1,15 +1,14 @@
-"""Actions of the page on what is known beside the pairs, and on the model."""
+"""Actions of the page on what is known beside the pairs, and on other objects."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 
 import numpy as np
 
 from cadalign.annotate.annotation import Annotation
-from cadalign.annotate.document import AnnotationDocument, History, Pair, Priors
+from cadalign.annotate.document import AnnotationDocument, History, Priors
 from cadalign.annotate.evidence import (
     MarkedLengths,
     MarkedMask,
@@ -19,12 +18,11 @@ from cadalign.annotate.evidence import (
     find_up,
 )
 from cadalign.annotate.files import NOTHING, AnnotationFiles
-from cadalign.annotate.models import KeypointRegistry
 from cadalign.annotate.names import further_file
 from cadalign.annotate.photos import FocalChoice
 from cadalign.annotate.problem import LIKELY_STRETCH
 from cadalign.errors import InputError
-from cadalign.io.documents import Count, Finite, Point2, Text
+from cadalign.io.documents import Count, Finite, Point2
 from cadalign.io.observation import Observation
 from cadalign.io.observation_file import StartFields
 
@@ -55,7 +53,6 @@ def another(state: Annotation) -> ActionOutcome:
         session,
         state.photo,
         state.intrinsics,
-        state.model,
         AnnotationFiles(free),
         Observation(*NOTHING, state.camera, up_axis=state.stored.up_axis),
         History(AnnotationDocument(focal=state.document.focal, priors=priors)),
@@ -63,67 +60,6 @@ def another(state: Annotation) -> ActionOutcome:
     )
     session.photos.append(new)  # at the end: others keep their numbers
     return ActionOutcome(message="Mark the other object of this photo.", shown=new)
-
-
-def model(state: Annotation, *, category: Text, model: Text) -> ActionOutcome | None:
-    """Go on with another model of the library.
-
-    Pairs keep their keypoints by semantic id or name.
-    """
-    session = state.session
-    if session.choice is None:
-        raise InputError("the session has no library", where="model", fix="start with --library")
-    mesh = session.choice.model((category, model)).mesh_path
-    assert mesh is not None
-    old, new = state.model, session.models.of(mesh)
-    if new is old:
-        return None
-    if session.ready:
-        new.prepare()
-    carried = carry_keypoints(old.registry, new.registry, session.choice.ids_on(old.path))
-    before = len(state.document.keypoints)
-    state.history = state.history.changed(lambda document: _carried(document, carried))
-    state.model, state.live = new, None
-    state.detected = tuple(
-        replace(one, keypoint=carried[one.keypoint])
-        for one in state.detected
-        if one.keypoint in carried
-    )
-    lost = before - len(state.document.keypoints)
-    if not lost:
-        return None
-    pairs = "1 pair has" if lost == 1 else f"{lost} pairs have"
-    return ActionOutcome(message=f"{pairs} no keypoint on this model: click on it.")
-
-
-def carry_keypoints(
-    old: KeypointRegistry, new: KeypointRegistry, known: Collection[int]
-) -> dict[int, int]:
-    """Ids of the old model's keypoints on the new one, by the same semantic id, else name.
-
-    Only semantic ids that are ``known`` mean the same on both. A keypoint that was renamed keeps
-    its name.
-    """
-    carried = {number: number for number, _ in old if number in known and number in new}
-    for number in carried:
-        if old[number].name != new[number].name:
-            new.rename(number, old[number].name)
-    free = {point.name: number for number, point in new if number not in carried}
-    return carried | {
-        number: free[point.name]
-        for number, point in old
-        if number not in carried and point.name in free
-    }
-
-
-def _carried(document: AnnotationDocument, carried: Mapping[int, int]) -> AnnotationDocument:
-    """The document with its pairs' keypoints on the new model; halves without any are left out."""
-    moved: list[Pair] = []
-    for pair in document.pairs:
-        keypoint = None if pair.keypoint is None else carried.get(pair.keypoint)
-        if keypoint is not None or pair.uv is not None:
-            moved.append(replace(pair, keypoint=keypoint))
-    return replace(document, pairs=tuple(moved))
 
 
 # What is known beside the pairs -------------------------------------------------------------------
@@ -220,6 +156,6 @@ def use_photo(state: Annotation, *, on: bool) -> ActionOutcome | None:
 
 
 EVIDENCE_ACTIONS = (
-    *(another, model, focal, prior, mask_load, mask_cut, mask_clear, vertical, gravity_clear),
+    *(another, focal, prior, mask_load, mask_cut, mask_clear, vertical, gravity_clear),
     *(lengths, use_photo),
 )

@@ -1,4 +1,4 @@
-"""The CAD models of a session, the shape of its objects, and their keypoints."""
+"""The CAD model of a session, the shape of its objects, and their keypoints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.lines import Wireframe
 from cadalign.annotate.model import ClickableModel
 from cadalign.annotate.names import LastContent, keypoints_file
@@ -318,90 +317,30 @@ class OpenedModel:
         self.content.note(self.keypoints_path)
 
 
-class Models:
-    """The models that objects can have, by number; each is opened when it is first needed.
+def open_model(
+    path: Path, folder: Path, *, keypoints: Path | None = None, shape: ObjectShape
+) -> OpenedModel:
+    """Open a model, whose keypoints are written into a folder.
 
-    Keypoints are written into ``folder``; ``keypoints`` are the first model's, where they are not
-    beside it. The ids of a shape's keypoints are reserved; a library gives its models' keypoints.
+    ``keypoints`` are those given with it, where they are not beside it. New ones don't get the ids
+    of the shape's.
     """
-
-    def __init__(
-        self,
-        paths: Sequence[Path],
-        folder: Path,
-        *,
-        keypoints: Path | None = None,
-        shape: ObjectShape,
-        choice: ModelChoice | None = None,
-    ) -> None:
-        self.paths: list[Path] = []
-        self._folder = folder
-        self._keypoints = keypoints
-        self._choice = choice
-        self._reserved = frozenset(shape.reserved)
-        if choice is not None:
-            self._reserved |= choice.ids
-        self._models: dict[int, OpenedModel] = {}
-        for path in paths:
-            self.number_of(path)
-
-    def __getitem__(self, number: int) -> OpenedModel:
-        if not 0 <= number < len(self.paths):
-            raise InputError(
-                f"there is no model {number}", where="model", fix="choose one of the list"
-            )
-        if number not in self._models:
-            self._models[number] = self._open(self.paths[number])
-        return self._models[number]
-
-    @property
-    def opened(self) -> tuple[OpenedModel, ...]:
-        """The models that are open."""
-        return tuple(self._models.values())
-
-    def number_of(self, path: Path) -> int:
-        """The number of the model of a file, which is added if it is not among them."""
-        wanted = path.resolve()
-        for number, known in enumerate(self.paths):
-            if known.resolve() == wanted:
-                return number
-        self.paths.append(path)
-        return len(self.paths) - 1
-
-    def of(self, path: Path) -> OpenedModel:
-        """The model of a file, opened."""
-        return self[self.number_of(path)]
-
-    def _open(self, path: Path) -> OpenedModel:
-        require_utf8(path)
-        cad = ClickableModel(load_mesh(path))
-        own, beside = self._keypoints_path(path), keypoints_file(path, path.parent)
-        source = beside if self._models or self._keypoints is None else self._keypoints
-        mesh = cad.scene.mesh
-        given = () if self._choice is None else self._choice.keypoints_of(path)
-        if source != own and (source != beside or source.exists()):
-            given = ModelKeypoints.load(source, mesh=mesh, model=path).keypoints
-        tolerance = _SAME_PLACE * cad.diagonal
-        content = LastContent()
-        content.note(own)
-        registry = KeypointRegistry(given, reserved=self._reserved, tolerance=tolerance)
-        if own.exists():
-            earlier = ModelKeypoints.load(own, mesh=mesh, model=path)
-            refuse_other_model(earlier.model, path, where=own)
-            registry.merge(earlier.keypoints)
-        return OpenedModel(path, cad, registry, own, content)
-
-    def _keypoints_path(self, path: Path) -> Path:
-        """The model's file of keypoints; with folders in its name where another model has it."""
-        if not self._models and self._choice is None:
-            return keypoints_file(path, self._folder)
-        taken = {model.keypoints_path for model in self.opened}
-        candidates = [
-            keypoints_file(path, self._folder, parents=count)
-            for count in range(len(path.resolve().parts) - 1)
-        ]
-        free = (each for each in candidates if each not in taken and not _is_others(each, path))
-        return next(free, candidates[-1])
+    require_utf8(path)
+    cad = ClickableModel(load_mesh(path))
+    own, beside = keypoints_file(path, folder), keypoints_file(path, path.parent)
+    source, mesh = keypoints or beside, cad.scene.mesh
+    given: tuple[ModelKeypoint, ...] = ()
+    if source != own and (source != beside or source.exists()):
+        given = ModelKeypoints.load(source, mesh=mesh, model=path).keypoints
+    content = LastContent()
+    content.note(own)
+    tolerance = _SAME_PLACE * cad.diagonal
+    registry = KeypointRegistry(given, reserved=shape.reserved, tolerance=tolerance)
+    if own.exists():
+        earlier = ModelKeypoints.load(own, mesh=mesh, model=path)
+        refuse_other_model(earlier.model, path, where=own)
+        registry.merge(earlier.keypoints)
+    return OpenedModel(path, cad, registry, own, content)
 
 
 def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
@@ -422,10 +361,3 @@ def refuse_other_model(named: Path | None, model: Path, *, where: Path) -> None:
         where=str(where),
         fix="give another --observation or --out",
     )
-
-
-def _is_others(path: Path, model: Path) -> bool:
-    if not path.exists():
-        return False
-    named = ModelKeypoints.load(path).model
-    return named is not None and named.resolve() != model.resolve()

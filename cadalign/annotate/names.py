@@ -85,10 +85,9 @@ def file_name(stem: str, ending: str) -> str:
     return name
 
 
-def keypoints_file(model: Path, folder: Path, *, parents: int = 0) -> Path:
-    """Path of a model's keypoints file in a folder, named by the model and some of its folders."""
-    parts = model.resolve().parts[-1 - parents : -1] if parents else ()
-    return folder / file_name(".".join([*parts, model.stem]), SUFFIX)
+def keypoints_file(model: Path, folder: Path) -> Path:
+    """Path of a model's keypoints file in a folder."""
+    return folder / file_name(model.stem, SUFFIX)
 
 
 def free_mask_file(observation: Path) -> Path:
@@ -177,15 +176,6 @@ def _named_photos(path: Path) -> list[Path]:
     images = [view.get("image") for view in views if isinstance(view, dict)]
     named = [path_from(each, path.parent) for each in images if isinstance(each, str) and each]
     return [photo for photo in named if os.path.exists(photo)]
-
-
-def named_model(path: Path) -> Path | None:
-    """The model's mesh that an observation file names and that is there; None without one."""
-    given = _observation(path).get("model")
-    if not isinstance(given, str) or not given:
-        return None
-    mesh = path_from(given, path.parent)
-    return mesh if mesh.is_file() else None
 
 
 def _has_namesake(photo: Path) -> bool:

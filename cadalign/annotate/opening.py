@@ -1,4 +1,4 @@
-"""Opening of a session: photos, models, camera and earlier annotations are read and checked."""
+"""Opening of a session: photos, model, camera and earlier annotations are read and checked."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from cadalign.annotate.detected import read_detected
 from cadalign.annotate.document import History, Priors
 from cadalign.annotate.evidence import MarkedEvidence, MarkedLengths, MarkedMask
 from cadalign.annotate.files import NOTHING, AnnotationFiles, stored_priors
-from cadalign.annotate.library import ModelChoice
-from cadalign.annotate.models import Models, ObjectShape
+from cadalign.annotate.models import ObjectShape, open_model
 from cadalign.annotate.names import (
     file_name,
     further_files,
     keypoints_file,
-    named_model,
     observation_file,
     refuse_collisions,
 )
@@ -82,7 +80,7 @@ def find_session_files(options: SessionOptions) -> SessionFiles:
     ]
     keypoints = keypoints_file(options.model, out)
     files = SessionFiles(tuple(photos), tuple(observations), tuple(further), keypoints)
-    read = [options.model, options.camera, options.mask, options.detections, options.library]
+    read = [options.model, options.camera, options.mask, options.detections]
     read += [photo.path for photo in photos]
     if options.keypoints != keypoints:
         read.append(options.keypoints)
@@ -94,23 +92,17 @@ def open_session(options: SessionOptions, files: SessionFiles | None = None) -> 
     """Open an annotation session."""
     files = files or find_session_files(options)
     folder = files.keypoints.parent
-    shape, choice = ObjectShape.open(options), ModelChoice.open(options)
-    models = Models(
-        [options.model],
-        folder,
-        keypoints=options.keypoints,
-        shape=shape,
-        choice=choice,
-    )
+    shape = ObjectShape.open(options)
+    model = open_model(options.model, folder, keypoints=options.keypoints, shape=shape)
     size = files.photos[0].width, files.photos[0].height
     camera = None if options.camera is None else read_camera(options.camera, size)
-    session = Session(models, WorkList.open(folder), shape, choice)
+    session = Session(model, WorkList.open(folder), shape)
     for photo, own, further in zip(files.photos, files.observations, files.further, strict=True):
         for file in (own, *further):
             session.photos.append(_open_annotation(session, options, photo, camera, file))
             session.photos[-1].is_further = file in further
     if options.detections is not None:
-        found = read_detected(options.detections, files.photos, models[0].registry)
+        found = read_detected(options.detections, files.photos, model.registry)
         for photo, detected in zip(files.photos, found, strict=True):
             first = next(each for each in session.photos if each.photo is photo)
             first.detected = detected
@@ -125,14 +117,11 @@ def _open_annotation(
     file: Path,
 ) -> Annotation:
     """An annotation of a photo; options add evidence to the first one."""
-    mesh = options.model
-    if options.library is not None and file.exists():  # another one may have been chosen
-        mesh = named_model(file) or mesh
     if options.focal is not None or options.fov is not None:
         camera = camera or Camera.without_focal(photo.width, photo.height)
         camera = with_lens(camera, options.focal, fov=options.fov)
-    model, files = session.models.of(mesh), AnnotationFiles(file)
-    stored, document = files.read(photo.path, model, session.shape)
+    files = AnnotationFiles(file)
+    stored, document = files.read(photo.path, session.model, session.shape)
     marks = document.evidence
     if not session.photos:
         marks = _with_options(marks, options, photo)
@@ -147,7 +136,7 @@ def _open_annotation(
     if options.up_axis is not None:
         stored = replace(stored, up_axis=options.up_axis)
     document = replace(document, focal=focal, priors=priors, evidence=marks)
-    return Annotation(session, photo, intrinsics, model, files, stored, History(document))
+    return Annotation(session, photo, intrinsics, files, stored, History(document))
 
 
 def _with_options(

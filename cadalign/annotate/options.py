@@ -35,16 +35,11 @@ class FileOptions:
     """Known lengths of a single photo's object: width, height, length (along the model's x, y, z)
     and sigma, their relative standard deviation, as in --size height 0.91 sigma 0.005."""
     up_axis: Literal["x", "y", "z"] | None = None
-    """The models' axis that points up, for their view and for gravity; by default the observation
+    """The model's axis that points up, for its view and for gravity; by default the observation
     file's, or y."""
     detections: Path | None = None
     """Keypoints of a detector, to confirm or correct: COCO's JSON, MMPose's, ultralytics'
     or CSV, with the photos' file names and the names of the model's keypoints."""
-    library: Path | None = None
-    """File of `cadalign library build`: the model can be chosen from it by the pairs marked so far,
-    and MODEL may be left out. The pairs keep their keypoints by name."""
-    category: str | None = None
-    """The only category of the library to choose from."""
     shape: Path | None = None
     """File of `cadalign shape learn`: estimate the object's own shape, of that category, from
     keypoints that it knows by semantic id or name."""

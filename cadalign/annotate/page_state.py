@@ -42,8 +42,6 @@ def page_state(
                 "height": state.photo.height,
                 "model": state.model.path.name,
                 "up_axis": state.stored.up_axis or "y",
-                "model_number": session.models.number_of(state.model.path),
-                "has_library": session.choice is not None,
                 "state": session.work_state(state),
             },
             "saved": {

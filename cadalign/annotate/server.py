@@ -22,16 +22,13 @@ from starlette.types import ASGIApp
 from cadalign.annotate.actions import perform
 from cadalign.annotate.annotation import Annotation
 from cadalign.annotate.guard import Access, BoundedProtocol, Guard
-from cadalign.annotate.library import thumbnail_of
 from cadalign.annotate.model import detail_bytes, display_bytes
 from cadalign.annotate.options import LOOPBACK
 from cadalign.annotate.page_state import page_state, worklist_state
-from cadalign.annotate.ranking import ranking_state
 from cadalign.annotate.session import Session
-from cadalign.errors import CadalignError, InputError, quote
+from cadalign.errors import CadalignError, InputError
 from cadalign.web import asset
 
-_LONGEST_NUMBER = 9  # digits
 _BYTES = "application/octet-stream"
 
 
@@ -48,9 +45,7 @@ def make_app(session: Session, access: Access) -> ASGIApp:
         "/worklist": routes.worklist,
         "/thumbnail/{number:int}": routes.thumbnail,
         "/mask/{number:int}": routes.mask,
-        "/library/{number:int}.jpg": routes.library,
-        "/state/{number:int}": partial(routes.data, page_state),
-        "/models/{number:int}": partial(routes.data, ranking_state),
+        "/state/{number:int}": routes.state,
     }
     app = Starlette(
         routes=[
@@ -104,7 +99,7 @@ class _Routes:
     def __init__(self, session: Session, access: Access) -> None:
         self._session = session
         self._access = access
-        self._models: dict[int, bytes] = {}
+        self._model = b""
 
     def page(self, request: Request) -> Response:
         response = Response(asset("annotate.html"), media_type="text/html")
@@ -113,14 +108,12 @@ class _Routes:
         return response
 
     def model(self, request: Request) -> Response:
-        number = _number(request, "number") or 0
         with self._session.lock:
-            if number not in self._models:
-                self._models[number] = display_bytes(self._session.models[number].cad)
-        return Response(self._models[number], media_type=_BYTES)
+            self._model = self._model or display_bytes(self._session.model.cad)
+        return Response(self._model, media_type=_BYTES)
 
     def details(self, request: Request) -> Response:
-        opened = self._session.models[_number(request, "number") or 0]
+        opened = self._session.model
         return Response(detail_bytes(opened.cad, opened.wireframe.creases), media_type=_BYTES)
 
     def photo(self, request: Request) -> Response:
@@ -131,13 +124,9 @@ class _Routes:
         return JSONResponse(worklist_state(self._session))
 
     def thumbnail(self, request: Request) -> Response:
-        return _kept(self._annotation(request).photo.thumbnail())
-
-    def library(self, request: Request) -> Response:
-        choice = self._session.choice
-        if choice is None:
-            raise InputError("the session has no library", where="library")
-        return _kept(thumbnail_of(choice, request.path_params["number"]))
+        thumbnail = self._annotation(request).photo.thumbnail()
+        kept = {"Cache-Control": "max-age=3600"}
+        return Response(thumbnail, media_type="image/jpeg", headers=kept)
 
     def mask(self, request: Request) -> Response:
         mask = self._annotation(request).mask
@@ -147,9 +136,8 @@ class _Routes:
         Image.fromarray(np.stack([np.zeros_like(opacity), opacity], axis=2), "LA").save(data, "PNG")
         return Response(data.getvalue(), media_type="image/png")
 
-    def data(self, answer: Callable[..., dict[str, Any]], request: Request) -> Response:
-        """Answer with what a function returns for an annotation."""
-        return JSONResponse(answer(self._session, request.path_params["number"]))
+    def state(self, request: Request) -> Response:
+        return JSONResponse(page_state(self._session, request.path_params["number"]))
 
     async def act(self, request: Request) -> Response:
         """Do an action of the page; answers with the state after it."""
@@ -176,19 +164,6 @@ class _Routes:
 
 def _asset(name: str, media_type: str, request: Request) -> Response:
     return Response(asset(name), media_type=media_type)
-
-
-def _kept(thumbnail: bytes) -> Response:
-    return Response(thumbnail, media_type="image/jpeg", headers={"Cache-Control": "max-age=3600"})
-
-
-def _number(request: Request, name: str) -> int | None:
-    given = request.query_params.get(name)
-    if given is None:
-        return None
-    if not given.isdecimal() or len(given) > _LONGEST_NUMBER:
-        raise InputError(f"{quote(given)} is no number", where=name, fix="reload the page")
-    return int(given)
 
 
 async def _refused(request: Request, error: Exception) -> Response:

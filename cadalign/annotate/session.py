@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from cadalign.annotate.annotation import Annotation
 from cadalign.annotate.files import AnnotationFiles
-from cadalign.annotate.library import ModelChoice
 from cadalign.annotate.live import LiveAlignment, live_alignment, missing_text
-from cadalign.annotate.models import Models, ObjectShape
+from cadalign.annotate.models import ObjectShape, OpenedModel
 from cadalign.annotate.photos import State, WorkList
 from cadalign.annotate.problem import Known, warm_up
 from cadalign.annotate.suggestion import Suggestion, suggest
@@ -28,10 +27,9 @@ from cadalign.io.images import read_photo
 class Session:
     """All state of an annotator; safe to use from several threads."""
 
-    models: Models
+    model: OpenedModel
     worklist: WorkList
     shape: ObjectShape = field(default_factory=ObjectShape)
-    choice: ModelChoice | None = None  # the library that objects' models are chosen from
     photos: list[Annotation] = field(default_factory=list)
     ready: bool = False  # True once the solvers are compiled and loaded, so that a fit is instant
 
@@ -41,15 +39,13 @@ class Session:
         self._pixels: tuple[Path, npt.NDArray[np.uint8]] | None = None
 
     def warm_up(self) -> None:
-        """Compile or load the solvers, and prepare the models, until the session has ``ended``."""
+        """Compile or load the solvers, and prepare the model, until the session has ``ended``."""
         try:
             marked = (each for each in self.photos if each.document.complete_pairs)
             joint = self.shape.is_estimated or not all(
                 each.observation().is_plain for each in marked
             )
-            steps = [partial(_load_solvers, joint=joint)]
-            steps += [partial(model.prepare) for model in self.models.opened]
-            for step in steps:
+            for step in (partial(_load_solvers, joint=joint), self.model.prepare):
                 if self.ended.is_set():
                     return
                 step()
@@ -81,7 +77,7 @@ class Session:
         """Compute the alignment and the next keypoint of the current annotation."""
         if not self.ready:
             return LiveAlignment(message="Solvers and model are being prepared."), None
-        document, model = annotation.document, annotation.model
+        document, model = annotation.document, self.model
         if annotation.live is not None and annotation.live[0] is document:
             return annotation.live[1:]
         suggestion = None
@@ -97,7 +93,7 @@ class Session:
 
     def _align(self, annotation: Annotation) -> LiveAlignment:
         observation, shape = annotation.observation(), self.shape
-        pairs, model = annotation.document.complete_pairs, annotation.model
+        pairs, model = annotation.document.complete_pairs, self.model
         points = model.points_of(pairs)
         by_mask = observation.evidence.mask is not None and not shape.is_estimated
         by_photo = observation.init is not None and "image" in observation.fit_options
@@ -120,7 +116,7 @@ class Session:
         return live_alignment(estimate, known, model.wireframe, observation, points, uv)
 
     def save(self, annotation: Annotation) -> None:
-        """Write the files of an annotation and of its model; an error is kept for the page.
+        """Write the files of an annotation and of the model; an error is kept for the page.
 
         Those that could not be written before are written too.
         """
@@ -139,8 +135,7 @@ class Session:
         with self.lock:
             unsaved = self.unsaved
             if folder is not None:
-                for model in self.models.opened:
-                    model.keypoints_path = folder / model.keypoints_path.name
+                self.model.keypoints_path = folder / self.model.keypoints_path.name
                 for each in unsaved:
                     each.files = AnnotationFiles(folder / each.files.observation.name)
             for each in unsaved:
@@ -150,10 +145,10 @@ class Session:
         ready = self.ready  # asked first: it may become so at any time
         annotation.fit_pending = not ready
         live, _ = self.live(annotation)
-        used = (each.document.keypoints for each in self.photos if each.model is annotation.model)
+        used = (each.document.keypoints for each in self.photos)
         try:
             # First the keypoints, which the observation names.
-            annotation.model.write_keypoints(frozenset[int]().union(*used))
+            self.model.write_keypoints(frozenset[int]().union(*used))
             written = annotation.observation(fit_options=live.fit_options, to_write=True)
             annotation.files.write(written)
             if ready:

@@ -56,10 +56,6 @@ class Annotate(FileOptions):
         found: dict[str, Path] = {}
         for name, given in (("image", self.image), ("model", self.model)):
             path = given if given is not None else (files.pop(0) if files else None)
-            if path is None and name == "model" and self.library is not None:
-                from cadalign.annotate.library import starting_model
-
-                path = starting_model(self, found["image"])
             if path is None:
                 what = "no photo is given" if name == "image" else "no model is given"
                 raise UsageError(what, where=flag_of(name), fix="cadalign annotate PHOTO MODEL")
@@ -113,7 +109,7 @@ class Annotate(FileOptions):
 
 def _save_and_say_where(session: Session) -> int:
     """Save what could not be saved before, elsewhere if need be; returns the exit code."""
-    folder = session.models[0].keypoints_path.parent.absolute()
+    folder = session.model.keypoints_path.parent.absolute()
     session.save_unsaved()
     if not session.unsaved:
         say(f"Saved in {folder}")

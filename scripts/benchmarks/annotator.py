@@ -150,7 +150,7 @@ def _times(clicks: int, given: BenchmarkData, browser: Browser, folder: Path) ->
         place_twenty(session, own)
         if kind == "mask":
             pose = own.instance.cam_from_model
-            mask = cast_geometry(session.models[0].cad.scene, own.instance.camera, pose).mask
+            mask = cast_geometry(session.model.cad.scene, own.instance.camera, pose).mask
             perform(session, 0, {"do": "mask_load", "runs": list(encode_runs(mask))})
         last = session.photos[0].document.pairs[-1]
         perform(session, 0, {"do": "delete", "pair": last.number})
@@ -372,12 +372,12 @@ def _pictured_session(mesh: Mesh, folder: Path) -> Session:
         SessionOptions(image=folder / "photo.png", model=folder / "model.obj", out=folder)
     )
     perform(session, 0, {"do": "focal", "known": True, "pixels": CAMERA.fx})
-    model = session.models[0].cad
+    model = session.model.cad
     seen = visible_keypoints(model.scene, model.sample_points, CAMERA, pose)
     shown = [point for point, is_seen in zip(model.samples, seen, strict=True) if is_seen]
     rng = np.random.default_rng(0)
     for point in shown[:PICTURED_PAIRS]:
         ((u, v),) = CAMERA.project(pose.apply([point.xyz])) + rng.normal(size=(1, 2))
-        place(session, session.models[0].registry.add(point), [float(u), float(v)])
+        place(session, session.model.registry.add(point), [float(u), float(v)])
     session.warm_up()
     return session

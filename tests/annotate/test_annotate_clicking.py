@@ -119,8 +119,8 @@ def test_mirror_planes_are_those_of_the_surface() -> None:
 
 def test_mirrored_pair_is_offered_until_it_is_there(case: Case) -> None:
     session = case.open()
-    corner = max(session.models[0].cad.samples, key=lambda point: abs(point.xyz[0]))
-    keypoint = session.models[0].registry.add(corner)
+    corner = max(session.model.cad.samples, key=lambda point: abs(point.xyz[0]))
+    keypoint = session.model.registry.add(corner)
     place(session, keypoint, [100, 100])
     (pair,) = page_state(session, 0)["pairs"]
     assert pair["mirrored"] is not None
@@ -137,8 +137,8 @@ def test_mirrored_pair_is_offered_until_it_is_there(case: Case) -> None:
 
 def aim(session: Session) -> dict[str, Any]:
     """A ray that hits the model away from its keypoints."""
-    model = session.models[0].cad
-    keypoints = np.array([point.xyz for _, point in session.models[0].registry])
+    model = session.model.cad
+    keypoints = np.array([point.xyz for _, point in session.model.registry])
     for target in model.scene.triangles.mean(axis=1):
         origin = target + [0, 0, -3 * model.diagonal]
         point = model.pick(origin, [0, 0, 1])
@@ -197,14 +197,14 @@ def on_page(page: Page, xyz: np.ndarray) -> tuple[float, float]:
 
 def seen_corner(page: Page, session: Session) -> np.ndarray:
     """A corner of the model that is seen in the page, apart from the markers."""
-    eye = session.models[0].cad.from_display(
+    eye = session.model.cad.from_display(
         page.evaluate("annotator.model.stage.camera.position.toArray()")
     )
-    points = session.models[0].cad.snap_points
-    keypoints = np.array([point.xyz for _, point in session.models[0].registry])
+    points = session.model.cad.snap_points
+    keypoints = np.array([point.xyz for _, point in session.model.registry])
     for xyz in points.xyz[points.kind == 0]:
         gap = np.linalg.norm(keypoints - xyz, axis=1).min()
-        if gap > 0.1 * session.models[0].cad.diagonal and session.models[0].cad.is_seen(eye, xyz):
+        if gap > 0.1 * session.model.cad.diagonal and session.model.cad.is_seen(eye, xyz):
             return np.asarray(xyz)
     raise AssertionError
 
@@ -214,7 +214,7 @@ def test_key_held_snaps_and_points_are_dragged_on_the_model(
 ) -> None:
     page, session = opened
     corner = seen_corner(page, session)
-    x, y = on_page(page, session.models[0].cad.to_display(corner))
+    x, y = on_page(page, session.model.cad.to_display(corner))
     page.keyboard.down("s")
     wait(page, "annotator.isSnapping")
     page.mouse.click(x + 3, y + 2)
@@ -222,16 +222,16 @@ def test_key_held_snaps_and_points_are_dragged_on_the_model(
     page.keyboard.up("s")
     wait(page, "!annotator.isSnapping")
     snapped = np.array(
-        session.models[0].registry[session.photos[0].document.pairs[0].keypoint or 0].xyz
+        session.model.registry[session.photos[0].document.pairs[0].keypoint or 0].xyz
     )
-    assert np.linalg.norm(snapped - corner) < 0.03 * session.models[0].cad.diagonal
-    gaps = np.linalg.norm(session.models[0].cad.snap_points.xyz - snapped, axis=1)
-    assert gaps.min() < 1e-9 * session.models[0].cad.diagonal
+    assert np.linalg.norm(snapped - corner) < 0.03 * session.model.cad.diagonal
+    gaps = np.linalg.norm(session.model.cad.snap_points.xyz - snapped, axis=1)
+    assert gaps.min() < 1e-9 * session.model.cad.diagonal
 
     # Dragged, the model stays where it is, and the point goes to the surface under the pointer.
     eye = "annotator.model.stage.camera.position.toArray()"
     before = page.evaluate(eye)
-    x, y = on_page(page, session.models[0].cad.to_display(snapped))
+    x, y = on_page(page, session.model.cad.to_display(snapped))
     middle = page.evaluate(
         """() => { const { left, top, width, height } =
             annotator.model.stage.canvas.getBoundingClientRect();
@@ -244,14 +244,10 @@ def test_key_held_snaps_and_points_are_dragged_on_the_model(
     page.mouse.up()
     page.wait_for_timeout(300)
     wait(page, IDLE)
-    moved = np.array(
-        session.models[0].registry[session.photos[0].document.pairs[0].keypoint or 0].xyz
-    )
+    moved = np.array(session.model.registry[session.photos[0].document.pairs[0].keypoint or 0].xyz)
     assert page.evaluate(eye) == pytest.approx(before)
     if np.linalg.norm(moved - snapped) > 0:
-        assert on_page(page, session.models[0].cad.to_display(moved)) == pytest.approx(
-            target, abs=2
-        )
+        assert on_page(page, session.model.cad.to_display(moved)) == pytest.approx(target, abs=2)
     else:
         assert "missed" in page.locator("[role=alert]").inner_text()
     page.mouse.move(*middle)
@@ -263,8 +259,8 @@ def test_key_held_snaps_and_points_are_dragged_on_the_model(
 
 def test_mirror_image_is_taken_by_key(opened: tuple[Page, Session]) -> None:
     page, session = opened
-    corner = max(session.models[0].cad.samples, key=lambda point: abs(point.xyz[0]))
-    place(session, session.models[0].registry.add(corner), [100, 100])
+    corner = max(session.model.cad.samples, key=lambda point: abs(point.xyz[0]))
+    place(session, session.model.registry.add(corner), [100, 100])
     page.evaluate("annotator.api.refresh()")
     wait(page, "annotator.api.idle && annotator.state.pairs.length === 1")
     page.get_by_role("button", name="mirror image of pair 1").wait_for()

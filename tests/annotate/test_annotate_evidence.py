@@ -153,7 +153,7 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
     assert stored(case)["mask"] == "m.mask.png"
     assert stored(case)["size"] == whole.size.given
     live, _ = session.live(session.photos[0])
-    points = session.models[0].registry.xyz(keypoint for keypoint, _ in case.clicks)
+    points = session.model.registry.xyz(keypoint for keypoint, _ in case.clicks)
     view = View(
         case.instance.camera,
         [uv for _, uv in case.clicks],
@@ -168,7 +168,7 @@ def test_mask_and_lengths_are_given_by_options(case: Case) -> None:
     model = Model(
         points_3d=points,
         ids=[k for k, _ in case.clicks],
-        mesh=session.models[0].cad.scene.mesh,
+        mesh=session.model.cad.scene.mesh,
         stretch_sigma=LIKELY_STRETCH,
     )
     expected = align(model, view, size=Size(**whole.size.given))

@@ -80,7 +80,7 @@ def test_model_of_a_long_name(case: Case) -> None:
     place(session, 0, [10, 20])
     assert page_state(session, 0)["saved"]["trouble"] == ""
     again = case.open(model=model, keypoints=None)
-    assert len(again.models[0].registry) == len(session.models[0].registry)
+    assert len(again.model.registry) == len(session.model.registry)
 
 
 @pytest.mark.parametrize("option", ["image", "model", "camera", "keypoints", "observation"])

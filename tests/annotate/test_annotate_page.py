@@ -96,7 +96,7 @@ class Driver:
     def eye(self) -> np.ndarray:
         """Where the model is looked at from, in model coordinates."""
         eye = self.page.evaluate("annotator.model.stage.camera.position.toArray()")
-        return self.session.models[0].cad.from_display(eye)
+        return self.session.model.cad.from_display(eye)
 
     def look(self, eye: np.ndarray) -> None:
         """Look at the model from another place, as orbiting would."""
@@ -106,7 +106,7 @@ class Driver:
                 annotator.model.stage.controls.update();
                 annotator.model.stage.invalidate();
             }""",
-            self.session.models[0].cad.to_display(eye).tolist(),
+            self.session.model.cad.to_display(eye).tolist(),
         )
         self.page.wait_for_timeout(50)
 
@@ -130,19 +130,17 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
     page = driver.page
     # The chair as the photo shows it, so that the keypoints that are seen there are seen here.
     pose = case.instance.cam_from_model
-    towards = pose.inverse(np.zeros((1, 3)))[0] - driver.session.models[0].cad.center
+    towards = pose.inverse(np.zeros((1, 3)))[0] - driver.session.model.cad.center
     driver.look(
-        driver.session.models[0].cad.center
-        + 2.2 * driver.session.models[0].cad.diagonal * towards / np.linalg.norm(towards)
+        driver.session.model.cad.center
+        + 2.2 * driver.session.model.cad.diagonal * towards / np.linalg.norm(towards)
     )
     for number, (keypoint, uv) in enumerate(case.clicks[:6], start=1):
         page.mouse.click(*driver.pixel(uv))
         driver.wait_for_state(lambda state, n=number: len(state["pairs"]) == n)
         page.mouse.click(
             *driver.surface(
-                driver.session.models[0].cad.to_display(
-                    driver.session.models[0].registry[keypoint].xyz
-                )
+                driver.session.model.cad.to_display(driver.session.model.registry[keypoint].xyz)
             )
         )
         state = driver.wait_for_state(lambda state, k=keypoint: state["pairs"][-1]["keypoint"] == k)
@@ -199,7 +197,7 @@ def test_six_pairs_are_clicked_moved_undone_reloaded_and_saved(
 
 def test_clicks_on_the_model_give_the_surface_point(opened: tuple[Driver, Case, Access]) -> None:
     driver, _, _ = opened
-    model = driver.session.models[0].cad
+    model = driver.session.model.cad
     rng = np.random.default_rng(3)
     gaps = []
     for view in range(3):
@@ -227,7 +225,7 @@ def test_clicks_on_the_model_give_the_surface_point(opened: tuple[Driver, Case, 
             pairs = driver.session.photos[0].document.pairs
             if len(pairs) == count:
                 continue  # half a pixel beside the outline
-            placed = driver.session.models[0].registry[pairs[-1].keypoint]
+            placed = driver.session.model.registry[pairs[-1].keypoint]
             gaps.append(np.linalg.norm(np.array(placed.xyz) - target) / model.diagonal)
             if len(gaps) >= 8 * (view + 1):
                 break

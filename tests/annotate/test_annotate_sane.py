@@ -197,7 +197,7 @@ def test_twenty_annotations_are_sane_from_the_fourth_pair(
             if count in errors:
                 errors[count].extend(np.abs(scale / case.scale - 1)[1:].tolist())
             if count == 6:
-                own = session.models[0].cad.scene.bounds
+                own = session.model.cad.scene.bounds
                 estimate = Box.from_model(own, live.result.alignment)
                 overlapping += box_iou(est=estimate, gt=case.box) > 0
         check_fit_agrees(session, case, capsys)

@@ -8,11 +8,9 @@ import json
 import socket
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from support.annotating import Case, served
-from support.files import TETRAHEDRON
 
 from cadalign.annotate import guard
 from cadalign.annotate.guard import MAX_BODY, Access
@@ -71,20 +69,15 @@ def test_with_the_token_everything_is_served(access: Access, path: str) -> None:
     assert "Access-Control-Allow-Origin" not in headers
 
 
-def test_the_model_of_each_number_is_served(original: Case, tmp_path: Path) -> None:
-    other = tmp_path / "other.obj"
-    other.write_text(TETRAHEDRON)
+def test_the_model_is_served(original: Case) -> None:
     session = original.open(prepared=False)
-    session.models.of(other)
+    model = session.model
     with served(session) as opened:
-        for number in (0, 1):
-            model = session.models[number]
-            creases = model.wireframe.creases
-            for path, content in (
-                ("/model", display_bytes(model.cad)),
-                ("/details", detail_bytes(model.cad, creases)),
-            ):
-                assert ask(opened, f"{path}?number={number}")[::2] == (200, content)
+        for path, content in (
+            ("/model", display_bytes(model.cad)),
+            ("/details", detail_bytes(model.cad, model.wireframe.creases)),
+        ):
+            assert ask(opened, path)[::2] == (200, content)
 
 
 @pytest.mark.parametrize("path", [*PATHS, "/nowhere", "/?token=", "/?token=wrong"])

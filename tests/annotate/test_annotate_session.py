@@ -164,9 +164,7 @@ def test_placed_points_are_written_with_face_and_barycentrics(case: Case) -> Non
     (point,) = written.keypoints
     assert point.name == "seat"
     assert point.face_index is not None
-    rebuilt = session.models[0].cad.scene.mesh.surface_points(
-        [point.face_index], [point.barycentric]
-    )
+    rebuilt = session.model.cad.scene.mesh.surface_points([point.face_index], [point.barycentric])
     np.testing.assert_allclose(rebuilt[0], point.xyz, atol=1e-9)
     perform(session, 0, {"do": "undo"})
     assert ModelKeypoints.load(case.folder / "sample_chair_000.keypoints.json").keypoints == ()
@@ -214,7 +212,7 @@ def test_an_observation_that_others_changed_is_not_written_over(case: Case) -> N
 def test_keypoints_that_others_changed_are_not_written_over(case: Case) -> None:
     session = case.open(prepared=False)
     place(session, 0, [10, 20])
-    keypoints = session.models[0].keypoints_path
+    keypoints = session.model.keypoints_path
     theirs = keypoints.read_text().replace("keypoint 1", "armrest")
     keypoints.write_text(theirs)
     perform(session, 0, {"do": "place_uv", "uv": [30, 40]})
@@ -270,18 +268,18 @@ def test_corners_of_the_surface_are_suggested_where_no_keypoint_is_left(case: Ca
     session = case.open(keypoints=None)
     given = {point.semantic_id: point for point in ModelKeypoints.load(case.keypoints).keypoints}
     for keypoint, uv in case.clicks:
-        place(session, session.models[0].registry.add(given[keypoint]), uv)
+        place(session, session.model.registry.add(given[keypoint]), uv)
     suggestion = page_state(session, 0)["suggestion"]
     assert suggestion is not None
     assert suggestion["keypoint"] is None
-    before = len(session.models[0].registry)
+    before = len(session.model.registry)
     perform(session, 0, {"do": "suggested"})
-    assert len(session.models[0].registry) == before + 1
+    assert len(session.model.registry) == before + 1
 
 
 def test_click_near_a_keypoint_takes_it_only_where_it_is_seen(case: Case) -> None:
     session = case.open()
-    model, registry = session.models[0].cad, session.models[0].registry
+    model, registry = session.model.cad, session.model.registry
     xyz = np.array(registry[0].xyz)
     outwards = xyz - model.center
     front = model.to_display(xyz + 3 * outwards)
@@ -644,10 +642,8 @@ def test_given_keypoints_without_ids_all_come(case: Case) -> None:
     bare = tuple(replace(point, semantic_id=None) for point in given)
     ModelKeypoints((given[0], *bare[1:])).save(case.keypoints)
     session = case.open()
-    assert [point.name for _, point in session.models[0].registry] == [
-        point.name for point in given
-    ]
-    assert len(session.models[0].registry.given) == len(given)
+    assert [point.name for _, point in session.model.registry] == [point.name for point in given]
+    assert len(session.model.registry.given) == len(given)
 
 
 def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
@@ -659,7 +655,7 @@ def test_observation_without_ids_is_matched_by_place(case: Case) -> None:
     session = case.open()
     keypoints = [pair.keypoint for pair in session.photos[0].document.pairs]
     assert keypoints[1:] == ids[1:]
-    assert keypoints[0] not in session.models[0].registry.given
+    assert keypoints[0] not in session.model.registry.given
 
 
 def test_session_prepares_its_solvers_before_it_fits(case: Case) -> None:

@@ -176,7 +176,7 @@ def test_points_of_the_model_can_be_identified(
     assert state["pairs"][0]["counts"]
     assert state["pairs"][0]["keypoint"] == 77
     assert state["shape"]["missing"] == []
-    written = ModelKeypoints.load(session.models[0].keypoints_path)
+    written = ModelKeypoints.load(session.model.keypoints_path)
     assert 77 in written.ids
     perform(session, 0, {"do": "undo"})
     assert not page_state(session, 0)["pairs"][0]["counts"]
@@ -192,7 +192,7 @@ def test_shape_of_named_keypoints(case: Case, tmp_path: Path) -> None:
     path = tmp_path / "named.shape"
     learn(named.xyz, list(named.names)).save(path)
     session = case.open(shape=path)
-    by_name = {point.name: number for number, point in session.models[0].registry}
+    by_name = {point.name: number for number, point in session.model.registry}
     for semantic_id, uv in case.clicks:
         place(session, by_name[f"keypoint {semantic_id}"], uv)
     page = live_shape(session)
@@ -242,7 +242,7 @@ def test_three_pairs_leave_an_unknown_focal_length_to_its_prior(
 ) -> None:
     session = case.open(**options_of(kind, shape_file), camera=None)
     perform(session, 0, {"do": "prior", "stretch": None, "focal": prior})
-    numbers = {point.semantic_id: number for number, point in session.models[0].registry}
+    numbers = {point.semantic_id: number for number, point in session.model.registry}
     for semantic_id, uv in case.clicks[LACKING : LACKING + 3]:
         place(session, numbers[semantic_id], uv)
     live = live_shape(session)

@@ -23,7 +23,7 @@ def test_the_page_places_the_displayed_model_where_the_alignment_has_it(case: Ca
     assert np.ptp(alignment.scale) > 1e-4
     points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
     placed = np.array(told["camera_from_page"]).reshape(4, 4)
-    displayed = session.models[0].cad.to_display(points)
+    displayed = session.model.cad.to_display(points)
     in_camera = displayed @ placed[:3, :3].T + placed[:3, 3]
     assert in_camera == pytest.approx(alignment.apply(points), abs=1e-6)
     eye = placed[:3, :3] @ told["eye"] + placed[:3, 3]  # the camera's own place

@@ -54,7 +54,7 @@ def test_the_up_axis_is_written_and_kept(case: Case) -> None:
     assert Observation.load(case.observation).up_axis == "z"
     again = z_up.open()
     assert page_state(again, 0)["image"]["up_axis"] == "z"
-    place(again, again.models[0].registry.add(again.models[0].cad.samples[0]), [300.0, 200.0])
+    place(again, again.model.registry.add(again.model.cad.samples[0]), [300.0, 200.0])
     assert Observation.load(case.observation).up_axis == "z"
     perform(again, 0, {"do": "another"})
     assert page_state(again, 1)["image"]["up_axis"] == "z"

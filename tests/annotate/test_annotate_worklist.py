@@ -81,7 +81,7 @@ def test_list_is_filtered_and_gone_through_by_keys(browser: Browser, case: Case)
 
 def detections(case: Case, session: Session, names: list[str], shift: float) -> dict[str, Any]:
     """COCO annotations of the visible keypoints in photos of these names."""
-    keypoints = [session.models[0].registry[keypoint].name for keypoint, _ in case.clicks]
+    keypoints = [session.model.registry[keypoint].name for keypoint, _ in case.clicks]
     values = [value for _, (u, v) in case.clicks for value in (u + shift, v, 0.9)]
     images = [{"id": row, "file_name": name} for row, name in enumerate(names)]
     return {

@@ -138,23 +138,21 @@ def place_twenty(session: Session, case: Case) -> None:
     place_all(session, case)
     rng = np.random.default_rng(0)
     seen = visible_keypoints(
-        session.models[0].cad.scene,
-        session.models[0].cad.sample_points,
+        session.model.cad.scene,
+        session.model.cad.sample_points,
         case.instance.camera,
         case.instance.cam_from_model,
     )
-    for point in (
-        p for p, is_seen in zip(session.models[0].cad.samples, seen, strict=True) if is_seen
-    ):
+    for point in (p for p, is_seen in zip(session.model.cad.samples, seen, strict=True) if is_seen):
         if len(session.photos[0].document.pairs) >= 20:
             return
-        if session.models[0].registry.find(point.xyz, tolerance=1e-3) is None:
+        if session.model.registry.find(point.xyz, tolerance=1e-3) is None:
             ((u, v),) = case.instance.camera.project(
                 case.instance.cam_from_model.apply([point.xyz])
             )
             noise = rng.normal(size=2)
             u, v = float(u + noise[0]), float(v + noise[1])
-            place(session, session.models[0].registry.add(point), [u, v])
+            place(session, session.model.registry.add(point), [u, v])
 
 
 @contextmanager

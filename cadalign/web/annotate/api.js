@@ -36,16 +36,6 @@ export class Api {
     return this.enqueue({ url: `state/${this.image}`, options: {} });
   }
 
-  /** A library's models, ranked by the pairs; null if the server does not answer. */
-  async models() {
-    try {
-      const response = await fetch(`models/${this.image}`);
-      return response.ok ? await response.json() : { note: await reasonOf(response), none: null, models: [] };
-    } catch {
-      return null;
-    }
-  }
-
   /** Go on to another photo. */
   open(image) {
     this.image = image;

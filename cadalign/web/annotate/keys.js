@@ -82,9 +82,6 @@ function plain(app, event) {
     case "r":
     case "R":
       return app.showResult();
-    case "q":
-    case "Q":
-      return app.showModels();
     case "t":
     case "T":
       return app.another();

@@ -27,7 +27,6 @@ const KEYS = [
   ["R", "shows the aligned model before the photo in 3D, or the model to click on again"],
   ["O", "draws the alignment as edges, shaded, as a box, or not"],
   ["Page up, Page down", "the photo before and after, as the list is filtered"],
-  ["Q", "the library's models by how well they explain the pairs: there 1 to 9 choose one, 0 none of them"],
   ["T", "begins another object of the photo"],
   ["W", "the list of photos with their states"],
   ["D, K", "marks the photo as done or skipped, and goes on"],
@@ -64,9 +63,6 @@ export class Layout {
     this.snapping = toggle("Snap", handlers.snap, { title: "Clicks go to corners, creases and silhouette (hold S)" });
     this.loupe = toggle("Loupe", handlers.loupe, { title: "Magnify about the pointer (L)" });
     this.result = toggle("Result", handlers.result, { title: "The aligned model before the photo, in 3D (R)" });
-    this.models = button("Models…", handlers.models, {
-      title: "Models of the library, by the pairs marked so far (Q)", "aria-haspopup": "dialog", class: "library",
-    });
     this.asPhoto = button("As photo", handlers.asPhoto, { title: "Look from where the photo was taken (V)" });
     document.body.classList.add("waiting"); // for the first state, which says what there is
     document.body.append(
@@ -94,7 +90,7 @@ export class Layout {
           above: h("div", { class: "above" }, this.another, this.tools.root),
           below: this.overlay.root,
         }),
-        view("Model", this.model, handlers.model, { below: [this.models, this.shown, this.result, this.asPhoto] }),
+        view("Model", this.model, handlers.model, { below: [this.shown, this.result, this.asPhoto] }),
         panel,
       ),
     );
@@ -114,7 +110,6 @@ export class Layout {
     this.next.disabled = image.number === image.count - 1;
     this.undo.disabled = !state.can_undo;
     this.redo.disabled = !state.can_redo;
-    this.models.hidden = !image.has_library;
     this.asPhoto.hidden = state.alignment.status !== "done";
     this.result.hidden = state.alignment.status !== "done" || state.alignment.camera_from_page === null;
     this.saved.classList.toggle("trouble", Boolean(saved.trouble));

@@ -3,7 +3,6 @@ import "../common/theme.css";
 import "./annotate.css";
 import { Api } from "./api.js";
 import { listen } from "./keys.js";
-import { ModelLibrary } from "./library.js";
 import { Layout } from "./layout.js";
 import { ModelView } from "./model_view.js";
 import { Mover } from "./mover.js";
@@ -53,7 +52,6 @@ class App {
         mark: (mark) => this.mark(mark),
         asPhoto: () => this.asPhoto(),
         result: (on) => this.showResult(on),
-        models: () => this.showModels(),
         tool: (tool) => this.choose(tool),
         another: () => this.another(),
         snap: (on) => this.snap({ on }),
@@ -79,7 +77,6 @@ class App {
       onSelect: (pair) => this.select(pair),
       onSuggested: () => this.suggested(),
     });
-    this.library = new ModelLibrary({ act, rank: () => this.api.models() });
     this.tour = new Tour();
     listen(this);
     window.addEventListener("hashchange", () => this.open());
@@ -88,22 +85,19 @@ class App {
 
   async start() {
     await this.open();
+    this.loadModel();
     if (!navigator.webdriver) this.tour.startOnce(); // programs know what to do
   }
 
-  /** Show the model of a number. */
-  async useModel(number) {
+  async loadModel() {
     try {
-      const header = await this.model.load(number);
-      if (!header) return; // another one is wanted by now
-      this.photo.shaded ??= new ShadedOverlay();
-      this.photo.shaded.use(this.model.group);
+      const { shown, all } = await this.model.load();
+      this.photo.shaded = new ShadedOverlay(this.model.group);
       this.photo.invalidate();
-      const { shown, all } = header;
-      const some = shown < all;
-      this.layout.shown.textContent = some
-        ? `${shown.toLocaleString()} of ${all.toLocaleString()} faces shown, clicks are exact`
-        : "";
+      if (shown < all) {
+        const counts = `${shown.toLocaleString()} of ${all.toLocaleString()}`;
+        this.layout.shown.textContent = `${counts} faces shown, clicks are exact`;
+      }
     } catch (error) {
       this.layout.tell(`The model cannot be shown: ${error.message}`);
     }
@@ -130,7 +124,6 @@ class App {
       this.photo.open(image.number, image);
       if (location.hash || image.number) history.replaceState(null, "", `/#${image.number + 1}`);
     }
-    if (this.model.number !== image.model_number) this.useModel(image.model_number);
     if (state.selected !== null) this.selected = state.selected;
     if (!state.pairs.some((pair) => pair.pair === this.selected)) this.selected = null;
     this.layout.show(state);
@@ -348,12 +341,6 @@ class App {
 
   showPhotos() {
     if (this.state?.image.count > 1) this.worklist.open(this.state.image.number);
-    return true;
-  }
-
-  /** Show the models of the library, if there is one, by how well they explain the pairs. */
-  showModels() {
-    if (this.state?.image.has_library) this.library.open();
     return true;
   }
 

@@ -27,10 +27,9 @@ async function fetched(address) {
   return response.arrayBuffer();
 }
 
-/** Fetch the model of a number; resolves to its numbers of faces, all triangles (for picking), and the group. */
-export async function fetchModel(number) {
-  const addresses = [`model?number=${number}`, `details?number=${number}`];
-  const [buffer, details] = await Promise.all(addresses.map(fetched));
+/** Fetch the model; resolves to its numbers of faces, all triangles (for picking), and the group. */
+export async function fetchModel() {
+  const [buffer, details] = await Promise.all(["model", "details"].map(fetched));
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   const { shown } = header;

@@ -36,8 +36,8 @@ export class ModelView {
       if (loupe) renderLoupe(this.stage, this.markers.group, loupe);
     };
     this.state = null;
+    this.mesh = null; // until it is there, nothing can be clicked on
     this.upAxis = "y";
-    this.models = new Map();
     this.raycaster = new Raycaster();
     const { canvas } = this.stage;
     // Before the controls, which would turn the model while a point is dragged.
@@ -48,14 +48,9 @@ export class ModelView {
     canvas.addEventListener("pointercancel", () => this.drop());
   }
 
-  /** Show the model of a number, fetched once; resolves to what is shown of how many faces. */
-  async load(number) {
-    this.number = number;
-    if (this.mesh) this.stage.scene.remove(this.group, this.axes);
-    this.mesh = null; // until it is there, nothing can be clicked on
-    if (!this.models.has(number)) this.models.set(number, fetchModel(number));
-    const { header, mesh, group } = await this.models.get(number);
-    if (this.number !== number) return null;
+  /** Fetch and show the model; resolves to what is shown of how many faces. */
+  async load() {
+    const { header, mesh, group } = await fetchModel();
     this.mesh = mesh;
     this.group = group;
     this.axes = makeAxes(new Box3().setFromObject(mesh));

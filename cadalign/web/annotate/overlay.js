@@ -5,20 +5,16 @@ const NEAR = 1e-3; // over the distance
 const FAR = 1e3;
 
 export class ShadedOverlay {
-  constructor() {
+  /** @param {import("three").Group} group - the model to draw, in the page's coordinates */
+  constructor(group) {
+    this.model = group.clone();
+    this.model.matrixAutoUpdate = false;
     this.scene = new Scene();
+    this.scene.add(this.model);
     this.camera = new PerspectiveCamera();
     this.camera.matrixAutoUpdate = false;
     this.renderer = new WebGLRenderer({ antialias: true, alpha: true });
     this.renderer.setPixelRatio(1);
-  }
-
-  /** @param {import("three").Group} group - the model to draw, in the page's coordinates */
-  use(group) {
-    if (this.model) this.scene.remove(this.model);
-    this.model = group.clone();
-    this.model.matrixAutoUpdate = false;
-    this.scene.add(this.model);
   }
 
   /**

@@ -13,6 +13,7 @@ export class Panel {
     this.advice = h("div", { class: "advice" });
     this.keypoints = h("ul", { class: "keypoints" });
     this.keypointsTitle = h("summary");
+    this.listed = new Set(); // keypoints in the list
     this.details = h("details", { class: "keypoints-list" }, this.keypointsTitle, this.keypoints);
     this.rows = h("tbody");
     this.root = h(
@@ -22,7 +23,6 @@ export class Panel {
       card("Next keypoint", this.details, this.advice),
       card("Pairs", this.makeTable()),
     );
-    this.root.lastChild.classList.add("wide");
   }
 
   show(state, selected) {
@@ -31,7 +31,7 @@ export class Panel {
     this.showPriors(state.priors);
     this.evidence.show(state);
     this.showAdvice(state);
-    this.showKeypoints(state.keypoints, state.image.model_number);
+    this.showKeypoints(state.keypoints);
     this.showPairs(state, selected);
   }
 
@@ -165,9 +165,7 @@ export class Panel {
   }
 
   /** The keypoints that can be marked; one that is marked keeps its place among them. */
-  showKeypoints(keypoints, revision) {
-    if (revision !== this.listedRevision) this.listed = new Set();
-    this.listedRevision = revision;
+  showKeypoints(keypoints) {
     const free = keypoints.filter((keypoint) => !keypoint.used);
     for (const { keypoint } of free) this.listed.add(keypoint);
     this.keypointsTitle.textContent = `Keypoints of the model not yet marked (${free.length})`;

@@ -24,6 +24,8 @@ from cadalign.io.observation import Observation
 from cadalign.render.drawing.layers import REPROJECTED_COLOR
 
 PROBLEM = simulate_problem(np.random.default_rng(0), points=10, noise_px=0.5)
+SIGMA = np.linspace(0.2, 5, 10)
+STORED = {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "stretch_sigma": 0.3}
 
 
 def write_observation(path: Path, problem: Problem = PROBLEM, **fields: Any) -> Path:
@@ -87,31 +89,29 @@ def test_method_is_chosen_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().out.startswith("aepnp: 10 keypoints, rms ")
 
 
-def test_sigma_of_the_file_is_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sigma = np.linspace(0.2, 5, 10)
-    path = write_observation(tmp_path / "chair.json", sigma=sigma)
-    assert main(["fit", str(path)]) == 0
-    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, sigma=sigma)
-    assert capsys.readouterr().out == f"{expected}\n"
-
-
 @pytest.mark.parametrize(
-    ("flags", "options"),
+    ("stored", "flags", "options"),
     [
-        ([], {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "stretch_sigma": 0.3}),
+        (STORED, [], STORED),
+        (STORED, ["--sigma", "2", "--stretch", "z"], STORED | {"sigma": 2.0, "stretch": "z"}),
+        (STORED, ["--no-stored"], {"sigma": SIGMA}),
+        ({"sigma": None}, [], {"sigma": None}),  # which has no prior of its own
+        ({}, [], {"sigma": SIGMA}),
         (
-            ["--sigma", "2", "--stretch", "z"],
-            {"sigma": 2.0, "loss": "cauchy", "stretch": "z", "stretch_sigma": 0.3},
+            {},
+            ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--stretch-sigma", "0.3"],
+            STORED | {"sigma": 2.0},
         ),
-        (["--no-stored"], {"sigma": np.linspace(0.2, 5, 10)}),
     ],
 )
-def test_options_stored_in_the_file_are_used(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], options: dict[str, Any]
+def test_options_are_those_of_the_command_or_of_the_file(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    stored: dict[str, Any],
+    flags: list[str],
+    options: dict[str, Any],
 ) -> None:
-    stored = {"sigma": 3.0, "loss": "cauchy", "stretch": "y", "stretch_sigma": 0.3}
-    sigma = np.linspace(0.2, 5, 10)
-    path = write_observation(tmp_path / "chair.json", sigma=sigma, fit_options=stored)
+    path = write_observation(tmp_path / "chair.json", sigma=SIGMA, fit_options=stored)
     assert main(["fit", str(path), *flags]) == 0
     expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, **options)
     assert capsys.readouterr().out == f"{expected}\n"
@@ -154,50 +154,12 @@ def test_similar_model_has_similar_proportions(
     assert capsys.readouterr().out == f"{expected}\n"
 
 
-def test_stored_estimate_of_sigma_has_no_prior_of_its_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_observation(tmp_path / "chair.json", fit_options={"sigma": None})
-    assert main(["fit", str(path)]) == 0
-    expected = fit(PROBLEM.points_3d, PROBLEM.points_2d, PROBLEM.camera, sigma=None)
-    assert capsys.readouterr().out == f"{expected}\n"
-
-
-def test_given_and_refused_prior_exclude_each_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    flags = ["--stretch-sigma", "0.1", "--no-stretch-prior"]
-    assert refusal_line(capsys, "fit", str(path), *flags) == (
-        "--no-stretch-prior: --no-stretch-prior leaves out the prior, which --stretch-sigma gives; "
-        "give one of the two options"
-    )
-
-
 def test_wrong_stored_options_name_the_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = write_observation(tmp_path / "chair.json", fit_options={"stretch": "x"})
     message = refusal_line(capsys, "fit", str(path))
     assert message.startswith(f"{path}: fit.stretch: 'x' are not axes that can stretch")
-
-
-def test_options_of_fit_are_those_of_the_function(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = write_observation(tmp_path / "chair.json", sigma=np.linspace(0.2, 5, 10))
-    flags = ["--sigma", "2", "--loss", "cauchy", "--stretch", "y", "--stretch-sigma", "0.3"]
-    assert main(["fit", str(path), *flags]) == 0
-    expected = fit(
-        PROBLEM.points_3d,
-        PROBLEM.points_2d,
-        PROBLEM.camera,
-        sigma=2.0,
-        loss="cauchy",
-        stretch="y",
-        stretch_sigma=0.3,
-    )
-    assert capsys.readouterr().out == f"{expected}\n"
 
 
 def test_options_of_ransac_need_no_prefix(
@@ -281,66 +243,6 @@ def test_missing_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert refusal_line(capsys, "fit", str(path)) == f"{path}: no such file"
 
 
-def test_malformed_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "chair.json"
-    path.write_text('{"camera": \n {"model": }')
-    assert (
-        refusal_line(capsys, "fit", str(path)) == f"{path}, line 2: not valid JSON: Expecting value"
-    )
-
-
-def test_keypoint_that_is_not_finite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    edit(path, lambda data: data["keypoints"][4].update(uv=[float("nan"), 3.0]))
-    assert refusal_line(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv[0]: nan is not a finite number"
-    )
-
-
-def test_keypoint_of_the_wrong_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    edit(path, lambda data: data["keypoints"][4].update(uv=[1, 2, 3]))
-    assert refusal_line(capsys, "fit", str(path)) == (
-        f"{path}: keypoints[4].uv: [1, 2, 3] is not a list of 2"
-    )
-
-
-def test_camera_without_focal_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    edit(path, lambda data: data["camera"].update(params=[0, 150, 320, 240]))
-    assert refusal_line(capsys, "fit", str(path)) == (
-        f"{path}: camera.fx: the focal length is 0; give the calibrated focal length in pixels"
-    )
-
-
-def first_of(count: int) -> Problem:
-    points_3d, points_2d = PROBLEM.points_3d[:count], PROBLEM.points_2d[:count]
-    return Problem(points_3d, points_2d, PROBLEM.camera, PROBLEM.alignment, None)
-
-
-@pytest.mark.parametrize(
-    ("method", "count", "text"),
-    [
-        (
-            "optimal",
-            3,
-            "points_3d: 3 keypoints are too few for 8 unknowns; "
-            "give at least 4, fewer unknowns by stretch=, or a prior",
-        ),
-        (
-            "aepnp",
-            5,
-            "points_3d: 5 keypoints are too few for the method 'aepnp'; give at least 6",
-        ),
-    ],
-)
-def test_too_few_keypoints(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str, count: int, text: str
-) -> None:
-    path = write_observation(tmp_path / "chair.json", first_of(count))
-    assert refusal_line(capsys, "fit", str(path), "--method", method) == text
-
-
 def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points_3d = PROBLEM.points_3d.copy()
     points_3d[:, 2] = 0.1
@@ -357,42 +259,42 @@ def test_keypoints_in_one_plane(tmp_path: Path, capsys: pytest.CaptureFixture[st
     )
 
 
-def test_unknown_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_observation(tmp_path / "chair.json")
-    assert refusal_line(capsys, "fit", str(path), "--method", "best") == (
-        "--method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp"
-    )
-
-
-def test_given_and_estimated_sigma_exclude_each_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("flags", "text"),
+    [
+        (
+            ["--stretch-sigma", "0.1", "--no-stretch-prior"],
+            "--no-stretch-prior: --no-stretch-prior leaves out the prior, which --stretch-sigma "
+            "gives; give one of the two options",
+        ),
+        (
+            ["--sigma", "2", "--similar"],
+            "--sigma: --similar estimates the standard deviation, which --sigma gives; "
+            "give one of the two options",
+        ),
+        (
+            ["--method", "best"],
+            "--method: unknown method 'best'; known are optimal, aepnp, aepnp-paper, epnp",
+        ),
+    ],
+)
+def test_wrong_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], text: str
 ) -> None:
     path = write_observation(tmp_path / "chair.json")
-    assert refusal_line(capsys, "fit", str(path), "--sigma", "2", "--similar") == (
-        "--sigma: --similar estimates the standard deviation, which --sigma gives; "
-        "give one of the two options"
-    )
+    assert refusal_line(capsys, "fit", path, *flags) == text
 
 
-def test_missing_photo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal_line(capsys, "fit", str(path)) == f"{tmp_path / 'photo.png'}: no such file"
-
-
-def test_photo_of_another_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cv2.imwrite(str(tmp_path / "photo.png"), np.zeros((10, 20, 3), dtype=np.uint8))
-    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal_line(capsys, "fit", str(path)) == (
-        f"{tmp_path / 'photo.png'}: the image is 20 x 10, the camera 640 x 480; "
-        "give the camera of this image"
-    )
-
-
-def test_photo_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "photo.png").write_text("not a picture")
-    path = write_observation(tmp_path / "chair.json", image=tmp_path / "photo.png")
-    assert refusal_line(capsys, "fit", str(path)).startswith(
-        f"{tmp_path / 'photo.png'}: not an image that can be read ("
+def test_photo_that_cannot_be_used(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photo = tmp_path / "photo.png"
+    path = write_observation(tmp_path / "chair.json", image=photo)
+    assert refusal_line(capsys, "fit", path) == f"{photo}: no such file"
+    photo.write_text("not a picture")
+    line = refusal_line(capsys, "fit", path)
+    assert line.startswith(f"{photo}: not an image that can be read (")
+    cv2.imwrite(str(photo), np.zeros((10, 20, 3), dtype=np.uint8))
+    assert refusal_line(capsys, "fit", path) == (
+        f"{photo}: the image is 20 x 10, the camera 640 x 480; give the camera of this image"
     )
 
 

@@ -33,6 +33,9 @@ from cadalign.shapes.examples import Example
 CAMERA = Camera(640, 480, 900.0, 900.0, 319.5, 239.5)
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float) - 0.5
 NAMES = tuple("abcdefgh")
+FIT_ALONE = ("--similar", "--no-stretch-prior", "--method aepnp")
+STRETCH = ("--stretch y", "--known-axis z", "--stretch-sigma 0.1")
+FIX = "leave out one of the two"
 RIGHT = np.array([1.1, 0.9, 1.2])  # lengths of the object's box
 TRUTH = Alignment(np.diag([1.0, -1, -1]) @ np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]),
                   [0.1, -0.1, 6.0], np.ones(3))  # fmt: skip
@@ -98,17 +101,6 @@ def test_learned_shape_gives_the_numbers_of_align(
     np.testing.assert_allclose(lengths / lengths[0], 1, rtol=0.1)
     for color in (EST_COLOR, UNSEEN_COLOR):
         assert has_color(out / "overlay.png", color)
-
-
-def test_json_is_that_of_the_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
-) -> None:
-    numbered.save(tmp_path / "box.shape")
-    command = ["fit", write(tmp_path), "--shape", tmp_path / "box.shape", "--json"]
-    assert main([str(each) for each in command]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data == json.loads((tmp_path / "box_fit" / "fit.json").read_text())
-    assert data["method"] == "align"
 
 
 @pytest.mark.long
@@ -281,102 +273,69 @@ def test_training_mesh_that_is_gone_is_left_out(
 # --- what it refuses -------------------------------------------------------------------------
 
 
-def test_unknown_keypoints_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
+@pytest.mark.parametrize(
+    ("fields", "text"),
+    [
+        (
+            {"ids": np.array([0, 1, 9, 3, 12, 5])},
+            "keypoints.semantic_id: box has no keypoint 9, 12; known are [0, 1, 2, 3, 4, 5, 6, 7]",
+        ),
+        (
+            {"ids": None, "names": NAMES[:6]},
+            "keypoints: the keypoints have no semantic_id; "
+            "the shape of box knows its keypoints by their semantic ids",
+        ),
+        (
+            {"ids": np.array([0, 1, 2, 3, 1, 5])},
+            "keypoints[4].semantic_id: 1 occurs twice, first in keypoints[1]",
+        ),
+    ],
+)
+def test_keypoints_that_the_shape_cannot_take_are_named(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    numbered: ShapeModel,
+    fields: dict[str, Any],
+    text: str,
 ) -> None:
     numbered.save(tmp_path / "box.shape")
-    path = write(tmp_path, ids=np.array([0, 1, 9, 3, 12, 5]))
-    assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
-        f"{path}: keypoints.semantic_id: box has no keypoint 9, 12; "
-        "known are [0, 1, 2, 3, 4, 5, 6, 7]"
-    )
-
-
-def test_keypoints_without_ids(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
-) -> None:
-    numbered.save(tmp_path / "box.shape")
-    path = write(tmp_path, ids=None, names=NAMES[:6])
-    assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
-        f"{path}: keypoints: the keypoints have no semantic_id; "
-        "the shape of box knows its keypoints by their semantic ids"
-    )
-
-
-def test_keypoint_that_occurs_twice(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], numbered: ShapeModel
-) -> None:
-    numbered.save(tmp_path / "box.shape")
-    path = write(tmp_path, ids=np.array([0, 1, 2, 3, 1, 5]))
-    assert refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape") == (
-        f"{path}: keypoints[4].semantic_id: 1 occurs twice, first in keypoints[1]"
-    )
+    path = write(tmp_path, **fields)
+    line = refusal_line(capsys, "fit", path, "--shape", tmp_path / "box.shape")
+    assert line == f"{path}: {text}"
 
 
 def test_similar_model_needs_xyz(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write(tmp_path)
-    edit(path, keypoints=[{"uv": [1.0, 2.0]}])
-    assert refusal_line(capsys, "fit", path, "--shape-sigma", "0.1").startswith(
-        f"{path}: keypoints[0].xyz: "
-    )
+    path = edit(write(tmp_path), keypoints=[{"uv": [1.0, 2.0]}])
+    line = refusal_line(capsys, "fit", path, "--shape-sigma", "0.1")
+    assert line.startswith(f"{path}: keypoints[0].xyz: ")
 
 
-@pytest.mark.parametrize("sigma", ["0", "-1", "nan", "inf"])
-def test_shape_sigma_that_is_no_length(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma: str
-) -> None:
-    assert refusal_line(capsys, "fit", write(tmp_path), f"--shape-sigma={sigma}") == (
-        f"--shape-sigma: {float(sigma)} is not positive"
-    )
-
-
-@pytest.mark.parametrize("sigma", [1e-200, 1e300])
-def test_shape_sigma_whose_square_is_no_number(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], sigma: float
-) -> None:
-    assert refusal_line(capsys, "fit", write(tmp_path), "--shape-sigma", sigma) == (
-        f"--shape-sigma: {sigma} is not between 1e-100 and 1e+100"
-    )
-
-
-def test_shape_file_that_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    missing = tmp_path / "none.shape"
-    line = refusal_line(capsys, "fit", write(tmp_path), "--shape", missing)
-    assert line == f"{missing}: no such file"
-
-
-def test_both_kinds_of_shape(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = ["--shape", "box.shape", "--shape-sigma", "0.1"]
-    assert refusal_line(capsys, "fit", write(tmp_path), *flags) == (
-        "--shape-sigma: --shape has learned how far objects of the category differ; "
-        "give one of the two options"
-    )
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "flags",
+    ("flags", "text"),
     [
-        ["--similar"],
-        ["--no-stretch-prior"],
-        ["--method", "aepnp"],
+        ("--shape-sigma=0", "--shape-sigma: 0.0 is not positive"),
+        ("--shape-sigma=-1", "--shape-sigma: -1.0 is not positive"),
+        ("--shape-sigma=nan", "--shape-sigma: nan is not positive"),
+        ("--shape-sigma=inf", "--shape-sigma: inf is not positive"),
+        ("--shape-sigma=1e-200", "--shape-sigma: 1e-200 is not between 1e-100 and 1e+100"),
+        ("--shape-sigma=1e300", "--shape-sigma: 1e+300 is not between 1e-100 and 1e+100"),
+        ("--shape none.shape", "none.shape: no such file"),
+        (
+            "--shape box.shape --shape-sigma 0.1",
+            "--shape-sigma: --shape has learned how far objects of the category differ; "
+            "give one of the two options",
+        ),
+        *(
+            (f"{shape} {flag}", f"{flag.split()[0]}: has no effect together with {name}; {FIX}")
+            for shape, name, flags in (
+                ("--shape box.shape", "--shape", (*FIT_ALONE, *STRETCH)),
+                ("--shape-sigma 0.1", "--shape-sigma", FIT_ALONE),
+            )
+            for flag in flags
+        ),
     ],
 )
-@pytest.mark.parametrize("shape", [["--shape", "box.shape"], ["--shape-sigma", "0.1"]])
-def test_options_without_effect(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], shape: list[str]
+def test_wrong_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: str, text: str
 ) -> None:
-    assert refusal_line(capsys, "fit", write(tmp_path), *shape, *flags) == (
-        f"{flags[0]}: has no effect together with {shape[0]}; leave out one of the two"
-    )
-
-
-@pytest.mark.parametrize(
-    "flags", [["--stretch", "y"], ["--known-axis", "z"], ["--stretch-sigma", "0.1"]]
-)
-def test_options_of_a_stretch_without_effect_on_a_learned_shape(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str]
-) -> None:
-    assert refusal_line(capsys, "fit", write(tmp_path), "--shape", "box.shape", *flags) == (
-        f"{flags[0]}: has no effect together with --shape; leave out one of the two"
-    )
+    assert refusal_line(capsys, "fit", write(tmp_path), *flags.split()) == text

@@ -372,15 +372,6 @@ class TestRuns:
         with pytest.raises(DataError, match="another configuration: correspondences is"):
             run(root, tmp_path / "run")
 
-    @pytest.mark.long
-    def test_results_are_the_same_bytes_with_and_without_workers(self, colmap, tmp_path):
-        options = CorrespondenceOptions(ANY, outliers=(0.0, 0.4), draws=2)
-        run(colmap, tmp_path / "none", options, workers=0)
-        run(colmap, tmp_path / "one", options, workers=1)
-        one, other = RunFolder(tmp_path / "none"), RunFolder(tmp_path / "one")
-        assert one.results.read_bytes() == other.results.read_bytes()
-        assert one.config_file.read_bytes() == other.config_file.read_bytes()
-
 
 class TestReport:
     def test_failures_count_as_infinite(self):
@@ -503,14 +494,6 @@ class TestCommand:
         with pytest.raises(SystemExit) as error:
             main(["evaluate", "correspondences", str(colmap), "--format", "nerf"])
         assert error.value.code == 2
-
-    def test_an_empty_folder_is_refused(self, tmp_path, capsys):
-        out = tmp_path / "run"
-        (tmp_path / "empty").mkdir()
-        arguments = ["evaluate", "correspondences", str(tmp_path / "empty"), "--out", str(out)]
-        assert main(arguments) == 1
-        assert "no correspondences of a known format" in capsys.readouterr().err
-        assert not out.exists()
 
 
 @needs_data

@@ -202,29 +202,7 @@ class TestRows:
 
 
 class TestRuns:
-    @pytest.mark.long
-    def test_bytes_are_the_same_with_workers_and_after_a_crash(
-        self, library: Path, tmp_path: Path
-    ) -> None:
-        folder, calm = RunFolder(tmp_path / "run"), RunFolder(tmp_path / "calm")
-        options = replace(QUICK, root=library, max_models=12, keypoints=(8,))
-        run(options, calm, workers=0, dask=None)
-
-        def stop(progress: Any) -> None:
-            if progress.done:
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            run(options, folder, workers=0, dask=None, on_progress=stop)
-        assert not folder.is_finished
-        run(options, folder, workers=1, dask=None)
-        assert folder.results.read_bytes() == calm.results.read_bytes()
-
-    def test_another_library_or_configuration_is_refused(
-        self, finished: RunFolder, library: Path, tmp_path: Path
-    ) -> None:
-        with pytest.raises(DataError, match="another configuration: seed is 0 there and 1 now"):
-            run(replace(QUICK, root=library, seed=1), finished, workers=None, dask=None)
+    def test_another_library_is_refused(self, finished: RunFolder, tmp_path: Path) -> None:
         other = tmp_path / "other"
         Library.from_models([make_model(number) for number in range(10)]).save(other)
         before = (finished.path / "library.cadalign").read_bytes()
@@ -387,15 +365,6 @@ class TestCommand:
         first = shown["summary"][0]
         assert (first["method"], first["rank_1"], first["queries"]) == ("optimal", 1.0, 3)
         assert shown["summary"][-1]["rank_1"] is None
-
-    def test_refusals_are_one_line(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        out = ["--out", str(tmp_path / "run")]
-        assert main(["evaluate", "retrieval", str(tmp_path / "none"), *out]) == 1
-        assert capsys.readouterr().err.lstrip() == (
-            f"cadalign: {tmp_path / 'none'}: no such folder; give KeypointNet's root\n"
-        )
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ import pytest
 
 import cadalign
 from cadalign.cli import main
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.evaluation.experiments.simulation import (
     SWEEPS,
     SweepOptions,
@@ -149,9 +149,3 @@ def test_the_command_writes_a_table_and_a_figure_for_each_metric(
     for metric in metrics:
         for ending in ("png", "pdf"):
             assert (out / "figures" / f"{sweep}_{metric}.{ending}").stat().st_size > 1000
-
-
-def test_the_same_folder_refuses_another_sweep(tmp_path: Path) -> None:
-    simulate("points", values=[8], runs=2, methods=["aepnp"], out=tmp_path)
-    with pytest.raises(DataError, match=r"sweep\.runs is 2 there and 3 now"):
-        simulate("points", values=[8], runs=3, methods=["aepnp"], out=tmp_path)

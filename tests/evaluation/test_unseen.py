@@ -15,7 +15,7 @@ from support.pages import embedded_payload
 from cadalign import Alignment, Box
 from cadalign.cli import main
 from cadalign.datasets import KeypointNet
-from cadalign.errors import DataError, InputError
+from cadalign.errors import InputError
 from cadalign.evaluation.api import run
 from cadalign.evaluation.experiments.unseen import METHODS, SPEC, UnseenOptions
 from cadalign.evaluation.instances.instance import KEYPOINT_CAMERA, KeypointTask
@@ -259,12 +259,6 @@ class TestRun:
         table = read_table(finished.results).to_pandas()
         kept = table[table["method"] == "mean-rigid"].reset_index(drop=True)
         assert kept.equals(read_table(folder.results).to_pandas())
-
-    def test_another_run_in_the_same_folder_is_refused(
-        self, root: Path, finished: RunFolder
-    ) -> None:
-        with pytest.raises(DataError, match="another configuration: noise_px is"):
-            run(UnseenOptions(root, noise_px=1.0), finished, workers=0, dask=None)
 
     @pytest.mark.long
     def test_outliers_are_found(self, root: Path, tmp_path: Path) -> None:

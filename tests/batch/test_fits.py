@@ -165,28 +165,6 @@ def test_killed_twice_it_gives_the_same_bytes(tmp_path: Path, calm: Path) -> Non
         assert (hit.path / name).read_bytes() == (calm / name).read_bytes()
 
 
-@pytest.mark.long
-def test_a_dask_worker_killed_in_between_loses_nothing(tmp_path: Path, calm: Path) -> None:
-    distributed = pytest.importorskip("distributed", reason="pip install 'cadalign[dask]'")
-    source = calm.parent / "o.jsonl"
-    killed: list[int] = []
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None
-    ) as cluster:
-
-        def kill_one(progress: Progress) -> None:
-            if progress.done >= 60 and not killed:
-                worker = next(iter(cluster.workers.values()))
-                killed.append(worker.pid)
-                os.kill(worker.pid, signal.SIGKILL)
-
-        address = cluster.scheduler_address
-        cadalign.fit_many(source, out=tmp_path / "hit", dask=address, on_progress=kill_one)
-    assert killed
-    for name in ("results.parquet", "records.parquet"):
-        assert (tmp_path / "hit" / name).read_bytes() == (calm / name).read_bytes()
-
-
 def test_workers_may_have_been_started_elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

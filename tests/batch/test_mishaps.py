@@ -6,9 +6,6 @@ Each is a row, or one clear line, and nothing that was done is lost.
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -71,30 +68,6 @@ def test_a_full_disk_is_one_line_and_the_run_goes_on(
     assert {row["status"] for row in rows_of(run.path)} == {"ok"}
 
 
-@pytest.mark.skipif(os.geteuid() == 0 and shutil.which("mount") is None, reason="needs mount")
-def test_a_file_system_without_room_is_one_line(tmp_path: Path) -> None:
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)],
-        capture_output=True,
-        check=False,
-    )
-    if mounted.returncode:
-        pytest.skip("file systems cannot be mounted here")
-    try:
-        command = ["fit", str(lines(tmp_path / "o.jsonl", 640)), "--no-picture", "--workers=0"]
-        ended = Program(MAIN, *command, f"--out={disk / 'run'}", "--method=aepnp")
-        _, told = ended.communicate()
-        assert ended.poll() == 1
-        (line,) = told.splitlines()
-        assert "cannot be written (No space left on device); make room" in line
-        parts = RunFolder(disk / "run").parts
-        assert [path for path in parts.iterdir() if path.name.startswith(".unfinished")] == []
-    finally:
-        subprocess.run(["umount", str(disk)], check=True)
-
-
 @pytest.mark.parametrize("command", ["fit", "retrieve"])
 def test_a_folder_that_cannot_be_written_is_one_line(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -134,15 +107,6 @@ def test_a_mask_that_cannot_be_read_fails_its_row_alone(tmp_path: Path) -> None:
     assert "broken.png" in bad["reason"]
 
 
-def test_a_record_without_camera_fails_its_row_alone(tmp_path: Path) -> None:
-    source = lines(tmp_path / "o.jsonl", 1, camera=None)
-    source.write_text(source.read_text() + lines(tmp_path / "p.jsonl", 1).read_text())
-    assert main(["fit", str(source), "--no-picture", "--out", str(tmp_path / "run")]) == 3
-    bad, good = rows_of(tmp_path / "run")
-    assert bad["reason"].endswith("o.jsonl, line 1: camera: missing")
-    assert good["status"] == "ok"
-
-
 def test_a_wrong_model_name_is_a_warning_of_its_row_and_refused_for_all(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -161,15 +125,6 @@ def test_a_wrong_model_name_is_a_warning_of_its_row_and_refused_for_all(
     (line,) = capsys.readouterr().err.splitlines()
     assert line == f"cadalign: {tmp_path / 'wrong.keypoints.json'}: no such file"
     assert not (tmp_path / "x").exists()
-
-
-def test_fields_of_a_file_are_no_flags_in_reasons(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source = lines(tmp_path / "o.jsonl", 1, colour="red")
-    assert main(["fit", str(source), "--no-picture", "--out", str(tmp_path / "run")]) == 1
-    said = capsys.readouterr().err
-    assert "unknown field 'colour'; known are cam_from_rig, camera, camera_height," in said
 
 
 def test_no_page_is_written_over_what_it_is_made_from(

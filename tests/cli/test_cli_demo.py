@@ -142,13 +142,6 @@ def test_results_follow_from_the_seed_alone(sample_root: Path, out: Path, tmp_pa
     assert other["rotation_error_deg"] not in [row["rotation_error_deg"] for row in expected]
 
 
-def test_keypoints_without_noise_are_fitted_exactly(sample_root: Path, tmp_path: Path) -> None:
-    assert run(sample_root, tmp_path, "--noise-px", "0") == 0
-    for row in rows_of(tmp_path):
-        assert max(float(row[name]) for name in NUMBERS[:-1]) < 1e-6
-        assert float(row["box_iou"]) > 1 - 1e-6
-
-
 def test_without_a_root_the_sample_data_set_is_made(tmp_path: Path) -> None:
     options = ["--out", str(tmp_path), "--per-category", "1", "--categories", "bottle"]
     assert main(["demo", *options]) == 0
@@ -316,33 +309,3 @@ def test_wrong_options_are_refused_in_one_line(
     captured = capsys.readouterr()
     assert captured.err == f"cadalign: {text}\n"
     assert captured.out == ""
-
-
-def test_folder_without_annotations_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "empty").mkdir()
-    assert run(tmp_path / "empty", tmp_path / "out") == 1
-    assert capsys.readouterr().err == (
-        f"cadalign: {tmp_path / 'empty'}: no annotations/*.json below it; "
-        "give the folder that holds KeypointNet's annotations/ and splits/\n"
-    )
-
-
-def test_unknown_category_is_refused(
-    sample_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(sample_root, tmp_path / "out", "--categories", "spaceship") == 1
-    captured = capsys.readouterr()
-    assert "spaceship" in captured.err
-    assert captured.err.count("\n") == 1
-
-
-def test_real_models_run(real_data: Path, tmp_path: Path) -> None:
-    assert run(real_data / "keypointnet", tmp_path, "--noise-px", "0") == 0
-    rows = rows_of(tmp_path)
-    assert len(rows) == 5
-    solved = [row for row in rows if row["status"] == "ok"]
-    assert len(solved) >= 4
-    for row in solved:
-        assert max(float(row[name]) for name in NUMBERS[:-1]) < 1e-6

@@ -153,21 +153,6 @@ def test_what_is_wrong_with_the_inputs_is_one_line(
         assert "Traceback" not in shown
 
 
-def test_a_photo_and_a_model_that_cannot_be_read_are_warnings_of_their_row(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(observe(folder, "--every", "--image", str(folder))) == 0
-    written = folder / "found_observations"
-    (folder / "a.png").write_text("no photo")
-    data = json.loads((written / "b.json").read_text())
-    (written / "b.json").write_text(json.dumps({**data, "model": "gone.obj"}))
-    assert main(["fit", str(written)]) == 0
-    rows = list(csv.DictReader((folder / "found_observations_fit" / "results.csv").open()))
-    assert "the photo is not shown: " in rows[0]["warnings"]
-    assert "the model is shown as a box: " in rows[2]["warnings"]
-    assert [row["status"] for row in rows] == ["ok"] * 3
-
-
 def test_several_files_are_fitted_as_a_folder_is(folder: Path) -> None:
     assert main(observe(folder, "--every")) == 0
     files = [str(folder / "found_observations" / f"{name}.json") for name in ("a_0", "b")]

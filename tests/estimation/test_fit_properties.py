@@ -12,7 +12,7 @@ from support.problems import problem_of
 
 from cadalign import Alignment, Camera, Result, fit
 from cadalign.errors import DegenerateError
-from cadalign.evaluation.simulation import Problem, random_rotation
+from cadalign.evaluation.simulation import SIMULATION_CAMERA, Problem, random_rotation
 from cadalign.geometry.metrics import rotation_error
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -40,45 +40,31 @@ def assert_explains(result: Result, problem: Problem, tolerance_px: float = 1e-5
 
 
 @METHODS
+@pytest.mark.parametrize(
+    ("camera", "depth", "explained", "tolerance"),
+    [
+        (SIMULATION_CAMERA, (4.0, 8.0), 1e-5, 1e-6),
+        (Camera(640, 480, 6000.0, 6000.0, 319.5, 239.5), (60.0, 100.0), 1e-6, 1e-5),
+        # A thousand sizes away: depths differ by a thousandth, and pixels are exact to 1e-13.
+        (Camera(640, 480, 1e5, 1e5, 319.5, 239.5), (900.0, 1100.0), 1e-5, 1e-4),
+        (Camera.from_fov(640, 480, fov_x=120.0), (2.0, 3.0), 1e-5, 1e-6),
+    ],
+    ids=["simulation", "far", "perspective lost", "near and wide"],
+)
 @given(seed=SEEDS, points=COUNTS)
-def test_recovery_without_noise(method: str, seed: int, points: int) -> None:
-    problem = problem_of(seed, points=points, noise_px=0.0)
-    result = fit(problem.points_3d, problem.points_2d, problem.camera, method=method)
-    assert_aligned(result, problem.alignment)
-
-
-@METHODS
-@given(seed=SEEDS, points=COUNTS)
-def test_recovery_of_a_far_object_through_a_long_lens(method: str, seed: int, points: int) -> None:
-    camera = Camera(640, 480, 6000.0, 6000.0, 319.5, 239.5)
-    problem = problem_of(seed, points=points, noise_px=0.0, camera=camera, depth=(60.0, 100.0))
-    result = fit(problem.points_3d, problem.points_2d, camera, method=method)
-    assert_explains(result, problem, 1e-6)
-    assert_aligned(result, problem.alignment, 1e-5)
-
-
-@METHODS
-@given(seed=SEEDS, points=COUNTS)
-def test_recovery_of_an_object_so_far_that_perspective_is_lost(
-    method: str, seed: int, points: int
+def test_recovery_without_noise(
+    method: str,
+    camera: Camera,
+    depth: tuple[float, float],
+    explained: float,
+    tolerance: float,
+    seed: int,
+    points: int,
 ) -> None:
-    # A thousand sizes away: depths differ by a thousandth, and pixels are exact to 1e-13.
-    camera = Camera(640, 480, 1e5, 1e5, 319.5, 239.5)
-    problem = problem_of(seed, points=points, noise_px=0.0, camera=camera, depth=(900.0, 1100.0))
+    problem = problem_of(seed, points=points, noise_px=0.0, camera=camera, depth=depth)
     result = fit(problem.points_3d, problem.points_2d, camera, method=method)
-    assert_explains(result, problem, 1e-5)
-    assert_aligned(result, problem.alignment, 1e-4)
-
-
-@METHODS
-@given(seed=SEEDS, points=COUNTS)
-def test_recovery_of_a_near_object_seen_at_a_wide_angle(
-    method: str, seed: int, points: int
-) -> None:
-    camera = Camera.from_fov(640, 480, fov_x=120.0)
-    problem = problem_of(seed, points=points, noise_px=0.0, camera=camera, depth=(2.0, 3.0))
-    result = fit(problem.points_3d, problem.points_2d, camera, method=method)
-    assert_aligned(result, problem.alignment)
+    assert_explains(result, problem, explained)
+    assert_aligned(result, problem.alignment, tolerance)
 
 
 @METHODS

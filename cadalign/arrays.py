@@ -175,7 +175,7 @@ def parse_numbers(
     """
     try:
         values = np.fromstring(text + b" 0", sep=" ", dtype=dtype)
-    except DeprecationWarning as error:  # where warnings are errors
+    except Warning as error:  # of older NumPy, where warnings are errors
         raise ValueError(str(error)) from None
     if len(values) != count + 1:
         raise ValueError("not all of it is numbers")
